@@ -15,14 +15,6 @@ from marsyard.scenarios.parts.scores import (
 )
 
 __all__ = [
-    "DescentPlace",
-    "InstrumentReadings",
-    "InstrumentTruth",
-    "Poses",
-    "ScoredDescent",
-    "ScoredFlight",
-    "ScoredLanding",
-    "ScoredRun",
-    "ScoredSite",
-    "ScoredVelocity",
-]
+    "DescentPlace", "InstrumentReadings", "InstrumentTruth", "Poses", "ScoredDescent", "ScoredFlight",
+    "ScoredLanding", "ScoredRun", "ScoredSite", "ScoredVelocity",
+]  # fmt: skip

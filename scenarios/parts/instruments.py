@@ -72,15 +72,15 @@ class InstrumentReadings:
     columns: Mapping[str, Scalar] = field(default_factory=dict)
 
 
-class _OwnInstrument(CustomPart):
+class _CustomInstrument(CustomPart):
     kind = INSTRUMENT
     named_by = "instrument"
     quantity: ClassVar[str]
 
-    instrument: Annotated[str, Field(description="own instrument's class: module:Class, or an entry point's name")]
+    instrument: Annotated[str, Field(description="custom instrument's class: module:Class, or an entry point's name")]
 
     @model_validator(mode="after")
-    def _measures_the_quantity(self) -> _OwnInstrument:
+    def _check_quantity(self) -> _CustomInstrument:
         measured = self.create().quantity
         if measured != self.quantity:
             raise ValueError(f"'{self.spec}' measures {measured!r}; allowed here: {self.quantity!r}")
@@ -91,13 +91,13 @@ class _OwnInstrument(CustomPart):
         return check_readings(self.spec, self.create().read(truth, rng), self.quantity, truth.times_s.size)
 
 
-class CustomAltimeter(_OwnInstrument):
+class CustomAltimeter(_CustomInstrument):
     """A user-defined altimeter (see `marsyard.scenarios.parts.instruments`)."""
 
     quantity = "altitude"
 
 
-class CustomAttitudeSource(_OwnInstrument):
+class CustomAttitudeSource(_CustomInstrument):
     """A user-defined instrument of attitudes at the pictures, instead of the inertial navigation."""
 
     quantity = "attitude"

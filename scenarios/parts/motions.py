@@ -74,7 +74,7 @@ class CustomMotion(CustomPart, RecordedAxes):
     kind = DYNAMICS
     named_by = "motion"
 
-    motion: Annotated[str, Field(description="own motion's class: module:Class, or an entry point's name")]
+    motion: Annotated[str, Field(description="custom motion's class: module:Class, or an entry point's name")]
     axes: Annotated[Literal["enu", "ned"], Field(description="east, north, up; or north, east, down")] = "enu"
     lead_s: Annotated[float, bounded(0.2, 30.0, "start of the navigation before the first picture")] = 5.0
 

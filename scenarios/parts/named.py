@@ -10,6 +10,7 @@ import difflib
 import inspect
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import entry_points
@@ -68,8 +69,12 @@ class Kind:
         try:
             return part(**options)
         except Exception as error:  # a user's class may raise anything
+            message = str(error) if isinstance(error, TypeError | ValueError) else f"{type(error).__name__}: {error}"
+            if isinstance(error, ValidationError):
+                faults = [(".".join(map(str, one["loc"])), str(one["msg"])) for one in error.errors()]
+                message = "; ".join(f"{key}: {text}" if key else text for key, text in faults)
             allowed = ", ".join(defaults(part)) or "none"
-            raise ValueError(f"'{spec}' refuses its options: {_message(error)}; it has: {allowed}") from error
+            raise ValueError(f"'{spec}' refuses its options: {message}; it has: {allowed}") from error
 
 
 DYNAMICS = Kind("dynamics", "marsyard.dynamics", "motion", ("fly", "random"))
@@ -87,25 +92,12 @@ def installed(group: str) -> Mapping[str, str]:
 
 def defaults(part: Any) -> dict[str, JsonValue]:
     """Options of a class with their default values, as far as TOML can state them."""
-    try:
-        parameters = inspect.signature(part).parameters.values()
-    except (TypeError, ValueError):
-        return {}
     plain: dict[str, JsonValue] = {}
-    for one in parameters:
-        if one.default is not inspect.Parameter.empty:
-            try:
-                plain[one.name] = json.loads(json.dumps(one.default, allow_nan=False))
-            except (TypeError, ValueError):
-                continue
+    with suppress(TypeError, ValueError):  # a class without a signature
+        for name, argument in inspect.signature(part).parameters.items():
+            with suppress(TypeError, ValueError):  # required, or a default that TOML cannot state
+                plain[name] = json.loads(json.dumps(argument.default, allow_nan=False))
     return plain
-
-
-def _message(error: Exception) -> str:
-    if isinstance(error, ValidationError):
-        faults = [(".".join(map(str, one["loc"])), str(one["msg"])) for one in error.errors()]
-        return "; ".join(f"{where}: {message}" if where else message for where, message in faults)
-    return str(error) if isinstance(error, TypeError | ValueError) else f"{type(error).__name__}: {error}"
 
 
 class CustomPart(Parameters):
@@ -140,7 +132,7 @@ class CustomPart(Parameters):
         return {**stated, "options": {**defaults(cls.kind.load(stated[cls.named_by])), **options}}
 
     @model_validator(mode="after")
-    def _options_are_valid(self) -> CustomPart:
+    def _check_options(self) -> CustomPart:
         json.dumps(self.options, allow_nan=False)
         self.create()
         return self
@@ -153,19 +145,18 @@ class CustomPart(Parameters):
         options = {name: value for name, value in self.options.items() if isinstance(value, bool | int | float | str)}
         row: dict[str, Scalar] = {f"{prefix}_{self.named_by}": self.spec}
         for name, value in (*options.items(), *check_columns(self.spec, reported).items()):
-            column = f"{prefix}_{name}"
-            if column in row:
+            if f"{prefix}_{name}" in row:
                 raise ValueError(f"'{self.spec}' reports the column {name} twice, or it is one of its options")
-            row[column] = value
+            row[f"{prefix}_{name}"] = value
         return row
 
 
-def default_or_custom(usual: type[BaseModel], own: type[CustomPart]) -> Discriminator:
-    """Discriminator between a table with a user-defined part and the usual one; tags are the models' names."""
+def default_or_custom(default: type[BaseModel], custom: type[CustomPart]) -> Discriminator:
+    """Discriminator between a table with a user-defined part and the default one; tags are the models' names."""
 
     def model(stated: Any) -> str:
-        is_own = own.named_by in stated if isinstance(stated, Mapping) else isinstance(stated, own)
-        return own.__name__ if is_own else usual.__name__
+        is_custom = custom.named_by in stated if isinstance(stated, Mapping) else isinstance(stated, custom)
+        return custom.__name__ if is_custom else default.__name__
 
     return Discriminator(model)
 

@@ -125,8 +125,8 @@ def load_score(spec: str, kind: type[Any] | None = None) -> Any:
     """Import a score. Raises ValueError if it does not exist, is no function, or does not accept a kind of case."""
     score = SCORE.load(spec)
     if isinstance(score, type) or not callable(score):
-        what = "a class" if isinstance(score, type) else f"a {type(score).__name__}"
-        raise ValueError(f"'{spec}' is no score: it is {what}, not a function")
+        kind_name = "class" if isinstance(score, type) else type(score).__name__
+        raise ValueError(f"'{spec}' is no score: it is a {kind_name}, not a function")
     try:
         inspect.signature(score).bind(None)
     except (TypeError, ValueError) as error:
@@ -143,11 +143,13 @@ class CustomScores(Parameters):
 
     scored: ClassVar[type[Any]]
 
-    scores: Annotated[tuple[str, ...], Field(description="own scores: module:function, or names of entry points")] = ()
+    scores: Annotated[
+        tuple[str, ...], Field(description="custom scores: module:function, or names of entry points")
+    ] = ()
 
     @field_validator("scores")
     @classmethod
-    def _scores_exist(cls, specs: tuple[str, ...]) -> tuple[str, ...]:
+    def _check_scores(cls, specs: tuple[str, ...]) -> tuple[str, ...]:
         for index, spec in enumerate(specs):
             load_score(spec, cls.scored)
             if spec in specs[:index]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
+from jaxtyping import Float64
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.vtt import VttOptions
@@ -14,9 +15,10 @@ from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.parts.scores import CustomScores, ScoredRun
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import SlipParameters
+from marsyard.sim.frames import direction
 from marsyard.sim.measurements import MastCalibration
-from marsyard.sim.parameters import NonNegative, Parameters, Positive
-from marsyard.sim.render import CloudParameters
+from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded
+from marsyard.sim.render import CloudParameters, Sun
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import (
     MASTS,
@@ -55,20 +57,14 @@ class WorldParameters(Parameters):
     terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
     samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, 2.5 cm apart")] = 2048
     incline: InclineParameters = InclineParameters()
-    rms_slope_deg: float | None = Field(
-        default=None, ge=0.0, le=30.0, description="of rough ground; default: the site's"
-    )
-    rock_abundance: float | None = Field(
-        default=None, ge=0.0, le=0.4, description="ground under rocks; default: the site's"
-    )
-    largest_near_m: NonNegative = Field(
-        default=0.08, description="largest rock left on the route that operators choose"
-    )
+    rms_slope_deg: Annotated[float | None, bounded(0.0, 30.0, "of rough ground; default: the site's")] = None
+    rock_abundance: Annotated[float | None, bounded(0.0, 0.4, "ground under rocks; default: the site's")] = None
+    largest_near_m: Annotated[NonNegative, Field(description="largest rock left on the route")] = 0.08
     east_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
     north_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
     rocks_underfoot: bool = Field(default=False, description="whether wheels feel rocks, or the ground alone")
-    background_half_deg: float = Field(
-        default=50.0, gt=0.0, le=180.0, description="half angle behind the target with rocks"
+    background_half_deg: Annotated[Positive, Field(le=180.0, description="half angle behind the target with rocks")] = (
+        50.0
     )
 
     @field_validator("site")
@@ -137,17 +133,15 @@ class LegParameters(Parameters):
     """
 
     motion: Literal["stay", "approach", "back-off", "straight", "turn", "circle"] = "approach"
-    steps: Annotated[
-        int, Field(ge=1, le=200, description="number of steps; the maximum of an approach or back-off")
-    ] = 60
+    steps: Annotated[int, bounded(1, 200, "number of steps; the maximum of an approach or back-off")] = 60
     step_share: float = Field(default=0.1, gt=0.0, le=0.9, description="step length over the camera's distance")
     step_m: Annotated[float | None, Field(description="length of a step instead; needed for straight")] = None
     step_deg: Annotated[Turn, Field(description="of a turn or circle")] = 5.0
     goal_m: Positive = Field(default=2.0, description="final horizontal distance of the rover's origin from the target")
     ends_with_steps: bool = Field(default=False, description="whether it may end short of goal_m, its steps done")
     offset_right_m: float = Field(default=0.0, description="offset of the goal to the right of the target's direction")
-    shuffle_m: NonNegative = Field(
-        default=0.0, description="forth, and back after the next step: for a stuck steering motor"
+    shuffle_m: Annotated[NonNegative, Field(description="drive of a step with a stuck motor, and back at the next")] = (
+        0.0
     )
     visual_odometry: Annotated[bool, Field(description="whether the pose is corrected by visual odometry")] = False
     visual_odometry_step_m: Positive = Field(default=0.75, description="longest drive between pictures (60 % overlap)")
@@ -171,11 +165,24 @@ class SunParameters(Parameters):
 
     azimuth_deg: Annotated[Azimuth, Field(description="clockwise from north")] = 225.0
     elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="above the horizon")] = 45.0
-    hour_angle_deg_min: float = Field(
-        default=16.0 / 66.0, ge=-1.0, le=1.0, description="about the pole: 16 deg in 66 min (Table IV)"
+    hour_angle_deg_min: Annotated[float, bounded(-1.0, 1.0, "about the pole: 16 deg in 66 min (Table IV)")] = (
+        16.0 / 66.0
     )
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0, description="elevation of the pole")] = -2.0
     held_s: Annotated[Positive, Field(description="interval over which pictures share one sun")] = 120.0
+
+    def direction(self, time_s: float) -> Float64[np.ndarray, "3"]:
+        """Unit vector to the sun, world axes; it rotates westwards about the pole."""
+        first = direction(np.radians(self.azimuth_deg), np.radians(self.elevation_deg))
+        pole = direction(0.0, np.radians(self.latitude_deg))
+        angle = -np.radians(self.hour_angle_deg_min * time_s / 60.0)
+        cosine, sine = np.cos(angle), np.sin(angle)
+        rotated = cosine * first + sine * np.cross(pole, first) + (1.0 - cosine) * (pole @ first) * pole
+        return np.asarray(rotated / np.linalg.norm(rotated))
+
+    def in_interval(self, number: int, angular_radius_rad: float) -> Sun:
+        """The sun in the middle of an interval of `held_s`, which all its pictures share."""
+        return Sun(self.direction((number + 0.5) * self.held_s), angular_radius_rad)
 
 
 class TimingParameters(Parameters):
@@ -194,7 +201,7 @@ class ExposureParameters(Parameters):
     auto: AutoExposureParameters = AutoExposureParameters()
 
 
-class OwnPair(Parameters):
+class CustomPair(Parameters):
     """A custom stereo pair on the mast's head; the positions in the camera files are ignored."""
 
     left: Annotated[CustomCameraChoice, Field(description="camera file: a path, or a table with file")]
@@ -203,7 +210,7 @@ class OwnPair(Parameters):
     toe_in_deg: Annotated[float, Field(ge=-30.0, le=30.0, description="turn of each towards the other")] = 0.0
 
     @model_validator(mode="after")
-    def _check_sizes(self) -> OwnPair:
+    def _check_sizes(self) -> CustomPair:
         if self.right is not None and self.right.size != self.left.size:
             left, right = (f"{columns} x {rows}" for columns, rows in (self.left.size, self.right.size))
             raise ValueError(f"the left camera has {left} pixels, the right one {right}; allowed: as many")
@@ -218,11 +225,10 @@ class OwnPair(Parameters):
 class CameraParameters(Parameters):
     """The stereo pair on the mast."""
 
-    preset: str = Field(
-        default="mer-navcam",
-        description="key of `marsyard.sim.sensor.mast.MASTS`: pair, mast and rover",
+    preset: Annotated[str, Field(description="key of `marsyard.sim.sensor.mast.MASTS`: pair, mast, rover")] = (
+        "mer-navcam"
     )
-    own: Annotated[OwnPair | None, Field(description="a custom pair on the preset's mast")] = None
+    own: Annotated[CustomPair | None, Field(description="a custom pair on the preset's mast")] = None
     detector: DetectorChoice | None = Field(default=None, description="of both cameras; by default the preset's")
     detector_noise: Annotated[bool, Field(description="whether pictures have detector noise and response")] = True
 
@@ -275,9 +281,7 @@ class RoverScenarioParameters(AlgorithmSelection, CustomScores):
     target: TargetParameters = TargetParameters()
     obstacles: tuple[ObstacleParameters, ...] = ()
     start: StartParameters = StartParameters()
-    legs: Annotated[tuple[LegParameters, ...], Field(min_length=1, description="parts of the run, in order")] = (
-        LegParameters(),
-    )
+    legs: Annotated[tuple[LegParameters, ...], Field(min_length=1, description="parts, in order")] = (LegParameters(),)
     slip: SlipParameters = SlipParameters()
     odometry: OdometryParameters = OdometryParameters()
     pointing: PointingParameters = PointingParameters()

@@ -10,10 +10,12 @@ from jaxtyping import Bool, Float64, Int64
 
 from marsyard.sim.dynamics import RoverParameters, Stance
 from marsyard.sim.measurements import MastGeometry
-from marsyard.sim.render import may_cast_shadow, rover_objects, rover_sphere
+from marsyard.sim.render import Objects, may_cast_shadow, rover_objects, rover_sphere
 
 Vector = Float64[np.ndarray, "3"]
 Triangles = Float64[np.ndarray, "triangles 3 3"]
+Rays = Float64[np.ndarray, "rays 3"]
+Points = Float64[np.ndarray, "points 3"]
 
 #: Rows of lines of sight that sample a rock's outline.
 _OUTLINE_ROWS = 96
@@ -34,7 +36,7 @@ def sight_axes(ahead: Vector) -> Float64[np.ndarray, "3 3"]:
 
 
 def intersect_rays(
-    triangles: Triangles, origin: Vector, directions: Float64[np.ndarray, "rays 3"]
+    triangles: Triangles, origin: Vector, directions: Rays
 ) -> tuple[Float64[np.ndarray, "rays"], Int64[np.ndarray, "rays"]]:
     """Distance to the first triangle on each ray, and its number: infinite and -1 without an intersection.
 
@@ -61,9 +63,7 @@ def intersect_rays(
     return nearest, numbers
 
 
-def ray_distances(
-    triangles: Triangles, origin: Vector, directions: Float64[np.ndarray, "rays 3"]
-) -> Float64[np.ndarray, "rays"]:
+def ray_distances(triangles: Triangles, origin: Vector, directions: Rays) -> Float64[np.ndarray, "rays"]:
     """Distance along rays from one origin to the nearest triangle, infinite without one."""
     return intersect_rays(triangles, origin, directions)[0]
 
@@ -75,8 +75,7 @@ def triangles_near_line(triangles: Triangles, eye: Vector, point: Vector, half_a
     along = middles @ ahead
     aside = np.linalg.norm(middles - along[:, None] * ahead, axis=1)
     size = np.linalg.norm(triangles[:, 1:] - triangles[:, :1], axis=2).max(axis=1)
-    near: Triangles = triangles[aside <= np.tan(half_angle_rad) * np.maximum(along, 0.0) + size]
-    return near
+    return np.asarray(triangles[aside <= np.tan(half_angle_rad) * np.maximum(along, 0.0) + size])
 
 
 def patch_normal(triangles: Triangles, eye: Vector, point: Vector, half_angle_rad: float) -> Vector:
@@ -96,8 +95,7 @@ def patch_normal(triangles: Triangles, eye: Vector, point: Vector, half_angle_ra
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     normals *= -np.sign(normals @ axes[0])[:, None]
     mean = normals.sum(axis=0)
-    normal: Vector = mean / np.linalg.norm(mean)
-    return normal
+    return np.asarray(mean / np.linalg.norm(mean))
 
 
 @dataclass(frozen=True)
@@ -138,29 +136,23 @@ class RockOutline:
         distance = ray_distances(self.triangles, self.eye, direction[None])[0]
         if not np.isfinite(distance):
             raise ValueError(f"at across {across:g}, up {up:g} nothing of the target's rock is seen")
-        point: Vector = self.eye + distance * direction
-        return point
+        return np.asarray(self.eye + distance * direction)
 
 
-def self_occluded(
-    triangles: Triangles, points: Float64[np.ndarray, "points 3"], eye: Vector
-) -> Bool[np.ndarray, "points"]:
+def self_occluded(triangles: Triangles, points: Points, eye: Vector) -> Bool[np.ndarray, "points"]:
     """Which points of a rock the rock itself hides from an eye."""
     away = points - eye
     distance = np.linalg.norm(away, axis=1)
-    blocked: Bool[np.ndarray, "points"] = ray_distances(triangles, eye, away / distance[:, None]) < distance - _CLOSER_M
-    return blocked
+    return np.asarray(ray_distances(triangles, eye, away / distance[:, None]) < distance - _CLOSER_M)
 
 
-def self_shadowed(
-    triangles: Triangles, points: Float64[np.ndarray, "points 3"], sun_direction: Vector
-) -> Bool[np.ndarray, "points"]:
+def self_shadowed(triangles: Triangles, points: Points, sun_direction: Vector) -> Bool[np.ndarray, "points"]:
     """Which points of a rock lie in its own shadow."""
     starts = points + 2.0 * _CLOSER_M * sun_direction
     return np.array([np.isfinite(ray_distances(triangles, one, sun_direction[None])[0]) for one in starts], dtype=bool)
 
 
-def template_patch(eye: Vector, point: Vector, half_angle_rad: float) -> Float64[np.ndarray, "points 3"]:
+def template_patch(eye: Vector, point: Vector, half_angle_rad: float) -> Points:
     """A point, and points on rings about it up to an angle as seen from an eye, across the line of sight."""
     _, right, up = sight_axes(point - eye)
     turns = np.linspace(0.0, 2.0 * np.pi, _RING_POINTS, endpoint=False)
@@ -169,19 +161,35 @@ def template_patch(eye: Vector, point: Vector, half_angle_rad: float) -> Float64
     return np.vstack([point, *(point + fraction * ring for fraction in _RING_RADII)])
 
 
+def cast_rover_shadow(
+    rover: RoverParameters,
+    stance: Stance,
+    mast: MastGeometry,
+    angles_rad: tuple[float, float],
+    centre_m: Vector,
+    radius_m: float,
+    sun_direction: Vector,
+) -> Objects | None:
+    """The rover's mesh, its mast at these angles, if its shadow may fall into a sphere, world axes; else None."""
+    # the mesh is built only where its bounding sphere may cast a shadow there
+    if not may_cast_shadow(rover_sphere(rover, stance, mast), sun_direction, centre_m, radius_m):
+        return None
+    body = rover_objects(rover, stance, mast, *angles_rad)
+    return body if may_cast_shadow(body.spheres, sun_direction, centre_m, radius_m) else None
+
+
 def rover_shades_patch(
     rover: RoverParameters,
     stance: Stance,
     mast: MastGeometry,
     angles_rad: tuple[float, float],
-    patch_m: Float64[np.ndarray, "points 3"],
+    patch_m: Points,
     sun_direction: Vector,
 ) -> bool:
     """Whether the rover, its mast at these angles, shades any point of a patch, world axes."""
     middle = patch_m.mean(axis=0)
     radius = float(np.linalg.norm(patch_m - middle, axis=1).max())
-    # the rover's mesh is built only where its bounding sphere may cast a shadow on the patch
-    if not may_cast_shadow(rover_sphere(rover, stance, mast), sun_direction, middle, radius):
+    body = cast_rover_shadow(rover, stance, mast, angles_rad, middle, radius, sun_direction)
+    if body is None:
         return False
-    triangles = rover_objects(rover, stance, mast, *angles_rad).triangles
-    return any(np.isfinite(ray_distances(triangles, point, sun_direction[None])[0]) for point in patch_m)
+    return any(np.isfinite(ray_distances(body.triangles, point, sun_direction[None])[0]) for point in patch_m)

@@ -1,51 +1,203 @@
-"""Rover scenarios: one run of the closed loop, or one target tracked over the pictures of a shared drive."""
+"""Rover scenarios: one run of the closed loop, or one target tracked over the pictures of a shared drive.
+
+A shared drive is open-loop tracking (paper, 5.1 to 5.3). The rover is driven by the true position of the point in the
+middle of all targets, and its mast points there. At every stop a part of both frames is taken that holds the rock and
+the search windows about it. A case then tracks one of the targets over every (skip + 1)-th stop: skipped pictures make
+larger steps. The tracker's answers do not move the rover. A drive is a function of the parameters, the campaign's seed
+and the run's number.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
-from typing import cast
+from typing import Annotated, cast
 
-from pydantic import BaseModel
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, Field, model_validator
+from scipy.spatial.transform import RigidTransform
 
+from marsyard.algorithms.interface import TrackingState
+from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios.algorithm_run import Judged, case_result, run_algorithm
-from marsyard.scenarios.base import TerrainScenario
+from marsyard.scenarios.base import LoadGround, TerrainScenario
+from marsyard.scenarios.conditions import picture_columns_of_hash
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import scored
-from marsyard.scenarios.rover.parameters import RoverScenarioParameters, WorldParameters
-from marsyard.scenarios.rover.run import Run, prepare_run, track_target
-from marsyard.scenarios.rover.score import (
-    fixed_conditions,
-    products,
-    provenance,
-    run_conditions,
-    score,
-    scored_run,
-    sighting_columns,
-    stored_updates,
-    tracking,
-)
-from marsyard.scenarios.rover.shared import (
-    DriveKey,
-    SharedDriveParameters,
-    render_drive,
-    sightings_along,
-    track_views,
-)
-from marsyard.scenarios.rover.shared import prepare_run as prepare_shared_run
-from marsyard.scenarios.rover.stops import RunOutcome
+from marsyard.scenarios.rover import score
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.run import Run, Setup, TrackerGuide, TruthGuide, drive_legs, prepare_run, track_target
+from marsyard.scenarios.rover.stops import RunOutcome, View
+from marsyard.scenarios.rover.target import Visibility, evaluate_visibility, pick_target
 from marsyard.scenarios.rover.world import terrain_parameters
+from marsyard.scenarios.views import SiteGround
+from marsyard.sim.parameters import Parameters
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
 #: Terrains of a bank that are built before its runs; a larger bank's are built by the runs that need them.
 PREPARED_TERRAINS = 64
-#: Maximum number of grounds, shared drives with their pictures, and sightings along drives that a process keeps.
-KEPT_GROUNDS, KEPT_DRIVES, KEPT_SIGHTINGS = 4, 1, 128
+#: Maximum number of grounds, shared drives with their pictures, and visibilities along drives that a process caches.
+CACHED_GROUNDS, CACHED_DRIVES, CACHED_VISIBILITIES = 4, 1, 128
+
+
+class VariantParameters(Parameters):
+    """Rock, terrain and sun of one run."""
+
+    terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
+    diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="of the rock")] = 1.4
+    height_m: Annotated[float, Field(gt=0.01, le=5.0, description="of the rock")] = 0.8
+    shape: Annotated[int, Field(ge=0, le=31, description="its shape, see PlacedRock")] = 0
+    yaw_deg: Annotated[float, Field(description="its turn")] = 0.0
+    sun_azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")] = 225.0
+    sun_elevation_deg: Annotated[float, Field(gt=3.0, le=90.0)] = 45.0
+
+
+class PointParameters(Parameters):
+    """A target on the rock's face, as `TargetParameters`; of a circle as seen from its middle."""
+
+    across: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
+    up: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
+
+
+class BandParameters(Parameters):
+    """A range of steps: a boolean column of this name, by which requirements choose their cases."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z]\w*$")]
+    least: float = 0.0
+    most: float = 1.0
+
+
+class SharedDriveParameters(Parameters):
+    """Drives whose pictures many cases share; `run`, `target`, `skip`, `drive.algorithm`, `drive.vtt` make a case."""
+
+    drive: Annotated[RoverScenarioParameters, Field(description="the drive at its finest steps, and the tracker")]
+    variants: Annotated[tuple[VariantParameters, ...], Field(min_length=1, description="the runs")]
+    targets: Annotated[tuple[PointParameters, ...], Field(min_length=1, description="points on every run's rock")]
+    run: Annotated[int, Field(ge=0, description="number of the run")] = 0
+    target: Annotated[int, Field(ge=0, description="number of the target")] = 0
+    skip: Annotated[int, Field(ge=0, le=100, description="stops left out between two updates")] = 0
+    margin_px: Annotated[float, Field(gt=0.0, description="margin about the rock in the pictures")] = 110.0
+    bands: Annotated[tuple[BandParameters, ...], Field(description="ranges of steps")] = ()
+    face_deg: float | None = Field(default=None, gt=0.0, le=90.0, description="maximum obliquity of a target `on_face`")
+
+    @model_validator(mode="after")
+    def _check_numbers(self) -> SharedDriveParameters:
+        for name, number, count in (("run", self.run, len(self.variants)), ("target", self.target, len(self.targets))):
+            if number >= count:
+                raise ValueError(f"{name} is {number}; allowed: 0 to {count - 1}")
+        if len(self.drive.legs) != 1:
+            raise ValueError(f"a shared drive has one leg, not {len(self.drive.legs)}")
+        return self
+
+    @property
+    def step(self) -> float:
+        """The step between two updates: a fraction of the distance, or degrees of a turn or circle."""
+        leg = self.drive.legs[0]
+        if leg.motion in ("turn", "circle"):
+            return abs(leg.step_deg) * (self.skip + 1)
+        return float(1.0 - (1.0 - leg.step_share) ** (self.skip + 1))
+
+
+@dataclass(frozen=True)
+class DriveKey:
+    """Everything that the pictures of a drive depend on: the drive of a run without its tracker, and its seed."""
+
+    drive: RoverScenarioParameters
+    margin_px: float
+    seed: int
+    campaign: str
+    run: int
+
+    @classmethod
+    def of(cls, p: SharedDriveParameters, streams: Streams) -> DriveKey:
+        """The key of a case's drive."""
+        variant, drive = p.variants[p.run], p.drive
+        # the drive is about the middle of its targets
+        middle = {name: float(np.mean([getattr(one, name) for one in p.targets])) for name in ("across", "up")}
+        rock = variant.model_dump(include={"diameter_m", "height_m", "shape", "yaw_deg"})
+        sun = {"azimuth_deg": variant.sun_azimuth_deg, "elevation_deg": variant.sun_elevation_deg}
+        changes = {
+            "world": drive.world.model_copy(update={"terrain": variant.terrain}),
+            "target": drive.target.model_copy(update=rock | middle),
+            "sun": drive.sun.model_copy(update=sun),
+            "algorithm": "vtt",
+            "compared": (),
+            "vtt": VttOptions(),
+        }
+        return cls(drive.model_copy(update=changes), p.margin_px, streams.seed, streams.campaign, p.run)
+
+
+@dataclass(frozen=True)
+class SharedDrive:
+    """A drive and its pictures; targets on its rock are picked from `eye`.
+
+    The paper selected the targets of its circle on the one face that is seen from both of its ends: `eye` is the left
+    camera at the start, or in the middle of a circle.
+    """
+
+    run: Run
+    views: tuple[View, ...]
+    eye: Float64[np.ndarray, "3"]
+
+
+def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) -> SharedDrive:
+    """Drive a run and take its pictures; its streams are named by the run and belong to no case."""
+    p, streams = key.drive, Streams(key.seed, f"{key.campaign}: run {key.run}", 0)
+    setup = Setup.of(p, streams, load_ground)
+    world, rig, leg = setup.world, setup.rig, p.legs[0]
+    half_circle_rad = np.radians(0.5 * leg.steps * leg.step_deg) if leg.motion == "circle" else 0.0
+    sine, cosine = np.sin(half_circle_rad), np.cos(half_circle_rad)
+
+    def picking_eye(world_from_head: RigidTransform) -> Float64[np.ndarray, "3"]:
+        rock = world.rocks.position_m[world.target_number]
+        east, north, up = rig.eyes(world_from_head)[0] - rock
+        return np.asarray(rock + np.array([cosine * east + sine * north, cosine * north - sine * east, up]))
+
+    mast = setup.vehicle.stance.world_from_rover * rig.calibrated.geometry.rover_from_head(0.0, 0.0)
+    position = p.target.across, p.target.up
+    run = Run.at(setup, pick_target(world, rig, mast, (0.0, 0.0), position, p.vtt, picking_eye(mast)))
+    guide = TruthGuide(key.margin_px)
+    drive_legs(p, run, guide)
+    return SharedDrive(run, tuple(guide.views), picking_eye(guide.views[0].world_from_head))
+
+
+def prepare_shared_run(p: SharedDriveParameters, drive: SharedDrive) -> Run:
+    """Create a run over the drive's pictures, its target chosen, before the tracker is called."""
+    first, run, point = drive.views[0], drive.run, p.targets[p.target]
+    position, head = (point.across, point.up), first.world_from_head
+    return Run.at(run, pick_target(run.world, run.rig, head, first.angles_rad, position, p.drive.vtt, drive.eye))
+
+
+def track_views(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | None = None) -> Run:
+    """Run a tracker over the drive's pictures for one of the targets; by default the tracker under test."""
+    run = prepare_shared_run(p, drive)
+    tracked = p.drive.model_copy(update={"algorithm": algorithm or p.drive.algorithm})
+    guide = TrackerGuide(tracked, run, drive.views[0].estimated)
+    for view in drive.views[:: p.skip + 1]:
+        guide.observe(run, view)
+        if run.stops[-1].update.state is TrackingState.FAILURE:
+            break
+    if not run.stops[0].update.found:
+        run.outcome = RunOutcome.NOT_SEEDED
+    else:
+        run.outcome = RunOutcome.COMPLETED if run.stops[-1].update.found else RunOutcome.LOST
+    return run
+
+
+def visibility_along(drive: SharedDrive, point: PointParameters, options: VttOptions) -> Visibility:
+    """Evaluate the visibility of a target along a drive."""
+    world, rig, first = drive.run.world, drive.run.rig, drive.views[0]
+    position = point.across, point.up
+    target = pick_target(world, rig, first.world_from_head, first.angles_rad, position, options, drive.eye)
+    heads = [view.world_from_head for view in drive.views]
+    return evaluate_visibility(world, rig, target.point_world, heads, options)
 
 
 class RoverScenario(TerrainScenario[RoverScenarioParameters]):
@@ -58,7 +210,7 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
     part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
     def __init__(self) -> None:
-        super().__init__(KEPT_GROUNDS)
+        super().__init__(CACHED_GROUNDS)
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains; none of a large bank, whose terrains few runs share."""
@@ -71,29 +223,21 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
 
     def input_terrain(self, p: RoverScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
         """A terrain of the bank."""
-        return _bank(p.world), shared_input
+        return TerrainBank(terrain_parameters(p.world), p.world.bank_seed), shared_input
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """One run for each algorithm, with the same draws."""
+        """Run the case for each algorithm, with the same draws."""
         p = self.checked(parameters)
         started = time.process_time()
         first = prepare_run(p, streams, self.load_ground)
-        known = fixed_conditions(p, first)
+        known = score.fixed_conditions(p, first)
 
         def judge(algorithm: str) -> Judged:
             judged = algorithm == p.algorithm
-            own = p.model_copy(update={"algorithm": algorithm})
-            began = started if judged else time.process_time()
-            run = first if judged else prepare_run(own, streams, self.load_ground)
-
-            def track() -> Run:
-                track_target(own, run)
-                return run
-
-            def more_columns(run: Run) -> dict[str, Scalar]:
-                return {"run_time_s": time.process_time() - began, **(sighting_columns(p, run) if judged else {})}
-
-            return _judge(p, track, known, judged, more_columns)
+            candidate = p.model_copy(update={"algorithm": algorithm})
+            run_started = started if judged else time.process_time()
+            run = first if judged else prepare_run(candidate, streams, self.load_ground)
+            return _judge(p, lambda: track_target(candidate, run), known, judged, run_started)
 
         return case_result(p.algorithms, judge, known)
 
@@ -108,10 +252,10 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
     part_keys: Mapping[str, Kind] = {"drive.scores": SCORE}
 
     def __init__(self) -> None:
-        super().__init__(KEPT_GROUNDS)
-        self._drive = lru_cache(maxsize=KEPT_DRIVES)(partial(render_drive, load_ground=self.load_ground))
-        self._sightings = lru_cache(maxsize=KEPT_SIGHTINGS)(
-            lambda key, point, options: sightings_along(self._drive(key), point, options)
+        super().__init__(CACHED_GROUNDS)
+        self._drive = lru_cache(maxsize=CACHED_DRIVES)(partial(render_drive, load_ground=self.load_ground))
+        self._visibility = lru_cache(maxsize=CACHED_VISIBILITIES)(
+            lambda key, point, options: visibility_along(self._drive(key), point, options)
         )
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
@@ -125,21 +269,33 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
 
     def input_terrain(self, p: SharedDriveParameters, shared_input: int) -> tuple[TerrainBank, int]:
         """A terrain of the bank."""
-        return _bank(p.drive.world), shared_input
+        w = p.drive.world
+        return TerrainBank(terrain_parameters(w), w.bank_seed), shared_input
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """One target of one run, tracked with one step; all algorithms see the same pictures."""
+        """Track one target of one run with one step; all algorithms see the same pictures."""
         p = self.checked(parameters)
-        key = DriveKey.of(p, streams)
+        key, point, algorithm = DriveKey.of(p, streams), p.targets[p.target], p.drive.algorithm
         drive = self._drive(key)
-        case = key.drive.model_copy(update={"algorithm": p.drive.algorithm, "vtt": p.drive.vtt})
-        seen = self._sightings(key, p.targets[p.target], p.drive.vtt)
-        on_face = seen.in_view and (p.face_deg is None or seen.obliquity_max_deg <= p.face_deg)
-        conditions = fixed_conditions(case, prepare_shared_run(p, drive))
-        known = {**conditions, **_case_columns(p), **asdict(seen), "on_face": on_face}
+        case = key.drive.model_copy(update={"algorithm": algorithm, "vtt": p.drive.vtt})
+        visibility = self._visibility(key, point, p.drive.vtt)
+        known = {
+            **score.fixed_conditions(case, prepare_shared_run(p, drive)),
+            "run": p.run,
+            "target": p.target,
+            "point_across": point.across,
+            "point_up": point.up,
+            "skip": p.skip,
+            "step": p.step,
+            "with_scale": algorithm != "pure-ncc" and p.drive.vtt.scale,
+            "pure_ncc": algorithm == "pure-ncc",
+            **{band.name: bool(band.least <= p.step <= band.most) for band in p.bands},
+            **asdict(visibility),
+            "on_face": visibility.in_view and (p.face_deg is None or visibility.obliquity_max_deg <= p.face_deg),
+        }
 
-        def judge(algorithm: str) -> Judged:
-            return _judge(case, lambda: track_views(p, drive, algorithm), known, algorithm == p.drive.algorithm)
+        def judge(name: str) -> Judged:
+            return _judge(case, lambda: track_views(p, drive, name), known, name == algorithm)
 
         return case_result(p.drive.algorithms, judge, known)
 
@@ -149,43 +305,27 @@ def _judge(
     track: Callable[[], Run],
     known: Mapping[str, Scalar],
     judged: bool,
-    more_columns: Callable[[Run], dict[str, Scalar]] = lambda run: {},
+    started: float | None = None,
 ) -> Judged:
-    """Score a run; `judged` is the run of the algorithm under test, whose conditions and products are stored."""
+    """Score a run; `judged` is the run of the algorithm under test, whose conditions and products are stored.
+
+    `started` is the processor time at the start of a run that takes its own pictures.
+    """
 
     def track_and_score() -> tuple[Run, dict[str, Scalar]]:
         run = track()
-        return run, {**score(p, run), **tracking(run)}
+        return run, {**score.score(p, run), **score.tracking(run)}
 
     attempt = run_algorithm(track_and_score, lambda answer: cast(tuple[Run, dict[str, Scalar]], answer))
     if attempt.answer is None:
         return Judged(attempt.outcome(str), False, attempt.row, failure=attempt.failure)
     run, row = attempt.answer
-    row |= more_columns(run)
+    if started is not None:
+        row["run_time_s"] = time.process_time() - started
+        row |= score.visibility_columns(p, run) if judged else {}
     if judged:
-        updates = stored_updates(run, p.score.stored_updates)
-        row |= {**updates, **run_conditions(p, run), **provenance(p, run)}
-    row |= scored(p.scores, scored_run(run), {*row, *known})
-    kept = products(p, run) if judged else {}
-    return Judged(run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, kept)
-
-
-def _case_columns(p: SharedDriveParameters) -> dict[str, Scalar]:
-    """Columns that identify a case."""
-    point = p.targets[p.target]
-    bands: dict[str, Scalar] = {one.name: bool(one.least <= p.step <= one.most) for one in p.bands}
-    return {
-        "run": p.run,
-        "target": p.target,
-        "point_across": point.across,
-        "point_up": point.up,
-        "skip": p.skip,
-        "step": p.step,
-        "with_scale": p.drive.algorithm != "pure-ncc" and p.drive.vtt.scale,
-        "pure_ncc": p.drive.algorithm == "pure-ncc",
-        **bands,
-    }
-
-
-def _bank(w: WorldParameters) -> TerrainBank:
-    return TerrainBank(terrain_parameters(w), w.bank_seed)
+        digest = hashlib.sha256(b"".join(stop.pictures.digest for stop in run.stops)).hexdigest()
+        row |= {**score.stored_updates(run, p.score.stored_updates), **score.run_conditions(p, run)}
+        row |= picture_columns_of_hash(p.backend, digest)
+    row |= scored(p.scores, score.scored_run(run), {*row, *known})
+    return Judged(run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, score.products(p, run) if judged else {})

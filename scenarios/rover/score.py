@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import asdict
 
 import numpy as np
 from jaxtyping import Float64
 
-from marsyard.algorithms.vtt.accuracy import stereo_range_error_m
+from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, stereo_range_error_m
 from marsyard.algorithms.vtt.stereo import disparity_px_m
-from marsyard.scenarios.conditions import picture_columns_of_hash
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.scores import ScoredRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import rover_shades_patch, template_patch
 from marsyard.scenarios.rover.run import Run
-from marsyard.scenarios.rover.stops import RunOutcome, Stop
-from marsyard.scenarios.rover.target import sightings
+from marsyard.scenarios.rover.stops import RunOutcome
+from marsyard.scenarios.rover.target import evaluate_visibility
 from marsyard.sim.measurements import RoverMeasurements
 
 NAN = float("nan")
@@ -56,16 +54,22 @@ def score(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     errors = errors_px(run)
     sizes = np.hypot(*errors.T)
     completed = run.outcome is RunOutcome.COMPLETED
-    last = errors[-1] if completed else np.full(2, np.nan)
-    stop = run.stops[-1] if run.stops else None
-    error = stop.error_m() if completed and stop is not None else np.full(3, np.nan)
+    last, error, along, across = np.full(2, np.nan), np.full(3, np.nan), NAN, NAN
+    if completed:
+        # components along the line of sight (positive: too far) and across it
+        stop, last = run.stops[-1], errors[-1]
+        error = stop.error_m()
+        eye = stop.stance.world_from_rover.inv().apply(stop.world_from_head.apply(run.rig.left.c.copy()))
+        sight = stop.point_rover - eye
+        along = float(error @ sight / np.linalg.norm(sight))
+        across = float(np.sqrt(np.maximum(float(error @ error) - along * along, 0.0)))
     false_updates = int(np.count_nonzero(sizes > p.score.tracked_px))
-    along, across = _sight_components(run, stop, error)
     drift = float(np.hypot(*last))
+    tracked = completed and drift <= p.score.tracked_px
     losses = next((one.update.losses for one in run.stops if one.update.losses), ())
     return {
-        "tracked": bool(completed and drift <= p.score.tracked_px),
-        "not_tracked": not (completed and drift <= p.score.tracked_px),
+        "tracked": tracked,
+        "not_tracked": not tracked,
         "true_track": false_updates == 0,
         "false_updates": false_updates,
         "position_error_m": float(np.linalg.norm(error)),
@@ -81,16 +85,6 @@ def score(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     }
 
 
-def _sight_components(run: Run, stop: Stop | None, error: Float64[np.ndarray, "3"]) -> tuple[float, float]:
-    """Components of an error along the line of sight (positive: too far) and across it."""
-    if stop is None:
-        return NAN, NAN
-    eye = stop.stance.world_from_rover.inv().apply(stop.world_from_head.apply(run.rig.left.c.copy()))
-    sight = stop.point_rover - eye
-    along = float(error @ sight / np.linalg.norm(sight))
-    return along, float(np.sqrt(max(float(error @ error) - along * along, 0.0))) if np.isfinite(along) else NAN
-
-
 def _max(values: Float64[np.ndarray, "n"]) -> float:
     """The maximum; NaN without finite values."""
     return float(np.nanmax(values)) if np.any(np.isfinite(values)) else NAN
@@ -100,12 +94,12 @@ def tracking(run: Run) -> dict[str, Scalar]:
     """Table III's figures at their extremes, and the tracker's corrections."""
     figures = update_figures(run)
     found = [one for one in run.stops if one.update.found]
-    moved = seed_error = seed_3_sigma = NAN
+    drift_m = seed_error = seed_3_sigma = NAN
     if found:
         seed, last = (
             one.estimated.apply(np.asarray(one.update.position_rover).copy()) for one in (found[0], found[-1])
         )
-        moved, seed_error = float(np.linalg.norm(last - seed)), float(np.linalg.norm(found[0].error_m()))
+        drift_m, seed_error = float(np.linalg.norm(last - seed)), float(np.linalg.norm(found[0].error_m()))
         scale = disparity_px_m(run.rig.calibrated.left, run.rig.calibrated.right)
         seed_3_sigma = stereo_range_error_m(found[0].range_m, scale, 1.0)
     return {
@@ -119,7 +113,7 @@ def tracking(run: Run) -> dict[str, Scalar]:
         },
         "roll_total_deg": float(np.nansum(figures["roll_change_deg"])),
         "azimuth_total_deg": float(np.nansum(figures["azimuth_change_deg"])),
-        "target_moved_m": moved,
+        "target_moved_m": drift_m,
         "designation_error_m": seed_error,
         "designation_3_sigma_m": seed_3_sigma,
         "update_time_s": float(np.mean([one.track_time_s for one in run.stops])) if run.stops else NAN,
@@ -127,37 +121,33 @@ def tracking(run: Run) -> dict[str, Scalar]:
 
 
 def update_figures(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
-    """Figures of every update, one array each; NaN where a tracker reports no details."""
-    rows = [_figures(stop, error) for stop, error in zip(run.stops, errors_px(run), strict=True)]
-    return {name: np.array([row[name] for row in rows], dtype=np.float64) for name in FIGURES}
-
-
-def _figures(stop: Stop, error_px: Float64[np.ndarray, "2"]) -> dict[str, float]:
-    """The `FIGURES` of one update; those of a match are NaN at the seed."""
-    azimuth, elevation = np.degrees(stop.angles_rad)
-    figures = dict.fromkeys(FIGURES, NAN) | {
-        "range_m": stop.range_m,
-        "azimuth_deg": float(azimuth),
-        "elevation_deg": float(elevation),
-        "error_px": float(np.hypot(*error_px)),
-        "position_error_m": float(np.linalg.norm(stop.error_m())),
-        "leg": float(stop.leg),
-        "time_s": stop.time_s,
-    }
-    details = stop.details
-    if details is None:
-        return figures
-    if details.change is not None:
-        figures["magnification"] = details.change.magnification
-        figures["roll_change_deg"] = float(np.degrees(details.change.roll_rad))
-    if details.stereo is not None:
-        figures["stereo_score"] = details.stereo.score
-    if not details.seeded and stop.update.found:
-        figures["azimuth_change_deg"] = float(np.degrees(details.azimuth_change_rad))
-    if not details.seeded and details.match is not None:
-        figures["match_score"] = details.match.score
-        if details.predicted_pixel is not None:
-            figures["correction_px"] = float(np.max(np.abs(details.match.pixel - details.predicted_pixel)))
+    """Figures of every update, one array each; NaN where a tracker reports no details, of a match also at the seed."""
+    figures = {name: np.full(len(run.stops), np.nan) for name in FIGURES}
+    for number, (stop, error) in enumerate(zip(run.stops, errors_px(run), strict=True)):
+        azimuth, elevation = np.degrees(stop.angles_rad)
+        row = {
+            "range_m": stop.range_m,
+            "azimuth_deg": float(azimuth),
+            "elevation_deg": float(elevation),
+            "error_px": float(np.hypot(*error)),
+            "position_error_m": float(np.linalg.norm(stop.error_m())),
+            "leg": float(stop.leg),
+            "time_s": stop.time_s,
+        }
+        details = stop.details
+        if details is not None and details.change is not None:
+            row["magnification"] = details.change.magnification
+            row["roll_change_deg"] = float(np.degrees(details.change.roll_rad))
+        if details is not None and details.stereo is not None:
+            row["stereo_score"] = details.stereo.score
+        if details is not None and not details.seeded and stop.update.found:
+            row["azimuth_change_deg"] = float(np.degrees(details.azimuth_change_rad))
+        if details is not None and not details.seeded and details.match is not None:
+            row["match_score"] = details.match.score
+            if details.predicted_pixel is not None:
+                row["correction_px"] = float(np.max(np.abs(details.match.pixel - details.predicted_pixel)))
+        for name, value in row.items():
+            figures[name][number] = value
     return figures
 
 
@@ -172,7 +162,8 @@ def stored_updates(run: Run, count: int) -> dict[str, Scalar]:
 
 def fixed_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     """Conditions that do not depend on the tracker, read from the simulated objects."""
-    chosen, rocks, number = run.target, run.world.rocks, run.world.target_number
+    target, rocks, number = run.target, run.world.rocks, run.world.target_number
+    azimuth_error, elevation_error = np.degrees(run.rig.mast.zeros_rad)
     return {
         "site": p.world.site,
         "terrain": p.world.terrain,
@@ -186,9 +177,9 @@ def fixed_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "rock_yaw_deg": float(np.degrees(rocks.yaw_rad[number])),
         "point_across": p.target.across,
         "point_up": p.target.up,
-        "point_on_edge": chosen.on_edge,
-        "point_lit": chosen.lit,
-        "selectable": chosen.lit and not chosen.on_edge,
+        "point_on_edge": target.on_edge,
+        "point_lit": target.lit,
+        "selectable": target.lit and not target.on_edge,
         "incline": p.world.incline.name,
         "slope_deg": p.world.incline.slope_deg,
         "bearing_deg": float(np.degrees(p.bearing_rad)) % 360.0,
@@ -198,7 +189,10 @@ def fixed_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "roll_compensated": p.vtt.roll and p.algorithm != "pure-ncc",
         "roll_ignored": not p.vtt.roll or p.algorithm == "pure-ncc",
         "clear_sky": p.clouds is None or p.clouds.cover == 0.0,
-        **run.rig.error_columns(),
+        "disparity_error_start_px": run.rig.head.disparity_error_px(START_M),
+        "disparity_error_goal_px": run.rig.head.disparity_error_px(GOAL_M),
+        "mast_azimuth_error_deg": float(azimuth_error),
+        "mast_elevation_error_deg": float(elevation_error),
     }
 
 
@@ -238,12 +232,12 @@ def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     }
 
 
-def sighting_columns(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
-    """Visibility of the designated point at the stops of a run (`Sightings`)."""
-    eyes = [run.rig.eyes(one.world_from_head) for one in run.stops]
-    if not eyes:
+def visibility_columns(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
+    """Visibility of the designated point at the stops of a run."""
+    if not run.stops:
         return {"point_in_view": False, "obliquity_start_deg": NAN, "obliquity_max_deg": NAN}
-    columns = asdict(sightings(run.world, run.target.point_world, eyes, run.rig.pixel_rad, p.vtt))
+    heads = [stop.world_from_head for stop in run.stops]
+    columns = asdict(evaluate_visibility(run.world, run.rig, run.target.point_world, heads, p.vtt))
     return {"point_in_view": columns.pop("in_view"), **columns}
 
 
@@ -264,15 +258,8 @@ def _is_rover_shadow_on_target(p: RoverScenarioParameters, run: Run) -> bool:
     return False
 
 
-def provenance(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
-    """Hash of the pictures, and of the renderer that they depend on."""
-    return picture_columns_of_hash(
-        p.backend, hashlib.sha256(b"".join(stop.pictures.digest for stop in run.stops)).hexdigest()
-    )
-
-
 def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
-    """Arrays from which a run's figures are drawn (Figs. 15, 16b and 17 of the paper).
+    """Collect the arrays for a run's figures (Figs. 15, 16b and 17 of the paper).
 
     ================== ================================================================================================
     stop_N_left        counts of the left subframe of stop N, from 1, and `stop_N_right` of the right one
@@ -291,8 +278,8 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
     rocks_m            east, north and diameter of the target's rock and the obstacles, (rocks, 3)
     ================== ================================================================================================
     """
-    stops = run.stops
-    kept: dict[str, object] = {}
+    stops, rocks, named = run.stops, run.world.rocks, list(run.world.rocks.names.values())
+    arrays: dict[str, object] = {}
     for number, stop in enumerate(stops, start=1):
         left, right, details = stop.pictures.left, stop.pictures.right, stop.details
         window, found = np.full(4, np.nan), np.full((2, 2), np.nan)
@@ -301,7 +288,7 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
         found[0] = stop.found_px(run.rig.calibrated)
         if details is not None and details.stereo is not None and stop.update.found:
             found[1] = details.stereo.pixel
-        arrays = {
+        of_stop = {
             "left": left.counts,
             "right": right.counts,
             "corners": np.array([left.corner, right.corner], dtype=np.float64),
@@ -309,15 +296,15 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
             "found": found,
             "point": stop.point_px,
         }
-        kept |= {f"stop_{number}_{name}": values for name, values in arrays.items()}
-    believed = [
+        arrays |= {f"stop_{number}_{name}": values for name, values in of_stop.items()}
+    estimated = [
         np.full(3, np.nan) if stop.reported_rover is None else stop.estimated.apply(stop.reported_rover.copy())
         for stop in stops
     ]
     path = [
         stance.world_from_rover.translation[:2] for stop in stops for drive in stop.drives for stance in drive.stances
     ]
-    kept |= {
+    arrays |= {
         "template_px": p.vtt.template_px,
         "figures": update_figures(run),
         "states": [stop.update.state.name for stop in stops],
@@ -325,11 +312,11 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
         "rover_believed_m": np.array([stop.estimated.translation for stop in stops]).reshape(-1, 3),
         "heading_deg": np.degrees(np.array([stop.stance.azimuth_rad for stop in stops])),
         "target_m": run.target.point_world,
-        "target_believed_m": np.array(believed).reshape(-1, 3),
+        "target_believed_m": np.array(estimated).reshape(-1, 3),
         "path_true_m": np.array(path).reshape(-1, 2),
-        "rocks_m": run.world.placed_m,
+        "rocks_m": np.column_stack([rocks.position_m[named, :2], rocks.diameter_m[named]]),
     }
-    return kept
+    return arrays
 
 
 def scored_run(run: Run) -> ScoredRun:

@@ -1,21 +1,115 @@
-"""Stops of a run: truth, estimates, pictures and the tracker's answer at each."""
+"""Stops of a run: stereo subframes through the true cameras, poses, and the tracker's answer at each."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import hashlib
+from dataclasses import dataclass, fields, replace
 from enum import Enum
+from functools import cached_property, lru_cache
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.algorithms.interface import TargetUpdate
+from marsyard.algorithms.interface import PixelBox, TargetUpdate
 from marsyard.algorithms.vtt import VttDetails
-from marsyard.scenarios.rover.pictures import StereoPictures
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.dynamics.driving import Drive
-from marsyard.sim.dynamics.rover import Stance
-from marsyard.sim.measurements import MastCalibration
+from marsyard.sim.dynamics import Drive, Stance
+from marsyard.sim.measurements import MastCalibration, MastImage
+from marsyard.sim.render import Objects, PixelRays, Scene, process_renderer
+from marsyard.sim.sensor import Detector, auto_expose, natural_fall_off
+from marsyard.sim.streams import Streams
+
+#: Full-frame auto-exposure uses a picture this many times smaller.
+_BINNED = 16
+#: A lens's fall-off; cached, as all runs of a process share the designed cameras.
+_cached_fall_off = lru_cache(maxsize=8)(natural_fall_off)
+
+
+@dataclass(frozen=True)
+class StereoPictures:
+    """A stereo pair of subframes as delivered."""
+
+    left: MastImage
+    right: MastImage
+    exposure_s: float
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Hash of both pictures' counts."""
+        digest = hashlib.sha256()
+        for image in (self.left, self.right):
+            digest.update(np.ascontiguousarray(image.counts).tobytes())
+        return digest.digest()
+
+
+@dataclass(frozen=True)
+class StereoCamera:
+    """The detectors of a stereo pair, with drawn pixels.
+
+    Without detector noise, counts are proportional to light, rounded, at an exposure that suits the subframe's pixels.
+    """
+
+    parameters: RoverScenarioParameters
+    detectors: tuple[Detector, Detector]  #: of the left and the right camera
+    noise: np.random.Generator  #: stream of the detectors' noise
+
+    @classmethod
+    def draw(cls, p: RoverScenarioParameters, streams: Streams) -> StereoCamera:
+        """Draw the detectors of the designed pair."""
+        design, settings, rng = p.camera.mast(), p.camera.settings(), streams.generator("detector response")
+        left, right = (Detector.drawn(_cached_fall_off(one), settings, rng) for one in (design.left, design.right))
+        return cls(p, (left, right), streams.generator("detector noise"))
+
+    def take(
+        self,
+        scene: Scene,
+        rover: Objects | None,
+        world_from_head: RigidTransform,
+        cameras: tuple[CameraModel, CameraModel],
+        boxes: tuple[PixelBox, PixelBox],
+        brightness: float,
+        time_s: float,
+    ) -> StereoPictures:
+        """Take subframes with the true cameras on a head.
+
+        `scene` is without the rover; `rover` is given where its shadow may fall into a picture. `world_from_head` and
+        `cameras` are true; `boxes` are the parts of the full frames; `brightness` is sunlight relative to 1 AU.
+        """
+        p, scale = self.parameters, np.float32(brightness / self.detectors[0].parameters.sunlight)
+
+        def add_rover(shown: Scene) -> Scene:
+            return shown if rover is None else shown.with_objects(Objects.joined([shown.objects, rover]))
+
+        def render(shown: Scene, rays: PixelRays) -> Float32[np.ndarray, "rows columns"]:
+            frame = process_renderer(p.backend).render(shown, rays, world_from_head, time_s)
+            return np.asarray(frame.radiance * scale)
+
+        pairs = zip(cameras, boxes, strict=True)
+        pixel_rays = [PixelRays.of(camera.cropped(*box.corner, box.size)) for camera, box in pairs]
+        near = add_rover(scene.within([rays.cone(world_from_head) for rays in pixel_rays]))
+        lights, exposure_s = [render(near, rays) for rays in pixel_rays], 0.0
+        if p.camera.detector_noise:
+            windows = [one.window(*box.corner, box.size) for one, box in zip(self.detectors, boxes, strict=True)]
+            metered, light = windows[0], lights[0]
+            exposure_s = metered.parameters.exposure_s
+            if p.exposure.of == "full-frame":
+                # each block of pixels by its mean light, through a detector of as many pixels
+                light = render(replace(add_rover(scene), edge_rays=1), PixelRays.of(cameras[0].scaled(1.0 / _BINNED)))
+                response = np.resize(metered.response[: len(light), : light.shape[1]], light.shape)
+                metered = replace(metered, response=response, hot_e_s=None)
+            if p.exposure.of != "fixed":
+                exposure_s = auto_expose(metered, light, p.exposure.auto, self.noise).detector.parameters.exposure_s
+            counts = [
+                one.with_exposure(exposure_s).expose(lit, self.noise) for one, lit in zip(windows, lights, strict=True)
+            ]
+        else:
+            # 12 bits in proportion to the light, the left subframe's brightest at three quarters of full scale
+            gain = 3071.0 / max(float(np.percentile(lights[0], 98.0)), 1e-9)
+            counts = [np.clip(np.rint(gain * one), 0, 4095).astype(np.uint16) for one in lights]
+        left, right = (MastImage(values, box.corner) for values, box in zip(counts, boxes, strict=True))
+        return StereoPictures(left, right, exposure_s)
 
 
 class RunOutcome(Enum):
@@ -48,6 +142,8 @@ class Stop(View):
     """A stop at which the target was tracked."""
 
     update: TargetUpdate  #: the tracker's answer
+    details: VttDetails | None  #: details of the answer of one of the project's trackers
+    reported_rover: Float64[np.ndarray, "3"] | None  #: in the rover frame; None where the target was not found
     track_time_s: float  #: processor time of the update
     point_px: Float64[np.ndarray, "2"]  #: true full-frame (u, v) of the target in the left picture; NaN outside of it
     point_rover: Float64[np.ndarray, "3"]  #: the designated point in the rover's true frame, metres
@@ -62,21 +158,13 @@ class Stop(View):
         return cls(
             **{one.name: getattr(view, one.name) for one in fields(View)},
             update=update,
+            details=update.details if isinstance(update.details, VttDetails) else None,
+            reported_rover=update.position_rover if update.found else None,
             track_time_s=track_time_s,
             point_px=np.asarray(left.project(in_head)[0]),
             point_rover=np.asarray(view.stance.world_from_rover.inv().apply(point_m.copy())),
             range_m=float(np.linalg.norm(in_head - left.c)),
         )
-
-    @property
-    def details(self) -> VttDetails | None:
-        """The details of our own trackers' answers."""
-        return self.update.details if isinstance(self.update.details, VttDetails) else None
-
-    @property
-    def reported_rover(self) -> Float64[np.ndarray, "3"] | None:
-        """The reported position in the rover frame; None where the target was not found."""
-        return self.update.position_rover if self.update.found else None
 
     def found_px(self, mast: MastCalibration) -> Float64[np.ndarray, "2"]:
         """Pixel of the target in the left picture by the tracker; NaN where it was not found.

@@ -1,4 +1,4 @@
-"""World of a rover run: a site's terrain with the target's rock and obstacles, and the sun."""
+"""World of a rover run: a site's terrain with the target's rock and obstacles, the sun, the rover and its mast."""
 
 from __future__ import annotations
 
@@ -6,25 +6,28 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
+from scipy.spatial.transform import RigidTransform
 
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters, SunParameters, WorldParameters
 from marsyard.scenarios.rover.points import RockOutline
 from marsyard.scenarios.views import Eye, SiteGround, site_scene
-from marsyard.sim.dynamics import RoverParameters, Stance
-from marsyard.sim.frames import direction
-from marsyard.sim.measurements import MastGeometry
-from marsyard.sim.render import CloudLayer, Objects, Scene, Sun, may_cast_shadow, rover_objects, rover_sphere
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.dynamics import MER, ROCKY_8, Drive, Ground, RockyGround, RoverParameters, Soil, Stance, drive, settle
+from marsyard.sim.measurements import DriveCommand, MastCalibration
+from marsyard.sim.render import CloudLayer, Scene
+from marsyard.sim.sensor import Mast, MastState, StereoHead
+from marsyard.sim.sensor.odometry import Odometer, PoseEstimate
 from marsyard.sim.streams import Streams
-from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Site, Surface, TerrainParameters, site
+from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, TerrainParameters, site
 from marsyard.sim.terrain.landforms import Ramp
 
 #: Name of the target's rock.
 TARGET = "target"
 #: Height above the target's foot from which the scene's detail is chosen: that of a mast's head at the goal.
 EYE_HEIGHT_M = 1.2
-#: How far behind the target ground and rocks are drawn.
+#: Distance behind the target to which ground and rocks are drawn.
 BACKGROUND_M = 25.0
 #: Spacing of the ground's mesh about the target, and its growth from line to line: half of it changed 38 of 1.4 million
 #: pixels by a thousandth of their brightness (ADR 34).
@@ -33,11 +36,10 @@ MESH_FINEST_M, MESH_GROWTH = 0.04, 0.012
 RAMP_FRACTION = 0.4
 #: Distance beyond start and target within which the ground is cleared of rocks on the route.
 CLEARED_M = 2.0
-#: Rocks lie at least this far from the outline of one that was placed.
-FREE_M = 0.05
-#: Radius about the target that a subframe shows, over its distance: 8 deg are more than half the diagonal of the
-#: subframe of a navcam's right camera.
-SEEN_FRACTION = 0.14
+#: Minimum distance of the bank's rocks from the outline of a placed rock.
+MIN_GAP_M = 0.05
+#: Maximum distance from the route of rocks that wheels roll over, metres.
+ROUTE_MARGIN_M = 1.5
 _ROCK_ARRAYS = ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up")
 
 
@@ -55,99 +57,45 @@ def terrain_parameters(w: WorldParameters) -> TerrainParameters:
     return base.changed(changes)
 
 
-@dataclass(frozen=True)
-class SunPath:
-    """The sun over a run: it rotates westwards about the pole."""
-
-    parameters: SunParameters
-
-    def direction(self, time_s: float) -> Float64[np.ndarray, "3"]:
-        """Unit vector to the sun, world axes."""
-        p = self.parameters
-        first = direction(np.radians(p.azimuth_deg), np.radians(p.elevation_deg))
-        pole = direction(0.0, np.radians(p.latitude_deg))
-        angle = -np.radians(p.hour_angle_deg_min * time_s / 60.0)
-        cosine, sine = np.cos(angle), np.sin(angle)
-        turned = cosine * first + sine * np.cross(pole, first) + (1.0 - cosine) * (pole @ first) * pole
-        unit: Float64[np.ndarray, "3"] = turned / np.linalg.norm(turned)
-        return unit
-
-    def step(self, time_s: float) -> int:
-        """Number of the interval within which pictures share a sun."""
-        return int(time_s // self.parameters.held_s)
-
-    def held(self, step: int, angular_radius_rad: float) -> Sun:
-        """The sun in the middle of an interval."""
-        return Sun(self.direction((step + 0.5) * self.parameters.held_s), angular_radius_rad)
-
-
 @dataclass
 class RunWorld:
     """Terrain, scene and sun of a run."""
 
-    ground: SiteGround  #: with all rocks; the target's is named `TARGET`, obstacles `obstacle-1`, `obstacle-2`, ...
+    ground: SiteGround
+    rocks: RockField  #: of the ground; the target's is named `TARGET`, obstacles `obstacle-1`, `obstacle-2`, ...
     base: Scene  #: the scene at the start, without the rover
-    sun: SunPath
+    sun: SunParameters
+    target_number: int  #: number of the target's rock
     target_triangles: Float64[np.ndarray, "triangles 3 3"]  #: the target's rock as rendered, which is the truth
     _latest: tuple[int, Scene] | None = field(default=None, repr=False)
 
     @classmethod
-    def of(
-        cls,
-        p: RoverScenarioParameters,
-        pixel_rad: float,
-        streams: Streams,
-        load_ground: LoadGround = SiteGround.from_bank,
-    ) -> RunWorld:
-        """The world of a run."""
+    def of(cls, p: RoverScenarioParameters, pixel_rad: float, streams: Streams, load_ground: LoadGround) -> RunWorld:
+        """Create the world of a run."""
         w = p.world
         bare = load_ground(site(w.site), terrain_parameters(w), w.bank_seed, w.terrain)
-        ground = place_rocks(p, bare, streams.generator("placed rocks"))
-        path = SunPath(p.sun)
+        ground, rocks = place_rocks(p, bare, streams.generator("placed rocks"))
         reach = p.start.distance_m + BACKGROUND_M
         middle, half = p.bearing_rad + np.pi, np.radians(w.background_half_deg)
         eye = Eye(w.east_m, w.north_m, EYE_HEIGHT_M, pixel_rad, float(middle), float(half), reach)
-        lines = 2 * int(np.ceil(np.arcsinh(reach / MESH_FINEST_M * np.sinh(MESH_GROWTH)) / MESH_GROWTH)) + 1
         clouds = None
         if p.clouds is not None:
             level = float(ground.surface.height(w.east_m, w.north_m))
             clouds = CloudLayer.draw(p.clouds, streams.generator("clouds"), ground_m=level)
         scene = replace(
-            site_scene(ground, eye, path.held(0, ground.site.environment.sun_radius_rad)),
+            site_scene(ground, eye, p.sun.in_interval(0, ground.site.environment.sun_radius_rad)),
             mesh_finest_m=MESH_FINEST_M,
             mesh_reach_m=reach,
-            mesh_lines=lines,
+            mesh_lines=2 * int(np.ceil(np.arcsinh(reach / MESH_FINEST_M * np.sinh(MESH_GROWTH)) / MESH_GROWTH)) + 1,
             clouds=clouds,
         )
-        return cls(ground, scene, path, _target_triangles(ground, scene.objects))
-
-    @property
-    def surface(self) -> Surface:
-        """The ground's surface."""
-        return self.ground.surface
-
-    @property
-    def site(self) -> Site:
-        """The site."""
-        return self.ground.site
-
-    @property
-    def rocks(self) -> RockField:
-        """All rocks of the ground; placed ones have names."""
-        if self.ground.rocks is None:
-            raise ValueError("a furnished ground has rocks")
-        return self.ground.rocks
-
-    @property
-    def target_number(self) -> int:
-        """Number of the target's rock."""
-        return self.rocks.by_name(TARGET)
-
-    @property
-    def placed_m(self) -> Float64[np.ndarray, "rocks 3"]:
-        """East, north and diameter of the target's rock and of the obstacles."""
-        numbers = list(self.rocks.names.values())
-        return np.column_stack([self.rocks.position_m[numbers, :2], self.rocks.diameter_m[numbers]])
+        # a periodic scene may hold copies of the target's rock: take the one nearest to its position
+        number, objects = rocks.by_name(TARGET), scene.objects
+        bodies = np.flatnonzero(objects.names == number)
+        offsets = objects.spheres[bodies, :2] - rocks.position_m[number][:2]
+        nearest = bodies[np.argmin(np.linalg.norm(offsets, axis=1))]
+        first, end = objects.first_triangle[nearest : nearest + 2]
+        return cls(ground, rocks, scene, p.sun, number, objects.triangles[first:end])
 
     def face_m(self, p: RoverScenarioParameters) -> float:
         """Distance of the designated point from the rock's middle along the horizontal line to the start, metres.
@@ -162,95 +110,140 @@ class RunWorld:
 
     def scene(self, time_s: float) -> Scene:
         """The scene at a time of the run, without the rover. The sun is held for `SunParameters.held_s`."""
-        step = self.sun.step(time_s)
-        if self._latest is None or self._latest[0] != step:
-            sun = self.sun.held(step, self.site.environment.sun_radius_rad)
-            self._latest = (step, self.base.in_light(sun, self.ground.photometry(sun)))
+        interval = int(time_s // self.sun.held_s)
+        if self._latest is None or self._latest[0] != interval:
+            sun = self.sun.in_interval(interval, self.ground.site.environment.sun_radius_rad)
+            self._latest = (interval, self.base.in_light(sun, self.ground.photometry(sun)))
         return self._latest[1]
-
-    def shadow_caster(
-        self,
-        rover: RoverParameters,
-        stance: Stance,
-        mast: MastGeometry,
-        angles_rad: tuple[float, float],
-        target_m: Float64[np.ndarray, "3"],
-        time_s: float,
-    ) -> Objects | None:
-        """The rover's mesh if its shadow may fall into a subframe about the target, else None."""
-        seen_m = SEEN_FRACTION * float(np.linalg.norm(target_m - stance.world_from_rover.translation))
-        sun = self.scene(time_s).sun.direction
-        # the mesh is built only where its bounding sphere may cast a shadow there
-        if not may_cast_shadow(rover_sphere(rover, stance, mast), sun, target_m, seen_m):
-            return None
-        body = rover_objects(rover, stance, mast, *angles_rad)
-        return body if may_cast_shadow(body.spheres, sun, target_m, seen_m) else None
 
     def brightness(self, time_s: float) -> float:
         """Direct sunlight on the ground relative to 1 AU."""
-        air = self.site.environment
+        air = self.ground.site.environment
         elevation = float(np.arcsin(self.scene(time_s).sun.direction[2]))
         return air.direct_share(elevation) * air.solar_irradiance
 
 
-def place_rocks(p: RoverScenarioParameters, bare: SiteGround, rng: np.random.Generator) -> SiteGround:
-    """The ground with the target's rock and obstacles; the bank's rocks on them and on the route are removed."""
-    field = RockField.on(bare.surface, RockParameters(abundance=0.0, placed=placed_rocks(p)), rng)
-    if bare.rocks is None:
-        return replace(bare, rocks=field)
-    kept = _kept_rocks(p, bare.rocks, field)
-    arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(field, name), getattr(bare.rocks, name)[kept]]) for name in _ROCK_ARRAYS
-    }
-    return replace(bare, rocks=replace(field, **arrays))
-
-
-def placed_rocks(p: RoverScenarioParameters) -> tuple[PlacedRock, ...]:
-    """The target's rock and the obstacles, in world coordinates."""
-    t, w = p.target, p.world
-    bearing = p.bearing_rad
+def place_rocks(p: RoverScenarioParameters, bare: SiteGround, rng: np.random.Generator) -> tuple[SiteGround, RockField]:
+    """Place the target's rock and the obstacles; remove the bank's rocks on them, and large ones near the route."""
+    bearing, centre = p.bearing_rad, np.array([p.world.east_m, p.world.north_m])
     along, right = np.array([np.sin(bearing), np.cos(bearing)]), np.array([-np.cos(bearing), np.sin(bearing)])
-    rocks = [
-        PlacedRock(
-            name=TARGET,
-            east_m=w.east_m,
-            north_m=w.north_m,
-            **t.model_dump(include={"diameter_m", "height_m", "shape", "yaw_deg"}),
-        )
-    ]
+    shape = p.target.model_dump(include={"diameter_m", "height_m", "shape", "yaw_deg"})
+    placed = [PlacedRock(name=TARGET, east_m=p.world.east_m, north_m=p.world.north_m, **shape)]
     for number, one in enumerate(p.obstacles, start=1):
-        east, north = np.array([w.east_m, w.north_m]) + one.towards_start_m * along + one.right_m * right
+        east, north = centre + one.towards_start_m * along + one.right_m * right
         size = one.model_dump(include={"diameter_m", "height_m"})
-        rocks.append(PlacedRock(name=f"obstacle-{number}", east_m=float(east), north_m=float(north), **size))
-    return tuple(rocks)
+        placed.append(PlacedRock(name=f"obstacle-{number}", east_m=float(east), north_m=float(north), **size))
+    rocks = RockField.on(bare.surface, RockParameters(abundance=0.0, placed=tuple(placed)), rng)
+    if bare.rocks is None:
+        return replace(bare, rocks=rocks), rocks
+    near = _distances(bare.rocks, centre) < p.start.distance_m + CLEARED_M
+    kept = ~near | (bare.rocks.diameter_m <= p.world.largest_near_m)
+    for position, diameter in zip(rocks.position_m[:, :2], rocks.diameter_m, strict=True):
+        kept &= _distances(bare.rocks, position) - 0.6 * (bare.rocks.diameter_m + diameter) > MIN_GAP_M
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(rocks, name), getattr(bare.rocks, name)[kept]]) for name in _ROCK_ARRAYS
+    }
+    rocks = replace(rocks, **arrays)
+    return replace(bare, rocks=rocks), rocks
 
 
-def _kept_rocks(p: RoverScenarioParameters, rocks: RockField, placed: RockField) -> Bool[np.ndarray, "rocks"]:
-    """Which of the bank's rocks stay: small ones near the route, all of them beyond, none on a placed rock."""
-    w = p.world
-    near = _distance(rocks, np.array([w.east_m, w.north_m])) < p.start.distance_m + CLEARED_M
-    kept = ~near | (rocks.diameter_m <= w.largest_near_m)
-    for position, diameter in zip(placed.position_m[:, :2], placed.diameter_m, strict=True):
-        apart = _distance(rocks, position) - 0.6 * (rocks.diameter_m + diameter)
-        kept &= apart > FREE_M
-    return kept
-
-
-def _distance(rocks: RockField, position: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "rocks"]:
-    """Horizontal distance of the rocks from a position on the periodic ground."""
+def _distances(rocks: RockField, position: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "rocks"]:
+    """Horizontal distances of rocks from a position on the periodic ground."""
     away = rocks.position_m[:, :2] - position
     away -= rocks.period_m * np.round(away / rocks.period_m)
-    distance: Float64[np.ndarray, "rocks"] = np.hypot(away[:, 0], away[:, 1])
-    return distance
+    return np.asarray(np.hypot(away[:, 0], away[:, 1]))
 
 
-def _target_triangles(ground: SiteGround, objects: Objects) -> Float64[np.ndarray, "triangles 3 3"]:
-    """Triangles of the body of the target's name that is nearest to its position: a periodic scene may hold copies."""
-    if ground.rocks is None:
-        raise ValueError("the ground has no rocks")
-    number = ground.rocks.by_name(TARGET)
-    bodies = np.flatnonzero(objects.names == number)
-    position = ground.rocks.position_m[number]
-    nearest = bodies[np.argmin(np.linalg.norm(objects.spheres[bodies, :2] - position[:2], axis=1))]
-    first, end = objects.first_triangle[nearest : nearest + 2]
-    return objects.triangles[first:end]
+@dataclass
+class Rig:
+    """A mast and its stereo pair, with their errors."""
+
+    head: StereoHead  #: the pair, true and calibrated
+    calibrated: MastCalibration  #: the calibration that flight software is given
+    left: CameraModel  #: the true left camera in the head's frame
+    right: CameraModel  #: the true right camera in the head's frame
+    mast: Mast
+    state: MastState  #: present angles
+    motors: np.random.Generator  #: stream of the motors' stopping errors
+
+    @classmethod
+    def of(cls, p: RoverScenarioParameters, streams: Streams) -> Rig:
+        """Draw the errors of a run's mast and pair."""
+        design = p.camera.mast()
+        head = StereoHead.drawn(design, p.stereo, streams.generator("stereo calibration"))
+        mast = Mast.drawn(p.pointing, design.geometry, streams.generator("mast zeros"))
+        left, right, motors = head.true.left, head.true.right, streams.generator("mast motors")
+        return cls(head, head.calibrated, left, right, mast, mast.rest, motors)
+
+    @property
+    def pixel_rad(self) -> float:
+        """Angle of a pixel in the middle of the frame."""
+        return 1.0 / self.left.focal_lengths[0]
+
+    @property
+    def rover_from_head(self) -> RigidTransform:
+        """True pose of the head in the rover frame."""
+        return self.mast.rover_from_head(self.state)
+
+    def eyes(self, world_from_head: RigidTransform) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+        """True positions of the left and the right camera, world, metres."""
+        left, right = world_from_head.apply(np.stack([self.left.c, self.right.c]))
+        return left, right
+
+    def point(self, azimuth_rad: float, elevation_rad: float) -> None:
+        """Point the mast; it stays where its encoders read these angles already."""
+        if self.state.readings_rad != (azimuth_rad, elevation_rad):
+            self.state = self.mast.point(self.state, azimuth_rad, elevation_rad, self.motors)
+
+    def range_m(self, position_rover: Float64[np.ndarray, "3"]) -> float:
+        """Estimated distance of a position from the left camera."""
+        camera = self.calibrated.left.moved(self.calibrated.geometry.rover_from_head(*self.state.readings_rad))
+        return float(np.linalg.norm(position_rover - camera.c))
+
+
+@dataclass
+class Vehicle:
+    """A rover on its route: true stance, and pose estimate by odometry."""
+
+    rover: RoverParameters
+    ground: Ground
+    soil: Soil
+    stance: Stance
+    odometer: Odometer
+    estimate: PoseEstimate
+    slip_stream: np.random.Generator
+    odometry_stream: np.random.Generator
+
+    @classmethod
+    def at_start(cls, p: RoverScenarioParameters, world: RunWorld, rig: Rig, streams: Streams) -> Vehicle:
+        """Settle the rover at its start, its pose known there."""
+        rover = MER if p.camera.preset.startswith("mer") else ROCKY_8
+        bearing = p.bearing_rad
+        away = np.array([np.sin(bearing), np.cos(bearing)])
+        azimuth = bearing + np.pi - np.radians(p.start.target_azimuth_deg)
+        ahead = np.array([np.sin(azimuth), np.cos(azimuth)])
+        left = np.array([-ahead[1], ahead[0]])
+        base = rig.calibrated.geometry.base_m
+        target = np.array([p.world.east_m, p.world.north_m])
+        position = target + (world.face_m(p) + p.start.distance_m) * away - base[0] * ahead - base[1] * left
+        ground: Ground = world.ground.surface
+        if p.world.rocks_underfoot:
+            half = p.start.distance_m + ROUTE_MARGIN_M
+            ground = RockyGround.of(ground, world.base.objects.triangles, (p.world.east_m, p.world.north_m), half)
+        stance = settle(rover, ground, float(position[0]), float(position[1]), float(azimuth))
+        odometer = Odometer.drawn(p.odometry, stance.world_from_rover, streams.generator("odometry"))
+        soil = Soil.draw(p.slip, streams.generator("soil"))
+        generators = streams.generator("slip"), streams.generator("odometry noise")
+        return cls(rover, ground, soil, stance, odometer, odometer.first, *generators)
+
+    @property
+    def estimated(self) -> RigidTransform:
+        """World pose of the rover as estimated on board."""
+        return self.estimate.world_from_rover
+
+    def drive(self, command: DriveCommand, visual: bool) -> Drive:
+        """Drive a command and update the estimate."""
+        driven = drive(self.rover, self.ground, self.soil, self.stance, command, self.slip_stream)
+        self.estimate = self.odometer.step(self.estimate, driven, self.odometry_stream, visual)
+        self.stance = driven.end
+        return driven

@@ -1,31 +1,13 @@
 """Dynamics of vehicles: true motion over time of landers, helicopters and rovers."""
 
-from marsyard.sim.dynamics.chain import SwingParameters
 from marsyard.sim.dynamics.driving import Drive, DriveStep, SlipParameters, Soil, drive
 from marsyard.sim.dynamics.rover import MER, ROCKY_8, Ground, RockyGround, RoverParameters, Stance, settle
-from marsyard.sim.dynamics.swing import SwingDescent
+from marsyard.sim.dynamics.swing import SwingDescent, SwingParameters
 from marsyard.sim.dynamics.trajectory import Motion, Resting, State, Trajectory
 from marsyard.sim.dynamics.wind import Wind, WindParameters
 
 __all__ = [
-    "MER",
-    "ROCKY_8",
-    "Drive",
-    "DriveStep",
-    "Ground",
-    "Motion",
-    "Resting",
-    "RockyGround",
-    "RoverParameters",
-    "SlipParameters",
-    "Soil",
-    "Stance",
-    "State",
-    "SwingDescent",
-    "SwingParameters",
-    "Trajectory",
-    "Wind",
-    "WindParameters",
-    "drive",
-    "settle",
-]
+    "MER", "ROCKY_8", "Drive", "DriveStep", "Ground", "Motion", "Resting", "RockyGround", "RoverParameters",
+    "SlipParameters", "Soil", "Stance", "State", "SwingDescent", "SwingParameters", "Trajectory", "Wind",
+    "WindParameters", "drive", "settle",
+]  # fmt: skip

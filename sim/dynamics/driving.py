@@ -151,12 +151,7 @@ class Drive:
 
 
 def drive(
-    rover: RoverParameters,
-    ground: Ground,
-    soil: Soil,
-    start: Stance,
-    command: DriveCommand,
-    rng: np.random.Generator,
+    rover: RoverParameters, ground: Ground, soil: Soil, start: Stance, command: DriveCommand, rng: np.random.Generator
 ) -> Drive:
     """Execute one command: forward, backward, along an arc, sideways, or a turn in place.
 

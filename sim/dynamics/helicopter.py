@@ -23,7 +23,11 @@ from scipy.interpolate import BPoly
 from marsyard.sim.dynamics.trajectory import Motion, Trajectory, attitudes_and_body_rates, check_times
 from marsyard.sim.parameters import Fraction, Parameters, Positive, bounded
 
+Vector = Float64[np.ndarray, "3"]
 Angle = Annotated[float, Field(ge=0.0, le=45.0)]
+
+#: Breakpoints within a pass, with small changes of the speed.
+_BREAKPOINTS = 4
 
 
 class HelicopterParameters(Parameters):
@@ -139,41 +143,42 @@ class HelicopterFlight(Trajectory):
         roll, roll_rate = self.tilt_across.derivatives(times_s)
         angle_rates = np.stack([self.platform.derivative()(times_s), pitch_rate, roll_rate], axis=-1)
         attitudes, rates = attitudes_and_body_rates(np.stack([yaw, pitch, roll], axis=-1), angle_rates)
-        derivatives = [self._displacement(times_s, order) for order in range(3)]
+        forward = np.array([np.sin(self.azimuth_rad), np.cos(self.azimuth_rad), 0.0])
+        left = np.array([-forward[1], forward[0], 0.0])
+        derivatives = []
+        for order in range(3):
+            along, across, up = (curve.derivative(order)(times_s) for curve in (self.along, self.across, self.up))
+            derivatives.append(np.outer(along, forward) + np.outer(across, left))
+            derivatives[order][:, 2] += up
         derivatives[0] = self.origin_m + derivatives[0]
         return Motion.from_accelerations(times_s, derivatives, attitudes, rates, self.gravity_m_s2)
 
-    def _displacement(self, times_s: Float64[np.ndarray, "n"], order: int) -> Float64[np.ndarray, "n 3"]:
-        """Position relative to the origin (order 0) or a derivative of it, world axes."""
-        along, across, up = (one.derivative(order)(times_s) for one in (self.along, self.across, self.up))
-        forward = np.array([np.sin(self.azimuth_rad), np.cos(self.azimuth_rad), 0.0])
-        left = np.array([-forward[1], forward[0], 0.0])
-        displacement: Float64[np.ndarray, "n 3"] = np.outer(along, forward) + np.outer(across, left)
-        displacement[:, 2] += up
-        return displacement
-
 
 def helicopter_flight(
-    parameters: HelicopterParameters,
-    origin_m: Float64[np.ndarray, "3"],
-    azimuth_rad: float,
-    gravity_m_s2: float,
-    rng: np.random.Generator,
+    p: HelicopterParameters, origin_m: Vector, azimuth_rad: float, gravity_m_s2: float, rng: np.random.Generator
 ) -> HelicopterFlight:
     """Draw a flight along a line through a point of the ground."""
-    p = parameters
-    first = 0.5 * p.fly_over_s + p.approach_s
+    half = 0.5 * p.fly_over_s
+    first = half + p.approach_s
     starts = [first + number * (p.pass_s + p.turn_s) for number in range(p.passes)]
     passes = tuple(FlownPass(k, start, start + p.pass_s, 1 - 2 * (k % 2)) for k, start in enumerate(starts))
-    half = 0.5 * p.fly_over_s
     fly_overs = ((-half, half), (p.between_s - half, p.between_s + half))
     times = np.arange(fly_overs[0][0], fly_overs[1][1] + 15.0, 15.0)
-    # height and platform angle are constant over the targets; a platform that rotates with the flight is turned by half
-    # a turn after each pass, left and right in turns
+    # points of the curves: (time, value, rate) or (time, value); height and platform angle are constant over the
+    # targets, and a platform that rotates with the flight rotates by half a turn after each pass, in alternate senses
+    reach, rate = half * p.fly_over_m_s, p.fly_over_m_s
+    positions = [point for start, end in fly_overs for point in ((start, -reach, rate), (end, reach, rate))]
+    heights = [(time, p.fly_over_m, 0.0) for times_s in fly_overs for time in times_s]
+    angles = [(time, 0.0) for times_s in fly_overs for time in times_s]
     gain = p.climb_m_s * p.pass_s
-    heights = [(time, p.fly_over_m, 0.0) for fly_over in fly_overs for time in fly_over]
-    angles = [(time, 0.0) for fly_over in fly_overs for time in fly_over]
+    fraction = np.linspace(0.0, 1.0, _BREAKPOINTS + 2)
     for one in passes:
+        changes = p.speed_change_m_s * rng.standard_normal(fraction.size)
+        changes[[0, -1]] = 0.0
+        distances = one.direction * p.length_m * (fraction - 0.5)
+        speeds = one.direction * (p.speed_m_s + changes)
+        pass_times = one.start_s + fraction * (one.end_s - one.start_s)
+        positions += list(zip(pass_times.tolist(), distances.tolist(), speeds.tolist(), strict=True))
         height = p.lowest_m + one.number * gain
         heights += [(one.start_s, height, p.climb_m_s), (one.end_s, height + gain, p.climb_m_s)]
         angle = np.pi if one.direction < 0 and p.turns_with_flight else 0.0
@@ -181,7 +186,7 @@ def helicopter_flight(
     return HelicopterFlight(
         origin_m=origin_m,
         azimuth_rad=azimuth_rad,
-        along=_along_curve(p, passes, fly_overs, rng),
+        along=_moving_curve(sorted(positions)),
         across=_rest_curve(times, p.wander_m * rng.standard_normal(times.size)),
         up=_moving_curve(sorted(heights)),
         platform=_rest_curve(*np.array(sorted(angles)).T),
@@ -191,30 +196,6 @@ def helicopter_flight(
         fly_overs_s=fly_overs,
         gravity_m_s2=gravity_m_s2,
     )
-
-
-#: Breakpoints within a pass, with small changes of the speed.
-_BREAKPOINTS = 4
-
-
-def _along_curve(
-    p: HelicopterParameters,
-    passes: Sequence[FlownPass],
-    fly_overs_s: Sequence[tuple[float, float]],
-    rng: np.random.Generator,
-) -> BPoly:
-    reach = 0.5 * p.fly_over_s * p.fly_over_m_s
-    (first, second), (third, fourth) = fly_overs_s
-    points = [(first, -reach, p.fly_over_m_s), (second, reach, p.fly_over_m_s)]
-    for one in passes:
-        fraction = np.linspace(0.0, 1.0, _BREAKPOINTS + 2)
-        changes = p.speed_change_m_s * rng.standard_normal(fraction.size)
-        changes[[0, -1]] = 0.0
-        positions = one.direction * p.length_m * (fraction - 0.5)
-        speeds = one.direction * (p.speed_m_s + changes)
-        times = one.start_s + fraction * (one.end_s - one.start_s)
-        points += list(zip(times.tolist(), positions.tolist(), speeds.tolist(), strict=True))
-    return _moving_curve([*points, (third, -reach, p.fly_over_m_s), (fourth, reach, p.fly_over_m_s)])
 
 
 def _draw_tilt(

@@ -41,7 +41,7 @@ from marsyard.sim.dynamics.trajectory import Motion, Trajectory, check_times
 from marsyard.sim.files import check_regular
 from marsyard.sim.parameters import Parameters
 
-#: Fewest poses that determine an acceleration.
+#: Minimum number of poses that determine an acceleration.
 MIN_POSES = 4
 #: Largest rotation from one pose to the next: the interpolation between larger ones is ambiguous.
 MAX_ROTATION_DEG = 90.0
@@ -54,7 +54,7 @@ UNIT_TOLERANCE = 5e-3
 MAX_BYTES = 1 << 29
 #: Longest table that is read, independent of compression.
 MAX_ROWS = 5_000_000
-#: Most poses sampled from SPICE kernels: five hours at 50 Hz.
+#: Maximum number of poses sampled from SPICE kernels: five hours at 50 Hz.
 MAX_SPICE_POSES = 1_000_000
 #: End of the name of a file of SPICE kernels.
 SUFFIX = ".spice.toml"
@@ -152,7 +152,15 @@ def read_poses(path: str | Path) -> RecordedPoses:
 @lru_cache(maxsize=_MAX_CACHED_FILES)
 def _read_file(path: str, _changed_ns: int, size: int) -> RecordedPoses:
     if path.endswith(SUFFIX):
-        return _read_kernels(path)
+        try:
+            return _check_poses(path, *_sample_kernels(path))
+        except ImportError as fault:
+            install = "SPICE kernels need the package spiceypy: pip install marsyard[spice]"
+            raise TrajectoryFileError(f"{path}: {install}") from fault
+        except TrajectoryFileError:
+            raise
+        except (OSError, ValueError) as fault:
+            raise TrajectoryFileError(f"{path}: {fault}") from fault
     if size > MAX_BYTES:
         raise TrajectoryFileError(f"{path}: is larger than {MAX_BYTES >> 20} MiB; {_ALLOWED} is needed")
     try:
@@ -174,44 +182,38 @@ def _read_file(path: str, _changed_ns: int, size: int) -> RecordedPoses:
     return _check_poses(path, digest, values)
 
 
-def _read_kernels(path: str) -> RecordedPoses:
-    try:
-        return _check_poses(path, *_spice_poses(path))
-    except ImportError as fault:
-        install = "SPICE kernels need the package spiceypy: pip install marsyard[spice]"
-        raise TrajectoryFileError(f"{path}: {install}") from fault
-    except TrajectoryFileError:
-        raise
-    except (OSError, ValueError) as fault:
-        raise TrajectoryFileError(f"{path}: {fault}") from fault
-
-
 def _read_table(path: str, head: bytes) -> Float64[np.ndarray, "n 8"]:
     """Time, position and quaternion (x, y, z, w) of each row; the first bytes determine the format."""
     first = head.decode("utf-8", errors="replace").lstrip("\ufeff").split("\n", 1)[0].strip()
     if head.startswith(b"PAR1"):
         return _read_parquet(path)
+    import pandas as pd  # imported here: slow, and few campaigns use such a file
+
     if first.startswith("#timestamp") and "," in first:
-        return _read_euroc(path)
+        frame = pd.read_csv(path, skiprows=1, header=None, usecols=range(8), dtype={0: np.int64})
+        values = frame.to_numpy(dtype=np.float64)
+        # nanoseconds since 1970 exceed the precision of a float: differences are taken first
+        values[:, 0] = 1e-9 * (frame[0] - int(frame[0].iloc[0])).to_numpy(dtype=np.float64)
+        values[:, 0] += 1e-9 * int(frame[0].iloc[0])
+        return np.asarray(values[:, [0, 1, 2, 3, 5, 6, 7, 4]])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # empty files are reported below; cells without a column name are ignored
         if "," in first and not first.startswith("#"):
-            return _read_csv(path)
+            frame = pd.read_csv(
+                path,
+                usecols=lambda name: name.strip() in COLUMNS,
+                dtype=np.float64,
+                index_col=False,
+                skipinitialspace=True,
+                na_values=list(_MISSING),
+                float_precision="round_trip",
+            )
+            names = [name.strip() for name in frame.columns]
+            return np.asarray(frame.to_numpy()[:, _column_indices(path, names)])
         values = np.loadtxt(path, comments="#", ndmin=2)
     if values.size and values.shape[1] != 8:
         raise TrajectoryFileError(f"{path}: has {values.shape[1]} numbers in a line; allowed: {_ALLOWED}")
     return values.reshape(-1, 8)
-
-
-def _read_euroc(path: str) -> Float64[np.ndarray, "n 8"]:
-    import pandas as pd  # imported here: slow, and few campaigns use such a file
-
-    frame = pd.read_csv(path, skiprows=1, header=None, usecols=range(8), dtype={0: np.int64})
-    values = frame.to_numpy(dtype=np.float64)
-    # nanoseconds since 1970 exceed the precision of a float: differences are taken first
-    values[:, 0] = 1e-9 * (frame[0] - int(frame[0].iloc[0])).to_numpy(dtype=np.float64)
-    values[:, 0] += 1e-9 * int(frame[0].iloc[0])
-    return np.asarray(values[:, [0, 1, 2, 3, 5, 6, 7, 4]])
 
 
 def _read_parquet(path: str) -> Float64[np.ndarray, "n 8"]:
@@ -238,22 +240,6 @@ def _read_parquet(path: str) -> Float64[np.ndarray, "n 8"]:
             values[read : read + batch.num_rows, column] = numbers.to_numpy(zero_copy_only=False)
         read += batch.num_rows
     return values[:read]
-
-
-def _read_csv(path: str) -> Float64[np.ndarray, "n 8"]:
-    """A text table with a header; cells without a number become NaN."""
-    import pandas as pd  # imported here: slow, and few campaigns use such a file
-
-    frame = pd.read_csv(
-        path,
-        usecols=lambda name: name.strip() in COLUMNS,
-        dtype=np.float64,
-        index_col=False,
-        skipinitialspace=True,
-        na_values=list(_MISSING),
-        float_precision="round_trip",
-    )
-    return np.asarray(frame.to_numpy()[:, _column_indices(path, [name.strip() for name in frame.columns])])
 
 
 def _column_indices(path: str, names: Sequence[str]) -> list[int]:
@@ -301,8 +287,8 @@ class SpiceFlight(Parameters):
     step_s: Annotated[float, Field(gt=0.0, le=60.0, description="time between poses, s")]
 
 
-def _spice_poses(path: str) -> tuple[str, Float64[np.ndarray, "n 8"]]:
-    """SHA-256 of the file with its kernels; for each pose time (s from `begin`), position (m), quaternion (xyzw).
+def _sample_kernels(path: str) -> tuple[str, Float64[np.ndarray, "n 8"]]:
+    """Sample poses: time (s from `begin`), position (m), quaternion (xyzw); SHA-256 of the file with its kernels.
 
     Raises ValueError for a fault of the file or of a kernel, ImportError without the package spiceypy.
     """
@@ -318,16 +304,12 @@ def _spice_poses(path: str) -> tuple[str, Float64[np.ndarray, "n 8"]]:
             raise ValueError(f"the kernel {kernel} is not there")
         with kernel.open("rb") as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
-    return digest.hexdigest(), _sample_kernels(flight, [str(kernel) for kernel in kernels])
-
-
-def _sample_kernels(flight: SpiceFlight, kernels: list[str]) -> Float64[np.ndarray, "n 8"]:
     import spiceypy
     from spiceypy.utils.exceptions import SpiceyError
 
     try:
         # the pool belongs to the process: kernels loaded by other code stay in it
-        with spiceypy.KernelPool(kernels):
+        with spiceypy.KernelPool([str(kernel) for kernel in kernels]):
             begin, end = (float(spiceypy.str2et(utc)) for utc in (flight.begin, flight.end))
             count = int(np.floor((end - begin) / flight.step_s + 1e-9)) + 1
             if not 1 < count <= MAX_SPICE_POSES:
@@ -340,4 +322,4 @@ def _sample_kernels(flight: SpiceFlight, kernels: list[str]) -> Float64[np.ndarr
         words = [getattr(error, "short", ""), *str(getattr(error, "long", "") or error).split()]
         raise ValueError(f"SPICE: {' '.join(words).strip()[:300]}") from error
     quaternions = Rotation.from_matrix(rotations).as_quat()
-    return np.concatenate([times[:, None], 1e3 * np.asarray(positions), quaternions], axis=1)
+    return digest.hexdigest(), np.concatenate([times[:, None], 1e3 * np.asarray(positions), quaternions], axis=1)

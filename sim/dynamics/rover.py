@@ -31,6 +31,8 @@ from marsyard.sim.frames import rigid, turn_matrix
 from marsyard.sim.parameters import Parameters, bounded
 
 Metres = Annotated[float, Field(gt=0.0, le=5.0)]
+Six = Float64[np.ndarray, "6"]
+WheelPoints = Float64[np.ndarray, "6 3"]
 
 #: Names of the wheels in the order of all arrays: two columns, left and right, of three.
 WHEELS = ("left front", "left middle", "left rear", "right front", "right middle", "right rear")
@@ -56,7 +58,6 @@ class Ground(Protocol):
 
     def height(self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
         """Height of the ground at world positions, metres."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,16 @@ class RockyGround:
         """
         cells = 2 * int(np.ceil(half_m / CELL_M)) + 1
         corner = np.array(centre_m) - 0.5 * (cells - 1) * CELL_M
-        points = _sample_triangles(triangles)
+        # sample points on the triangles, at most `_SAMPLE_SPACING` cells apart
+        edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
+        steps = np.ceil(edges / (_SAMPLE_SPACING * CELL_M)).astype(np.int64)
+        samples = [np.empty((0, 3))]
+        for count in np.unique(steps):
+            i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1))
+            first, second = i[i + j <= count] / count, j[i + j <= count] / count
+            weights = np.stack([1.0 - first - second, first, second], axis=1)
+            samples.append(np.einsum("pk,tki->tpi", weights, triangles[steps == count]).reshape(-1, 3))
+        points = np.concatenate(samples)
         cell = np.rint((points[:, :2] - corner) / CELL_M).astype(np.int64)
         inside = np.all((cell >= 0) & (cell < cells), axis=1)
         column, row = cell[inside].T
@@ -106,19 +116,6 @@ class RockyGround:
         cells = [(y - self.corner_m[1]) / CELL_M, (x - self.corner_m[0]) / CELL_M]
         above = map_coordinates(self.above_m, cells, order=1, mode="constant", prefilter=False)
         return np.asarray(self.ground.height(x, y) + above)
-
-
-def _sample_triangles(triangles: Float64[np.ndarray, "triangles 3 3"]) -> Float64[np.ndarray, "points 3"]:
-    """Points on triangles, at most `_SAMPLE_SPACING` cells apart."""
-    edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2).max(axis=1)
-    steps = np.ceil(edges / (_SAMPLE_SPACING * CELL_M)).astype(np.int64)
-    parts = [np.empty((0, 3))]
-    for count in np.unique(steps):
-        i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1))
-        first, second = i[i + j <= count] / count, j[i + j <= count] / count
-        weights = np.stack([1.0 - first - second, first, second], axis=1)
-        parts.append(np.einsum("pk,tki->tpi", weights, triangles[steps == count]).reshape(-1, 3))
-    return np.concatenate(parts)
 
 
 class RoverParameters(Parameters):
@@ -159,7 +156,7 @@ class RoverParameters(Parameters):
         return self
 
     @property
-    def wheel_centres_m(self) -> Float64[np.ndarray, "6 3"]:
+    def wheel_centres_m(self) -> WheelPoints:
         """Centres of the wheels on level ground, rover frame, in the order of `WHEELS`."""
         along = np.tile([self.front_m, 0.0, -self.rear_m], 2)
         across = _SIDE * np.tile([self.half_track_m, self.middle_half_track_m, self.half_track_m], 2)
@@ -215,17 +212,7 @@ class Stance:
     world_from_rover: RigidTransform
     differential_rad: float
     bogies_rad: tuple[float, float]
-    gaps_m: Float64[np.ndarray, "6"]
-
-    @property
-    def east_m(self) -> float:
-        """World x of the rover's origin."""
-        return float(self.world_from_rover.translation[0])
-
-    @property
-    def north_m(self) -> float:
-        """World y of the rover's origin."""
-        return float(self.world_from_rover.translation[1])
+    gaps_m: Six
 
     @cached_property
     def _yaw_pitch_roll(self) -> tuple[float, float, float]:
@@ -279,9 +266,7 @@ def settle(
     return Stance(rigid(rotation, np.array([east_m, north_m, unknowns[0]])), differential, (left, right), gaps)
 
 
-def wheel_centres(
-    rover: RoverParameters, differential_rad: float, bogies_rad: tuple[float, float]
-) -> Float64[np.ndarray, "6 3"]:
+def wheel_centres(rover: RoverParameters, differential_rad: float, bogies_rad: tuple[float, float]) -> WheelPoints:
     """Centres of the wheels in the rover frame at the given joint angles, metres."""
     joints = np.array([differential_rad, *bogies_rad])
     return np.asarray(suspension.wheel_centres(rover.wheel_centres_m, *rover.pivots_m, joints))
@@ -304,7 +289,7 @@ class _StanceEquations:
     position_m: Float64[np.ndarray, "2"]
     yaw_rad: float
 
-    def solve(self, start: Float64[np.ndarray, "6"]) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6"]]:
+    def solve(self, start: Six) -> tuple[Six, Six]:
         """Unknowns that close the gaps, and the remaining gaps, by Newton's method: few iterations on most ground.
 
         A wheel's lowest point jumps along its tread. If Newton's method then diverges, or no stance has all wheels on
@@ -320,33 +305,29 @@ class _StanceEquations:
             except np.linalg.LinAlgError:
                 break
 
-        def gaps_of(x: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6"]:
+        def gaps_of(x: Six) -> Six:
             return self._lowest_points(x)[0]
 
-        def jacobian_of(x: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6 6"]:
+        def jacobian_of(x: Six) -> Float64[np.ndarray, "6 6"]:
             return self._jacobian(x, self._lowest_points(x)[1])
 
         solution = least_squares(gaps_of, start, jac=jacobian_of, method="lm", xtol=1e-8, ftol=1e-12)
         return solution.x, solution.fun
 
-    def _jacobian(
-        self, unknowns: Float64[np.ndarray, "6"], points: Float64[np.ndarray, "6 3"]
-    ) -> Float64[np.ndarray, "6 6"]:
+    def _jacobian(self, unknowns: Six, points: WheelPoints) -> Float64[np.ndarray, "6 6"]:
         """Derivatives of the gaps by finite differences, at the lowest point of each tread alone."""
         step = _DIFFERENCE * np.eye(6)
         heights = self._heights(np.concatenate([unknowns - step, unknowns + step]), points[:, None])[..., 0]
         return np.asarray(((heights[6:] - heights[:6]) / (2.0 * _DIFFERENCE)).T)
 
-    def _lowest_points(
-        self, unknowns: Float64[np.ndarray, "6"]
-    ) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6 3"]]:
+    def _lowest_points(self, unknowns: Six) -> tuple[Six, WheelPoints]:
         """Smallest height of each tread above the ground, and its point on the tread, from the wheel's centre."""
         heights = self._heights(unknowns[None], self._tread[None])[0]
         lowest = heights.argmin(axis=1)
         return heights[np.arange(6), lowest], self._tread[lowest]
 
     @cached_property
-    def _shape(self) -> tuple[Float64[np.ndarray, "6 3"], Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
+    def _shape(self) -> tuple[WheelPoints, Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
         return (self.rover.wheel_centres_m, *self.rover.pivots_m)
 
     @cached_property

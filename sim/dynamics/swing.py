@@ -41,29 +41,173 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
+from pydantic import Field, model_validator
 from scipy.integrate import OdeSolution, solve_ivp
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from marsyard.sim.dynamics.chain import Modes, SwingParameters, chain_of
-from marsyard.sim.dynamics.kernels.swing import AXIS, CANOPY, LINE, Chain, WindField, interpolated, packed, slope, truth
+from marsyard.sim.dynamics.kernels import swing as kernels
+from marsyard.sim.dynamics.kernels.swing import CANOPY, Chain
 from marsyard.sim.dynamics.trajectory import Motion, Trajectory, check_times
-from marsyard.sim.dynamics.wind import Wind
+from marsyard.sim.dynamics.wind import Wind, WindParameters
+from marsyard.sim.parameters import bounded
 
 Vector = Float64[np.ndarray, "3"]
 StateVector = Float64[np.ndarray, "22"]
+Constants = tuple[kernels.Array, kernels.Array]
+Phase = Annotated[float, Field(ge=-360.0, le=720.0)]
+Gyration = Annotated[float, Field(ge=0.05, le=5.0)]
 
 #: The integration ends with the camera this far below the height of the thrusters' firing, m: more than a second later.
 BEYOND_FIRING_M = 90.0
 #: Integrated backwards, damped swings grow: a nod of 60 deg/s to twice that in half a minute.
 MAX_LEAD_S = 30.0
-#: With these tolerances finite differences of the flight reproduce its derivatives to 1e-6.
-RELATIVE_TOLERANCE = 1e-9
-ABSOLUTE_TOLERANCE = 1e-9
+#: With these relative and absolute tolerances finite differences of the flight reproduce its derivatives to 1e-6.
+TOLERANCE = 1e-9
+#: Largest ratio of the coning lander's tilt to the line's for which the linear theory gives an initial state.
+MAX_LANDER_TILT_RATIO = 1.5
 DOWN = np.array([0.0, 0.0, -1.0])
+
+
+class SwingParameters(WindParameters):
+    """A descent. Angles in degrees, as in campaign files; altitudes above the ground below the first picture.
+
+    Masses are those of the Mars Exploration Rovers (NASA press kit, January 2004: lander with rover 533 kg, backshell
+    with parachute 209 kg), as is the bridle of 20 m. Values marked "assumed" are not published.
+    """
+
+    altitude_first_m: Annotated[float, Field(gt=100.0, le=10000.0, description="of the first picture")] = 2000.0
+    interval_s: Annotated[float, Field(gt=0.1, le=60.0, description="time between pictures")] = 3.75
+    descent_rate_m_s: Annotated[float, bounded(20.0, 200.0, "descent rate of the canopy at the first picture")] = 75.0
+    density_scale_height_m: Annotated[float, bounded(5000.0, 20000.0, "of the atmosphere; CO2 at 220 K")] = 11200.0
+    cone_angle_deg: Annotated[float, bounded(0.0, 45.0, "largest angle of the coning lander from nadir")] = 15.0
+    cone_minor_share: Annotated[float, bounded(-1.0, 1.0, "minor over major half-axis; sign: sense")] = 0.5
+    cone_direction_deg: Annotated[Phase, Field(description="azimuth of the cone's major axis")] = 0.0
+    cone_phase_deg: Annotated[Phase, Field(description="phase of the coning at the first picture")] = 0.0
+    cone_damping_ratio: Annotated[float, bounded(-0.05, 0.2, "damping of small coning over critical (assumed)")] = 0.01
+    nod_rate_deg_s: Annotated[float, bounded(0.0, 120.0, "largest rate of the nodding")] = 20.0
+    nod_direction_deg: Annotated[Phase, Field(description="azimuth of the nodding, relative to the cone's axis")] = 0.0
+    nod_phase_deg: Annotated[Phase, Field(description="phase of the nodding at the first picture")] = 0.0
+    nod_damping_ratio: Annotated[float, bounded(0.0, 0.5, "damping of small nodding by the bridle (assumed)")] = 0.002
+    heading_deg: Annotated[Phase, Field(description="rotation about the lander's axis at the first picture")] = 0.0
+    spin_rate_deg_s: Annotated[float, bounded(-30.0, 30.0, "rate of this rotation at that time")] = 0.0
+    line_length_m: Annotated[float, bounded(10.0, 200.0, "canopy to hinge; bridle 20 m, rest assumed")] = 47.0
+    bridle_length_m: Annotated[float, bounded(1.0, 100.0, "from the backshell to the hinge")] = 20.0
+    canopy_mass_kg: Annotated[float, bounded(1.0, 1000.0, "with lines and entrained air (assumed)")] = 30.0
+    backshell_mass_kg: Annotated[float, bounded(0.0, 5000.0, "backshell without canopy")] = 179.0
+    lander_mass_kg: Annotated[float, bounded(1.0, 5000.0, "lander with rover")] = 533.0
+    mass_centre_m: Annotated[float, bounded(0.1, 10.0, "hinge to the lander's centre of mass (assumed)")] = 1.5
+    gyration_transverse_m: Annotated[Gyration, Field(description="radius across the lander's axis (assumed)")] = 0.5
+    gyration_axial_m: Annotated[Gyration, Field(description="radius about the lander's axis (assumed)")] = 0.5
+    arm_length_m: Annotated[float, bounded(0.0, 10.0, "from the hinge to the camera (assumed)")] = 1.5
+    thruster_firing_m: Annotated[float, bounded(0.0, 1000.0, "height above ground of the thrusters' firing")] = 100.0
+
+    @model_validator(mode="after")
+    def _bridle_is_part_of_line(self) -> SwingParameters:
+        if self.bridle_length_m > self.line_length_m:
+            raise ValueError(
+                f"bridle_length_m is {self.bridle_length_m:.6g}; allowed: up to line_length_m, {self.line_length_m:.6g}"
+            )
+        return self
+
+    @property
+    def _mass_kg(self) -> float:
+        return self.canopy_mass_kg + self.backshell_mass_kg + self.lander_mass_kg
+
+    def _moments(self, lander_at_m: float) -> tuple[float, float]:
+        """First and second moment of mass about the canopy, with the lander's mass at a distance."""
+        backshell_at = self.line_length_m - self.bridle_length_m
+        first = self.backshell_mass_kg * backshell_at + self.lander_mass_kg * lander_at_m
+        return first, self.backshell_mass_kg * backshell_at**2 + self.lander_mass_kg * lander_at_m**2
+
+
+@dataclass(frozen=True)
+class Modes:
+    """Linear coning and nodding modes of the hanging chain, from which a descent's initial state is computed.
+
+    - support_m_s2: mean force of the air over mass: gravity, and braking in air of increasing density
+    - cone_rad_s, nod_rad_s: undamped angular frequencies
+    - lander_tilt_ratio: the lander's tilt over the line's while coning
+    - line_recoil, canopy_recoil_m: the line's tilt and the canopy's displacement per tilt of the nodding lander
+    - normal_force_n: normal force on the canopy per radian of angle of attack
+    - hinge_damping: torque per rate in the bridle, N m s; the canopy's drag adds about 0.003 of critical damping
+    """
+
+    support_m_s2: float
+    cone_rad_s: float
+    nod_rad_s: float
+    lander_tilt_ratio: float
+    line_recoil: float
+    canopy_recoil_m: float
+    normal_force_n: float
+    hinge_damping: float
+
+    @classmethod
+    def of(cls, p: SwingParameters, gravity_m_s2: float) -> Modes:
+        """Compute the modes. Raises ValueError unless the lander nods far faster than it cones."""
+        mass, lander = p._mass_kg, p.lander_mass_kg * p.mass_centre_m
+        inertia = p.lander_mass_kg * p.gyration_transverse_m**2
+        first, second = p._moments(p.line_length_m)
+        support = gravity_m_s2 + p.descent_rate_m_s**2 / (2.0 * p.density_scale_height_m)
+        rigid_first, rigid_second = p._moments(p.line_length_m + p.mass_centre_m)
+        rigid_second += inertia
+        length = rigid_second / rigid_first
+        # kappa = a + 2 ratio V omega and kappa = l omega^2: see marsyard.sim.dynamics.swing
+        damping = p.cone_damping_ratio * p.descent_rate_m_s
+        cone = (damping + np.sqrt(damping**2 + support * length)) / length
+        normal = (mass - rigid_first**2 / rigid_second) * length * cone**2
+        # moments with the canopy's position eliminated: A of the line, B of the lander, C of both
+        a = second - first**2 / mass
+        c = lander * (p.line_length_m - first / mass)
+        b = inertia + lander * (p.mass_centre_m - lander / mass)
+        nod = np.sqrt(lander * support * (1.0 + c / a) / (b - c**2 / a))
+        # forced response of the lander's pendulum to the line's coning
+        tilt_ratio = (lander * (support - normal / mass) + c * cone**2) / (lander * support - b * cone**2)
+        if not 0.0 < tilt_ratio <= MAX_LANDER_TILT_RATIO:
+            raise ValueError(
+                f"gyration_transverse_m of {p.gyration_transverse_m:.6g} with mass_centre_m of {p.mass_centre_m:.6g} "
+                f"makes the lander nod in {2.0 * np.pi / nod:.3g} s, and it cones in {2.0 * np.pi / cone:.3g} s; "
+                "allowed: nods far faster than cones"
+            )
+        return cls(
+            support_m_s2=float(support),
+            cone_rad_s=float(cone),
+            nod_rad_s=float(nod),
+            lander_tilt_ratio=float(tilt_ratio),
+            line_recoil=float(-c / a),
+            canopy_recoil_m=float((first * c / a - lander) / mass),
+            normal_force_n=float(normal),
+            hinge_damping=float(2.0 * p.nod_damping_ratio * nod * (b - c**2 / a) / (1.0 + c / a) ** 2),
+        )
+
+
+def chain_of(p: SwingParameters, modes: Modes, gravity_m_s2: float, canopy_height_m: float) -> Chain:
+    """Constants of the equations of motion; `canopy_height_m` is the canopy's world z at the first picture."""
+    first, second = p._moments(p.line_length_m)
+    largest_rad = np.radians(p.cone_angle_deg) / modes.lander_tilt_ratio
+    # the vertical component of the air's mean force over the cone balances the weight
+    upright = np.cos(largest_rad * np.sqrt(0.5 * (1.0 + p.cone_minor_share**2)))
+    tangential = p._mass_kg * modes.support_m_s2 / (upright * p.descent_rate_m_s**2)
+    return Chain(
+        **p.model_dump(include=set(Chain._fields)),
+        mass_kg=p._mass_kg,
+        first_moment=first,
+        second_moment=second,
+        line_m=p.line_length_m,
+        reach_m=p.arm_length_m,
+        transverse_inertia=p.lander_mass_kg * p.gyration_transverse_m**2,
+        axial_inertia=p.lander_mass_kg * p.gyration_axial_m**2,
+        hinge_damping=modes.hinge_damping,
+        tangential=float(tangential),
+        normal=modes.normal_force_n / p.descent_rate_m_s**2,
+        reference_height_m=canopy_height_m,
+        scale_height_m=p.density_scale_height_m,
+        gravity_m_s2=gravity_m_s2,
+    )
 
 
 @dataclass(frozen=True)
@@ -84,20 +228,30 @@ class Path:
 
     @classmethod
     def integrate(
-        cls,
-        state: StateVector,
-        lead_s: float,
-        max_s: float,
-        event: Callable[..., float],
-        chain: Chain,
-        field: WindField,
+        cls, state: StateVector, lead_s: float, max_s: float, event: Callable[..., float], constants: Constants
     ) -> Path:
         """Integrate from a state at time 0: back by `lead_s`, and forward until `event` passes zero or `max_s`.
 
-        Raises ValueError where the integration fails.
+        `constants` are those of `kernels.pack_constants`. Raises ValueError where the integration fails.
         """
-        before = _integrate(state, -lead_s, None, chain, field)
-        after = _integrate(state, max_s, event, chain, field)
+        event.terminal = True  # type: ignore[attr-defined]
+        parts: list[OdeSolution] = []
+        for end_s, events in ((-lead_s, None), (max_s, event)):
+            solution = solve_ivp(
+                kernels.state_derivative,
+                (0.0, end_s),
+                state,
+                method="DOP853",
+                dense_output=True,
+                rtol=TOLERANCE,
+                atol=TOLERANCE,
+                events=events,
+                args=constants,
+            )
+            if solution.sol is None or not solution.success:
+                raise ValueError(f"the descent cannot be followed beyond {solution.t[-1]:.6g} s: {solution.message}")
+            parts.append(solution.sol)
+        before, after = parts
         steps = [*reversed(before.interpolants), *after.interpolants]
         starts, lengths = np.array([[step.t_old, step.h] for step in steps]).T.copy()
         return cls(
@@ -113,29 +267,10 @@ class Path:
         """State vectors (`marsyard.sim.dynamics.kernels.swing`). Raises ValueError outside of the span."""
         check_times(times_s, self.span_s)
         return np.asarray(
-            interpolated(times_s, self.knots_s, self.starts_s, self.lengths_s, self.states, self.polynomials)
+            kernels.interpolate_states(
+                times_s, self.knots_s, self.starts_s, self.lengths_s, self.states, self.polynomials
+            )
         )
-
-
-def _integrate(
-    state: StateVector, end_s: float, event: Callable[..., float] | None, chain: Chain, field: WindField
-) -> OdeSolution:
-    if event is not None:
-        event.terminal = True  # type: ignore[attr-defined]
-    solution = solve_ivp(
-        slope,
-        (0.0, end_s),
-        state,
-        method="DOP853",
-        dense_output=True,
-        rtol=RELATIVE_TOLERANCE,
-        atol=ABSOLUTE_TOLERANCE,
-        events=event,
-        args=packed(chain, field),
-    )
-    if solution.sol is None or not solution.success:
-        raise ValueError(f"the descent cannot be followed beyond {solution.t[-1]:.6g} s: {solution.message}")
-    return solution.sol
 
 
 @dataclass(frozen=True)
@@ -194,7 +329,7 @@ class SwingDescent(Trajectory):
             return _camera_height(y, chain) - lowest + BEYOND_FIRING_M
 
         max_s = 3.0 * (start_m[2] - ground_height_m) / p.descent_rate_m_s
-        path = Path.integrate(state, lead_s, max_s, height_left, chain, wind.field)
+        path = Path.integrate(state, lead_s, max_s, height_left, kernels.pack_constants(chain, wind.field))
         return cls(p, start_m, wind, ground_height_m, chain, path)
 
     @property
@@ -204,7 +339,9 @@ class SwingDescent(Trajectory):
 
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         """True states at many times. Raises ValueError outside of the span."""
-        positions, velocities, matrices, rates, forces = truth(self.path.at(times_s), self.chain, self.wind.field)
+        positions, velocities, matrices, rates, forces = kernels.compute_truth(
+            self.path.at(times_s), self.chain, self.wind.field
+        )
         return Motion(times_s, positions, velocities, Rotation.from_matrix(matrices, assume_valid=True), rates, forces)
 
     def time_of_altitude(self, altitude_m: float) -> float:
@@ -228,7 +365,7 @@ class SwingDescent(Trajectory):
 
 
 def _camera_height(y: StateVector, chain: Chain) -> float:
-    return float(y[CANOPY + 2] + chain.line_m * y[LINE + 2] + chain.reach_m * y[AXIS + 2])
+    return float(y[CANOPY + 2] + chain.line_m * y[kernels.LINE + 2] + chain.reach_m * y[kernels.AXIS + 2])
 
 
 def _initial_state(p: SwingParameters, modes: Modes, wind: Wind, start_m: Vector) -> StateVector:

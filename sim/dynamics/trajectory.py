@@ -12,6 +12,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.frames import rigid
 
+Times = Float64[np.ndarray, "n"]
+Vectors = Float64[np.ndarray, "n 3"]
+
 
 @dataclass(frozen=True)
 class State:
@@ -40,20 +43,20 @@ class State:
 class Motion:
     """True states at many instants, one in each row; axes as in `State`."""
 
-    times_s: Float64[np.ndarray, "n"]
-    positions_m: Float64[np.ndarray, "n 3"]
-    velocities_m_s: Float64[np.ndarray, "n 3"]
+    times_s: Times
+    positions_m: Vectors
+    velocities_m_s: Vectors
     attitudes: Rotation
-    body_rates_rad_s: Float64[np.ndarray, "n 3"]
-    specific_forces_m_s2: Float64[np.ndarray, "n 3"]
+    body_rates_rad_s: Vectors
+    specific_forces_m_s2: Vectors
 
     @classmethod
     def from_accelerations(
         cls,
-        times_s: Float64[np.ndarray, "n"],
-        derivatives: Sequence[Float64[np.ndarray, "n 3"]],
+        times_s: Times,
+        derivatives: Sequence[Vectors],
         attitudes: Rotation,
-        body_rates_rad_s: Float64[np.ndarray, "n 3"],
+        body_rates_rad_s: Vectors,
         gravity_m_s2: float,
     ) -> Motion:
         """Motion from position, velocity and acceleration in world axes."""
@@ -75,15 +78,13 @@ class Trajectory(Protocol):
     @property
     def span_s(self) -> tuple[float, float]:
         """First and last time at which the motion is defined; infinite for a motion given by a formula."""
-        ...
 
     def state(self, time_s: float) -> State:
         """True state at a time. Raises ValueError outside of the span."""
         return self.motion(np.array([time_s])).state(0)
 
-    def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
+    def motion(self, times_s: Times) -> Motion:
         """True states at many times. Raises ValueError outside of the span."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -99,7 +100,7 @@ class Resting(Trajectory):
         """All times."""
         return -np.inf, np.inf
 
-    def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
+    def motion(self, times_s: Times) -> Motion:
         """True states at many times."""
         count = times_s.size
         zeros = np.zeros((count, 3))
@@ -108,7 +109,7 @@ class Resting(Trajectory):
         return Motion(times_s, np.tile(self.position_m, (count, 1)), zeros, attitudes, zeros, forces)
 
 
-def check_times(times_s: Float64[np.ndarray, "n"], span_s: tuple[float, float], tolerance_s: float = 0.0) -> None:
+def check_times(times_s: Times, span_s: tuple[float, float], tolerance_s: float = 0.0) -> None:
     """Raises ValueError for a time outside of a span."""
     first, last = span_s
     outside = times_s[(times_s < first - tolerance_s) | (times_s > last + tolerance_s)]
@@ -116,9 +117,7 @@ def check_times(times_s: Float64[np.ndarray, "n"], span_s: tuple[float, float], 
         raise ValueError(f"time {outside[0]:.6g} s is outside of the motion; allowed: {first:.6g} to {last:.6g} s")
 
 
-def attitudes_and_body_rates(
-    angles_rad: Float64[np.ndarray, "n 3"], rates_rad_s: Float64[np.ndarray, "n 3"]
-) -> tuple[Rotation, Float64[np.ndarray, "n 3"]]:
+def attitudes_and_body_rates(angles_rad: Vectors, rates_rad_s: Vectors) -> tuple[Rotation, Vectors]:
     """Attitudes, and angular velocities in body axes, from Euler angles (yaw, pitch, roll) and their rates.
 
     The rotation sequence is yaw about z, pitch about the new y axis, roll about the new x axis.

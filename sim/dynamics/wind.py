@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field
 
-from marsyard.sim.dynamics.kernels.swing import WindField, winds
+from marsyard.sim.dynamics.kernels.swing import WindField, wind_profile
 from marsyard.sim.parameters import Parameters, Positive, bounded
 
 #: Shortest gusts, m: two diameters of the canopy, which responds to the mean over its own width.
@@ -75,4 +75,4 @@ class Wind:
 
     def velocities(self, heights_m: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
         """Wind towards east, north and up, m/s, at heights of the world's z, metres."""
-        return np.asarray(winds(heights_m, self.field))
+        return np.asarray(wind_profile(heights_m, self.field))

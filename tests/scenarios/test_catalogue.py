@@ -10,8 +10,7 @@ from marsyard.campaigns.definition.catalogue import catalogue
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.campaigns.store.rows import Row
-from marsyard.scenarios.rover.scenario import SharedDriveScenario
-from marsyard.scenarios.rover.shared import SharedDriveParameters
+from marsyard.scenarios.rover.scenario import SharedDriveParameters, SharedDriveScenario
 from marsyard.scenarios.systems import systems
 from marsyard.sim.streams import Streams
 

@@ -43,13 +43,7 @@ def wheel_centres(rest: Array, rocker_pivot: Array, bogie_pivot: Array, joints: 
 
 @njit(cache=True)
 def tread_points(
-    unknowns: Array,
-    yaw: float,
-    position: Array,
-    rest: Array,
-    rocker_pivot: Array,
-    bogie_pivot: Array,
-    treads: Array,
+    unknowns: Array, yaw: float, position: Array, rest: Array, rocker_pivot: Array, bogie_pivot: Array, treads: Array
 ) -> tuple[Array, Array, Array]:
     """World x, y and z of points of the wheels' treads, each of shape (n, 6, points).
 

@@ -87,7 +87,7 @@ def wind_at(height: float, field: WindField) -> tuple[float, float, float]:
 
 
 @njit(cache=True)
-def winds(heights: Array, field: WindField) -> Array:
+def wind_profile(heights: Array, field: WindField) -> Array:
     """Rows (east, north, up) of the wind at many heights."""
     rows = np.empty((heights.size, 3))
     for i in range(heights.size):
@@ -96,50 +96,51 @@ def winds(heights: Array, field: WindField) -> Array:
 
 
 @njit(cache=True)
-def _dot(a: Array, i: int, b: Array, j: int) -> float:
-    return float(a[i] * b[j] + a[i + 1] * b[j + 1] + a[i + 2] * b[j + 2])
+def _dot(a: Array, b: Array) -> float:
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 @njit(cache=True)
-def _cross(a: Array, i: int, b: Array, j: int) -> Array:
-    out = np.empty(3)
-    out[0] = a[i + 1] * b[j + 2] - a[i + 2] * b[j + 1]
-    out[1] = a[i + 2] * b[j] - a[i] * b[j + 2]
-    out[2] = a[i] * b[j + 1] - a[i + 1] * b[j]
-    return out
+def _cross(a: Array, b: Array) -> Array:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@njit(cache=True)
+def _vector(y: Array, first: int) -> Array:
+    """The three components of a state from a first one on."""
+    return y[first : first + 3]
 
 
 @njit(cache=True)
 def aerodynamic_force(y: Array, chain: Chain, field: WindField) -> Array:
     """Force of the air on the canopy, N, world axes."""
-    height = y[CANOPY + 2]
-    relative = y[CANOPY_RATE : CANOPY_RATE + 3] - np.array(wind_at(height, field))
-    force = np.empty(3)
-    speed = math.sqrt(_dot(relative, 0, relative, 0))
-    along = _dot(relative, 0, y, LINE)
+    height, line = y[CANOPY + 2], _vector(y, LINE)
+    relative = _vector(y, CANOPY_RATE) - np.array(wind_at(height, field))
+    speed = math.sqrt(_dot(relative, relative))
+    along = _dot(relative, line)
     density = math.exp((chain.reference_height_m - height) / chain.scale_height_m)
-    for i in range(3):
-        across = relative[i] - along * y[LINE + i]
-        force[i] = -density * speed * (chain.tangential * speed * y[LINE + i] + chain.normal * across)
+    force: Array = -density * speed * (chain.tangential * speed * line + chain.normal * (relative - along * line))
     return force
 
 
 @njit(cache=True)
-def slope(_t: float, y: Array, constants: Array, waves: Array) -> Array:
-    """`derivatives` with the signature of an integrator; constants are `packed`, as numba converts tuples slowly."""
+def state_derivative(_t: float, y: Array, constants: Array, waves: Array) -> Array:
+    """`derivatives` with the signature of an integrator; see `pack_constants`, as numba converts tuples slowly."""
     chain = Chain(*to_fixed_tuple(constants[:CHAIN_SIZE], CHAIN_SIZE))
     mean = to_fixed_tuple(constants[CHAIN_SIZE:], FIELD_SIZE)
     rates: Array = derivatives(y, chain, WindField(mean[0], mean[1], mean[2], mean[3], mean[4], waves))
     return rates
 
 
-def packed(chain: Chain, field: WindField) -> tuple[Array, Array]:
-    """The last two arguments of `slope`."""
+def pack_constants(chain: Chain, field: WindField) -> tuple[Array, Array]:
+    """The last two arguments of `state_derivative`."""
     return np.array([*chain, *field[:FIELD_SIZE]]), field.waves
 
 
 @njit(cache=True)
-def interpolated(times: Array, knots: Array, starts: Array, lengths: Array, states: Array, polynomials: Array) -> Array:
+def interpolate_states(
+    times: Array, knots: Array, starts: Array, lengths: Array, states: Array, polynomials: Array
+) -> Array:
     """States at many times, a row each, from the polynomials of `marsyard.sim.dynamics.swing.Path`."""
     rows = np.empty((times.size, SIZE))
     for n in range(times.size):
@@ -162,108 +163,77 @@ def derivatives(y: Array, chain: Chain, field: WindField) -> Array:
     c = lander_moment * (chain.line_m - chain.first_moment / chain.mass_kg)
     b = chain.transverse_inertia + lander_moment * (chain.mass_centre_m - lander_moment / chain.mass_kg)
 
+    line, line_rate = _vector(y, LINE), _vector(y, LINE_RATE)
+    axis, axis_rate, spin = _vector(y, AXIS), _vector(y, AXIS_RATE), y[SPIN]
     force = aerodynamic_force(y, chain, field)
-    line_rotation = _cross(y, LINE, y, LINE_RATE)
-    lander_rotation = _cross(y, AXIS, y, AXIS_RATE)
-    spin = y[SPIN]
-    rolling = _dot(lander_rotation, 0, y, LINE) + spin * _dot(y, AXIS, y, LINE)
-    slip = np.empty(3)
-    for i in range(3):
-        slip[i] = lander_rotation[i] + spin * y[AXIS + i] - rolling * y[LINE + i] - line_rotation[i]
-    slip_line = _cross(slip, 0, y, LINE)
-    slip_axis = _cross(slip, 0, y, AXIS)
-    gyro = _cross(y, AXIS_RATE, y, AXIS)
+    lander_rotation = _cross(axis, axis_rate)
+    rolling = _dot(lander_rotation, line) + spin * _dot(axis, line)
+    slip = lander_rotation + spin * axis - rolling * line - _cross(line, line_rate)
 
-    line_speed2 = _dot(y, LINE_RATE, y, LINE_RATE)
-    axis_speed2 = _dot(y, AXIS_RATE, y, AXIS_RATE)
-    cosine = _dot(y, LINE, y, AXIS)
-    force_line = _dot(force, 0, y, LINE)
-    force_axis = _dot(force, 0, y, AXIS)
-    pull_line = chain.first_moment / chain.mass_kg
-    pull_axis = lander_moment / chain.mass_kg
-    on_line = np.empty(3)
-    on_axis = np.empty(3)
-    for i in range(3):
-        n = y[LINE + i]
-        e = y[AXIS + i]
-        on_line[i] = (
-            chain.hinge_damping * slip_line[i]
-            - pull_line * (force[i] - force_line * n)
-            + c * axis_speed2 * (e - cosine * n)
-        )
-        on_axis[i] = (
-            -chain.hinge_damping * slip_axis[i]
-            - chain.axial_inertia * spin * gyro[i]
-            - pull_axis * (force[i] - force_axis * e)
-            + c * line_speed2 * (n - cosine * e)
-        )
+    line_speed2, axis_speed2, cosine = _dot(line_rate, line_rate), _dot(axis_rate, axis_rate), _dot(line, axis)
+    on_line = (
+        chain.hinge_damping * _cross(slip, line)
+        - chain.first_moment / chain.mass_kg * (force - _dot(force, line) * line)
+        + c * axis_speed2 * (axis - cosine * line)
+    )
+    on_axis = (
+        -chain.hinge_damping * _cross(slip, axis)
+        - chain.axial_inertia * spin * _cross(axis_rate, axis)
+        - lander_moment / chain.mass_kg * (force - _dot(force, axis) * axis)
+        + c * line_speed2 * (line - cosine * axis)
+    )
     # A w + C P_n x = on_line and B x + C P_e w = on_axis, w across the line n, x across the axis e
-    source = np.empty(3)
-    across = np.empty(3)
-    pulled = _dot(on_axis, 0, y, LINE)
-    for i in range(3):
-        source[i] = on_line[i] - c / b * (on_axis[i] - pulled * y[LINE + i])
-        across[i] = y[AXIS + i] - cosine * y[LINE + i]
+    source = on_line - c / b * (on_axis - _dot(on_axis, line) * line)
+    across = axis - cosine * line
     stiff = a - c * c / b
     extra = c * c / b
-    along = _dot(across, 0, source, 0) / (stiff + extra * _dot(across, 0, across, 0))
+    along = _dot(across, source) / (stiff + extra * _dot(across, across))
+    w = (source - extra * across * along) / stiff
+    x = (on_axis - c * (w - _dot(w, axis) * axis)) / b
 
     rates = np.empty(SIZE)
-    turn = np.empty(3)
-    for i in range(3):
-        rates[CANOPY + i] = y[CANOPY_RATE + i]
-        rates[LINE + i] = y[LINE_RATE + i]
-        rates[AXIS + i] = y[AXIS_RATE + i]
-        rates[LINE_RATE + i] = (source[i] - extra * across[i] * along) / stiff
-    reaction = _dot(rates, LINE_RATE, y, AXIS)
-    for i in range(3):
-        w = rates[LINE_RATE + i]
-        x = (on_axis[i] - c * (w - reaction * y[AXIS + i])) / b
-        rates[AXIS_RATE + i] = x - axis_speed2 * y[AXIS + i]
-        rates[LINE_RATE + i] = w - line_speed2 * y[LINE + i]
-        rates[CANOPY_RATE + i] = (
-            force[i] - chain.first_moment * rates[LINE_RATE + i] - lander_moment * rates[AXIS_RATE + i]
-        ) / chain.mass_kg
-        turn[i] = lander_rotation[i] + spin * y[AXIS + i]
+    rates[CANOPY : CANOPY + 3] = _vector(y, CANOPY_RATE)
+    rates[LINE : LINE + 3] = line_rate
+    rates[AXIS : AXIS + 3] = axis_rate
+    line_acceleration, axis_acceleration = w - line_speed2 * line, x - axis_speed2 * axis
+    rates[LINE_RATE : LINE_RATE + 3] = line_acceleration
+    rates[AXIS_RATE : AXIS_RATE + 3] = axis_acceleration
+    rates[CANOPY_RATE : CANOPY_RATE + 3] = (
+        force - chain.first_moment * line_acceleration - lander_moment * axis_acceleration
+    ) / chain.mass_kg
     rates[CANOPY_RATE + 2] -= chain.gravity_m_s2
-    rates[SIDE : SIDE + 3] = _cross(turn, 0, y, SIDE)
-    rates[SPIN] = -chain.hinge_damping * _dot(slip, 0, y, AXIS) / chain.axial_inertia
+    rates[SIDE : SIDE + 3] = _cross(lander_rotation + spin * axis, _vector(y, SIDE))
+    rates[SPIN] = -chain.hinge_damping * _dot(slip, axis) / chain.axial_inertia
     return rates
 
 
 @njit(cache=True)
-def truth(states: Array, chain: Chain, field: WindField) -> tuple[Array, Array, Array, Array, Array]:
+def compute_truth(states: Array, chain: Chain, field: WindField) -> tuple[Array, Array, Array, Array, Array]:
     """Position, velocity, rotation matrix from body to world, body rate and specific force for rows of states."""
     count = states.shape[0]
-    positions = np.empty((count, 3))
-    velocities = np.empty((count, 3))
+    positions, velocities = np.empty((count, 3)), np.empty((count, 3))
+    body_rates, forces = np.empty((count, 3)), np.empty((count, 3))
     matrices = np.empty((count, 3, 3))
-    body_rates = np.empty((count, 3))
-    forces = np.empty((count, 3))
-    force = np.empty(3)
     for k in range(count):
         y = states[k]
         rates = derivatives(y, chain, field)
-        # Gram-Schmidt: removes the integration error of the side along the axis
-        axis_norm = math.sqrt(_dot(y, AXIS, y, AXIS))
-        along_axis = _dot(y, SIDE, y, AXIS) / axis_norm**2
-        for i in range(3):
-            positions[k, i] = y[CANOPY + i] + chain.line_m * y[LINE + i] + chain.reach_m * y[AXIS + i]
-            velocities[k, i] = y[CANOPY_RATE + i] + chain.line_m * y[LINE_RATE + i] + chain.reach_m * y[AXIS_RATE + i]
-            force[i] = (
-                rates[CANOPY_RATE + i] + chain.line_m * rates[LINE_RATE + i] + chain.reach_m * rates[AXIS_RATE + i]
-            )
-            matrices[k, i, 2] = -y[AXIS + i] / axis_norm
-            matrices[k, i, 0] = y[SIDE + i] - along_axis * y[AXIS + i]
+        axis, axis_rate, side = _vector(y, AXIS), _vector(y, AXIS_RATE), _vector(y, SIDE)
+        positions[k] = _vector(y, CANOPY) + chain.line_m * _vector(y, LINE) + chain.reach_m * axis
+        velocities[k] = _vector(y, CANOPY_RATE) + chain.line_m * _vector(y, LINE_RATE) + chain.reach_m * axis_rate
+        force = (
+            _vector(rates, CANOPY_RATE)
+            + chain.line_m * _vector(rates, LINE_RATE)
+            + chain.reach_m * _vector(rates, AXIS_RATE)
+        )
         force[2] += chain.gravity_m_s2
-        side_norm = math.sqrt(matrices[k, 0, 0] ** 2 + matrices[k, 1, 0] ** 2 + matrices[k, 2, 0] ** 2)
-        for i in range(3):
-            matrices[k, i, 0] /= side_norm
-        matrices[k, :, 1] = _cross(matrices[k, :, 2].copy(), 0, matrices[k, :, 0].copy(), 0)
-        turn = _cross(y, AXIS, y, AXIS_RATE)
-        for i in range(3):
-            turn[i] += y[SPIN] * y[AXIS + i]
+        # Gram-Schmidt: removes the integration error of the side along the axis
+        axis_norm = math.sqrt(_dot(axis, axis))
+        x = side - _dot(side, axis) / axis_norm**2 * axis
+        x = x / math.sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
+        z = -axis / axis_norm
+        matrices[k, :, 0], matrices[k, :, 1], matrices[k, :, 2] = x, _cross(z, x), z
+        rotation = _cross(axis, axis_rate) + y[SPIN] * axis
         for j in range(3):
-            body_rates[k, j] = matrices[k, 0, j] * turn[0] + matrices[k, 1, j] * turn[1] + matrices[k, 2, j] * turn[2]
-            forces[k, j] = matrices[k, 0, j] * force[0] + matrices[k, 1, j] * force[1] + matrices[k, 2, j] * force[2]
+            body_rates[k, j] = _dot(matrices[k, :, j], rotation)
+            forces[k, j] = _dot(matrices[k, :, j], force)
     return positions, velocities, matrices, body_rates, forces

@@ -1,4 +1,4 @@
-"""Compiled flight dynamics of a small helicopter; `marsyard.sim.dynamics.rotorcraft.flight` states the model.
+"""Compiled flight dynamics of a small helicopter; `marsyard.sim.dynamics.rotorcraft` states the model.
 
 A row is the state at a knot: position, velocity and acceleration, then angles (yaw, pitch, roll), their rates and
 accelerations. Accelerations are linear between knots: this defines the motion exactly at every time.
@@ -124,11 +124,9 @@ def _command_acceleration(
     state: Array, autopilot: Array, goal: Array, speed: Array, acceleration: Array, step: float, c: Craft
 ) -> tuple[float, float, float]:
     """Acceleration commanded by the autopilot (east, north, up); updates its trim."""
-    command = np.empty(3)
-    for i in range(3):
-        error = speed[i] + c.position_gain * (goal[i] - state[i]) - state[VELOCITY + i]
-        autopilot[TRIM + i] += c.trim_gain * error * step
-        command[i] = acceleration[i] + c.speed_gain * error + autopilot[TRIM + i]
+    error = speed + c.position_gain * (goal - state[:VELOCITY]) - state[VELOCITY:ACCELERATION]
+    autopilot[TRIM:] += c.trim_gain * error * step
+    command = acceleration + c.speed_gain * error + autopilot[TRIM:]
     limit = c.gravity_m_s2 * math.tan(c.max_tilt_rad)
     east, north = _limit(command[0], command[1], limit)
     return east, north, min(max(command[2], -0.4 * c.gravity_m_s2), 0.4 * c.gravity_m_s2)
@@ -181,9 +179,8 @@ def _step_flight(flight: Flight, k: int, tilt_error: Array, command: tuple[float
     after[ACCELERATION] = thrust * (math.cos(yaw) * forward - math.sin(yaw) * left)
     after[ACCELERATION + 1] = thrust * (math.sin(yaw) * forward + math.cos(yaw) * left)
     after[ACCELERATION + 2] = thrust * math.cos(roll) * math.cos(pitch) - g
-    for i in range(3):
-        speed = row[VELOCITY + i] + step * row[ACCELERATION + i]
-        after[ACCELERATION + i] += (flight.wind[i] + gust[i] - speed) / c.drag_s
+    velocity = row[VELOCITY:ACCELERATION] + step * row[ACCELERATION:ANGLE]
+    after[ACCELERATION:ANGLE] += (flight.wind + gust - velocity) / c.drag_s
     _advance(row, after, step)
 
 
@@ -230,12 +227,10 @@ def land(
     goal = np.empty(3)
     speed = np.zeros(3)
     zero = np.zeros(3)
-    estimate = np.empty(ACCELERATION)
     phase = WAIT
     for k in range(start, rows.shape[0] - 1):
         delayed = max(k - c.delay_steps, 0)
-        for i in range(ACCELERATION):
-            estimate[i] = rows[delayed, i] + errors[delayed, i]
+        estimate = rows[delayed, :ACCELERATION] + errors[delayed, :ACCELERATION]
         if phase == REST:
             phases[k + 1] = REST
             _step_on_ground(rows[k], rows[k + 1], flight.step, c)

@@ -1,4 +1,4 @@
-"""In which order a step's activities come (Fig. 12): visual odometry within the drive, tracking, navigation."""
+"""Order of a step's activities (Fig. 12): visual odometry within the drive, tracking, navigation."""
 
 import re
 
@@ -6,9 +6,8 @@ import pytest
 
 from marsyard.scenarios.rover import run as loop
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.route import Mapper
 from marsyard.scenarios.rover.run import run_case
-from marsyard.scenarios.rover.vehicle import Vehicle
+from marsyard.scenarios.rover.world import Vehicle
 from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT
 
@@ -25,7 +24,7 @@ def test_a_step_drives_by_what_was_tracked_and_mapped_before_it(monkeypatch: pyt
 
         monkeypatch.setattr(kind, name, after)
 
-    record_calls(Mapper, "sense", "map")
+    record_calls(loop, "map_terrain", "map")
     record_calls(Vehicle, "drive", "drive and see how far")
     record_calls(loop, "visit_stop", "track")
     leg = {"motion": "approach", "goal_m": 3.0, "step_share": 0.08, "autonav": True, "visual_odometry": True}

@@ -1,12 +1,12 @@
-"""Commands of legs, from where the target is believed to be."""
+"""Commands of legs, from the estimated position of the target."""
 
 import numpy as np
 import pytest
 
 from marsyard.scenarios.rover.parameters import LegParameters
-from marsyard.scenarios.rover.route import (
+from marsyard.scenarios.rover.run import (
     GOAL_TOLERANCE_M,
-    Belief,
+    TargetEstimate,
     drive_towards,
     goal_position,
     is_finished,
@@ -15,32 +15,32 @@ from marsyard.scenarios.rover.route import (
 from marsyard.sim.measurements import DriveCommand
 
 
-def at(x: float, y: float) -> Belief:
+def at(x: float, y: float) -> TargetEstimate:
     """A target in the rover frame, seen by a camera 1.2 m above it."""
-    return Belief(np.array([x, y, 0.3]), float(np.hypot(np.hypot(x, y), 1.2)))
+    return TargetEstimate(np.array([x, y, 0.3]), float(np.hypot(np.hypot(x, y), 1.2)))
 
 
-def driven(told: list[DriveCommand]) -> tuple[np.ndarray, float]:
-    """Where commands lead without slip: place and heading in the axes of their start."""
-    place, heading = np.zeros(2), 0.0
-    for one in told:
+def driven(commands: list[DriveCommand]) -> tuple[np.ndarray, float]:
+    """Position and heading after commands without slip, in the axes of their start."""
+    position, heading = np.zeros(2), 0.0
+    for one in commands:
         sine, cosine = np.sin(heading), np.cos(heading)
-        place = place + np.array([[cosine, -sine], [sine, cosine]]) @ one.displacement_m
+        position = position + np.array([[cosine, -sine], [sine, cosine]]) @ one.displacement_m
         heading += one.turn_left_rad
-    return place, heading
+    return position, heading
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 5.0, -14.0, 40.0, -120.0])
-def test_steps_lead_to_a_place(angle_deg: float) -> None:
+def test_steps_lead_to_a_position(angle_deg: float) -> None:
     angle = np.radians(angle_deg)
-    place = 3.0 * np.array([np.cos(angle), np.sin(angle)])
-    reached, _ = driven(list(drive_towards(place, 10.0)))
-    np.testing.assert_allclose(reached, place, atol=1e-12)
+    position = 3.0 * np.array([np.cos(angle), np.sin(angle)])
+    reached, _ = driven(list(drive_towards(position, 10.0)))
+    np.testing.assert_allclose(reached, position, atol=1e-12)
 
 
 def test_a_step_is_no_longer_than_asked() -> None:
-    told = list(drive_towards(np.array([3.0, 0.4]), 0.5))
-    assert sum(one.length_m for one in told) == pytest.approx(0.5)
+    commands = list(drive_towards(np.array([3.0, 0.4]), 0.5))
+    assert sum(one.length_m for one in commands) == pytest.approx(0.5)
 
 
 def test_an_approach_keeps_its_distance_and_offset() -> None:
@@ -58,14 +58,16 @@ def test_an_approach_keeps_its_distance_and_offset() -> None:
 
 def test_a_circle_keeps_target_and_bearing() -> None:
     leg = LegParameters(motion="circle", step_deg=10.0, steps=7)
-    belief = at(7.0, 0.5)
-    place, heading = driven(list(step_commands(leg, 0, belief)))
+    target = at(7.0, 0.5)
+    position, heading = driven(list(step_commands(leg, 0, target)))
     # Seen from above the rover goes clockwise about the target; the target stays where it was in its frame.
-    away = belief.target_rover[:2] - place
+    away = target.position_rover[:2] - position
     sine, cosine = np.sin(-heading), np.cos(-heading)
-    np.testing.assert_allclose(np.array([[cosine, -sine], [sine, cosine]]) @ away, belief.target_rover[:2], atol=1e-12)
+    np.testing.assert_allclose(
+        np.array([[cosine, -sine], [sine, cosine]]) @ away, target.position_rover[:2], atol=1e-12
+    )
     assert np.degrees(heading) == pytest.approx(-10.0)
-    assert is_finished(leg, 7, belief)
+    assert is_finished(leg, 7, target)
 
 
 def test_turns_backing_and_straight_legs() -> None:

@@ -9,8 +9,14 @@ import pytest
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.run import run_case
-from marsyard.scenarios.rover.scenario import RoverScenario, SharedDriveScenario
-from marsyard.scenarios.rover.shared import DriveKey, SharedDriveParameters, render_drive, track_views
+from marsyard.scenarios.rover.scenario import (
+    DriveKey,
+    RoverScenario,
+    SharedDriveParameters,
+    SharedDriveScenario,
+    render_drive,
+    track_views,
+)
 from marsyard.sim.render import PixelRays, process_renderer
 from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT

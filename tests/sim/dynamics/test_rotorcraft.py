@@ -9,6 +9,7 @@ import pytest
 
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.dynamics.rotorcraft import (
+    TAIL_S,
     Air,
     AirParameters,
     GroundPatch,
@@ -22,7 +23,6 @@ from marsyard.sim.dynamics.rotorcraft import (
     landing_flight,
     transit_flight,
 )
-from marsyard.sim.dynamics.rotorcraft.flight import TAIL_S
 
 GRAVITY, COURSE, HEADING = 9.8, 0.3, 1.0
 OVER, SITE = np.array([100.0, 50.0, 12.0]), np.array([103.0, 52.0])

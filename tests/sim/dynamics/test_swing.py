@@ -10,8 +10,8 @@ from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
 from marsyard.sim.dynamics import SwingDescent, SwingParameters
-from marsyard.sim.dynamics.chain import Modes, chain_of
 from marsyard.sim.dynamics.kernels.swing import Chain, WindField, aerodynamic_force, derivatives
+from marsyard.sim.dynamics.swing import Modes, chain_of
 
 START = np.array([100.0, -50.0, 2100.0])
 GROUND_M = 100.0

@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from marsyard.sim.dynamics.rotorcraft import (
+    TAIL_S,
     Air,
     AirParameters,
     FlownPath,
@@ -17,7 +18,6 @@ from marsyard.sim.dynamics.rotorcraft import (
     TransitParameters,
     transit_flight,
 )
-from marsyard.sim.dynamics.rotorcraft.flight import TAIL_S
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
 from marsyard.sim.sensor.navigation import FilterParameters, NavigationFilter, NavigationSolution
 from marsyard.sim.sensor.navigation.kernels import POSITION_FIX, VELOCITY_FIX

@@ -1,4 +1,4 @@
-"""Cameras of a user's own on the mast: a stereo pair from calibration files, a detector from its datasheet."""
+"""Custom cameras on the mast: a stereo pair from calibration files, a detector from its datasheet."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_presets_pair_by_its_files_is_the_preset(
     assert found.geometry is expected.geometry
 
 
-def test_a_target_is_tracked_through_an_own_pair(tmp_path: Path) -> None:
+def test_a_target_is_tracked_through_a_custom_pair(tmp_path: Path) -> None:
     camera, sheet = tmp_path / "cam0.yaml", tmp_path / "sensor.toml"
     camera.write_text(OPENCV)
     sheet.write_text(SHEET)
@@ -70,18 +70,18 @@ def test_a_target_is_tracked_through_an_own_pair(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("stated", "said"),
+    ("stated", "message"),
     [
         ({"own": {"left": "none.cahvor", "baseline_m": 0.2}}, "none.cahvor"),
         ({"own": {"left": "small.yaml", "right": "large.yaml", "baseline_m": 0.2}}, "640 x 480 pixels, the right one"),
         ({"detector": {"preset": "mer-descent-flown"}}, "rows_summed is 4; allowed for cameras on a mast: 1"),
     ],
 )
-def test_pairs_that_cannot_be_are_refused(
-    stated: dict[str, Any], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_invalid_pairs_are_refused(
+    stated: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "small.yaml").write_text(OPENCV)
     (tmp_path / "large.yaml").write_text(OPENCV.replace("640\nimage_height", "800\nimage_height"))
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValidationError, match=said):
+    with pytest.raises(ValidationError, match=message):
         CameraParameters.model_validate(stated)

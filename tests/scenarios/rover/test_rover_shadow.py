@@ -1,4 +1,4 @@
-"""Where the rover's own shadow falls."""
+"""Position of the shadow of the rover."""
 
 import numpy as np
 import pytest
@@ -21,8 +21,8 @@ def test_the_head_s_shadow_falls_where_the_sun_s_ray_meets_the_ground(elevation_
     shadow = head - head[2] / sun[2] * sun
 
     def shaded(east_m: float, north_m: float) -> bool:
-        place = shadow + np.array([east_m, north_m, 0.0])
-        patch = template_patch(head, place, 0.002)
+        position = shadow + np.array([east_m, north_m, 0.0])
+        patch = template_patch(head, position, 0.002)
         return rover_shades_patch(ROCKY_8, stance, RESEARCH_MAST, (0.0, 0.0), patch, sun)
 
     assert shaded(0.0, 0.0)
