@@ -35,7 +35,7 @@ scene = Scene(surface, (10.0, 20.0), Sun(direction(1.0, 0.7)), Photometry())
 renderer = Renderer(sys.argv[1])
 frame = renderer.render(scene, PixelRays.of(camera), pose)
 camera_pose = Pose(pose.rotation.as_matrix(), pose.translation)
-depth = renderer._draw(scene, PixelRays.of(camera), camera_pose, 1000.0).depth
+depth = renderer._draw_views(scene, PixelRays.of(camera), camera_pose, 1000.0).depth
 np.savez(sys.argv[2], radiance=frame.radiance, distance=frame.range_m, depth=depth)
 """
 
