@@ -24,8 +24,9 @@ from benchmarks.pictures import SUN, descent_exposure, descent_pose, descent_sce
 from benchmarks.timing import Figure, core_seconds
 from marsyard.scenarios.descent.optics import camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters
-from marsyard.sim.render.mesh import graded_offsets, ground_mesh
 from marsyard.sim.render.rays import VIEW_SIDE_PX
+from marsyard.sim.render.renderer import ground_mesh
+from marsyard.sim.render.scene import graded_offsets
 
 #: Side of their frames, pixels; the delivered frame's own.
 SIDE_PX = 1024

@@ -13,9 +13,9 @@ Stages = Mapping[str, tuple[tuple[str, str], ...]]
 STAGES: Stages = {
     "terrain, its rocks": (("descent/world.py", "of"), ("descent/world.py", "scene")),
     "flight": (("descent/flight.py", "create_flight"),),
-    "mesh and OpenGL": (("render/renderer.py", "_load"), ("render/renderer.py", "_draw")),
+    "mesh and OpenGL": (("render/renderer.py", "_draw_views"),),
     "what rays meet": (("kernels/primary.py", "trace_primary_rays"),),
-    "shadow of the ground": (("render/shadows.py", "ground_shadow"),),
+    "shadow of the ground": (("render/scene.py", "ground_shadow"),),
     "shading": (("kernels/shading.py", "shade"),),
     "pixels with edges, but for their shading": (
         ("render/renderer.py", "edge_pixels"),

@@ -31,7 +31,7 @@ from marsyard.scenarios.system import Ingested
 from marsyard.scenarios.template import toml_environment
 from marsyard.scenarios.user_files import listed
 from marsyard.sim.camera import CameraModel, Pds3Product, mount_looking_down, read_cameras, read_pds3_product
-from marsyard.sim.camera.pds3 import is_pds3
+from marsyard.sim.camera.pds import is_pds3
 from marsyard.sim.frames import SITE_FROM_WORLD
 
 _POSITION = ("x_m", "y_m", "z_m")

@@ -67,13 +67,9 @@ def create_camera(
     """Create the camera of a model name and its vectors by letter. Raises CameraFileError for impossible values."""
     c, a, h, v, *lens = (np.array(vectors[letter], dtype=np.float64) for letter in name)
     try:
-        if name == "CAHV":
-            return Cahv(c, a, h, v, size)
-        if name == "CAHVOR":
-            return Cahvor(c, a, h, v, lens[0], lens[1], size)
-        if linearity is None:
-            raise ValueError("linearity is missing")
-        return Cahvore(c, a, h, v, lens[0], lens[1], lens[2], linearity=linearity, size=size)
+        if linearity is not None:
+            return Cahvore(c, a, h, v, lens[0], lens[1], lens[2], linearity=linearity, size=size)
+        return Cahvor(c, a, h, v, lens[0], lens[1], size) if lens else Cahv(c, a, h, v, size)
     except ValueError as fault:
         field, allowed = str(fault).partition(" ")[0].upper(), "a camera model of unit A and O and independent H, V, A"
         raise source.error(field, str(fault), allowed) from fault

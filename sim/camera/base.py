@@ -23,7 +23,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Num
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 Vector = NDArray[np.float64]
@@ -68,11 +68,7 @@ class CameraModel(ABC):
 
     @abstractmethod
     def _sight(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
-        """Direction (of any length) of a pixel, and how far along `_pupil_axis` its ray starts (None: at C)."""
-
-    @property
-    def _pupil_axis(self) -> Vector:
-        return self.a
+        """Direction (of any length) of a pixel, and the offset of its ray's origin from C, (n, 3) (None: no offset)."""
 
     def project(
         self, points: Float[np.ndarray, "*batch 3"]
@@ -88,10 +84,9 @@ class CameraModel(ABC):
         visible = np.empty(len(flat), dtype=np.bool_)
         with np.errstate(all="ignore"):
             for block in _blocks(len(flat)):
-                u, v, seen = self._image(*self._from_centre(flat[block]))
-                pixels[block, 0] = u
-                pixels[block, 1] = v
-                visible[block] = seen & np.isfinite(u) & np.isfinite(v)
+                u, v, imaged = self._image(*self._from_centre(flat[block]))
+                pixels[block, 0], pixels[block, 1] = u, v
+                visible[block] = imaged & np.isfinite(u) & np.isfinite(v)
         pixels[~visible] = np.nan
         return pixels.reshape(*points.shape[:-1], 2), visible.reshape(points.shape[:-1])
 
@@ -102,9 +97,7 @@ class CameraModel(ABC):
         with np.errstate(all="ignore"):
             for block in _blocks(len(flat)):
                 coordinates = self._from_centre(flat[block])
-                for row, gradient in enumerate(self._image_gradient(*coordinates)):
-                    for column, derivative in enumerate(gradient):
-                        jacobian[block, row, column] = derivative
+                jacobian[block] = np.moveaxis(np.array(self._image_gradient(*coordinates)), -1, 0)
                 jacobian[block][~self._image(*coordinates)[2]] = np.nan
         return jacobian.reshape(*points.shape[:-1], 2, 3)
 
@@ -118,27 +111,21 @@ class CameraModel(ABC):
         """
         flat = pixels.reshape(-1, 2)
         directions = np.empty((len(flat), 3))
-        origins: NDArray[np.float64] | None = None
+        origins = np.broadcast_to(self.c, (len(flat), 3))
         with np.errstate(all="ignore"):
             for block in _blocks(len(flat)):
-                u, v = np.array(flat[block].T, dtype=np.float64, order="C")
-                sight, shift = self._sight(u, v)
-                length = np.sqrt(sight[0] * sight[0] + sight[1] * sight[1] + sight[2] * sight[2])
-                for column, component in enumerate(sight):
-                    directions[block, column] = component / length
-                if shift is not None:
-                    origins = np.empty((len(flat), 3)) if origins is None else origins
-                    origins[block] = self.c + shift[:, np.newaxis] * self._pupil_axis
-        if origins is None:
-            origins = np.broadcast_to(self.c, (len(flat), 3))
+                (x, y, z), offset = self._sight(*np.array(flat[block].T, dtype=np.float64, order="C"))
+                length = np.sqrt(x * x + y * y + z * z)
+                directions[block, 0], directions[block, 1], directions[block, 2] = x / length, y / length, z / length
+                if offset is not None:
+                    origins = origins if origins.flags.writeable else np.empty((len(flat), 3))
+                    origins[block] = self.c + offset
         shape = (*pixels.shape[:-1], 3)
         return origins.reshape(shape), directions.reshape(shape)
 
     def in_frame(self, pixels: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
         """Whether pixels lie in the frame, -0.5 <= u < columns - 0.5 and the same for rows; false for NaN."""
-        u, v = pixels[..., 0], pixels[..., 1]
-        inside = (u >= -0.5) & (u < self.size[0] - 0.5) & (v >= -0.5) & (v < self.size[1] - 0.5)
-        return np.asarray(inside)
+        return np.asarray(np.all((pixels >= -0.5) & (pixels < np.array(self.size) - 0.5), axis=-1))
 
     def pixel_grid(self) -> Float[np.ndarray, "rows columns 2"]:
         """(u, v) of every pixel's centre."""
@@ -154,8 +141,8 @@ class CameraModel(ABC):
         if not new_from_old.single:
             raise ValueError("a camera moves by a single transform, not by an array of transforms")
         matrix = new_from_old.as_matrix()
-        turned = {name: matrix[:3, :3] @ getattr(self, name) for name in ("a", "h", "v", "o") if hasattr(self, name)}
-        return self._with(c=matrix[:3, :3] @ self.c + matrix[:3, 3], **turned)
+        rotated = {name: matrix[:3, :3] @ getattr(self, name) for name in ("a", "h", "v", "o") if hasattr(self, name)}
+        return self._with(c=matrix[:3, :3] @ self.c + matrix[:3, 3], **rotated)
 
     def binned(self: M, columns: int, rows: int) -> M:
         """The camera of an image in which blocks of `columns` x `rows` pixels are summed or averaged into one.
@@ -176,18 +163,15 @@ class CameraModel(ABC):
         """The camera of the resized image: u becomes (u + 0.5) * factor - 0.5. ValueError unless factor is positive."""
         if not (np.isfinite(factor) and factor > 0):
             raise ValueError(f"an image is scaled by a positive, finite factor, not {factor}")
-        scale = float(factor)
+        scale, (columns, rows) = float(factor), self.size
         shift = 0.5 * scale - 0.5
-        size = (round(self.size[0] * factor), round(self.size[1] * factor))
-        return self._with_image_map((scale, scale), (shift, shift), size)
+        return self._with_image_map((scale, scale), (shift, shift), (round(columns * factor), round(rows * factor)))
 
     def cropped(self: M, column: int, row: int, size: tuple[int, int]) -> M:
         """The camera of a part of the image, by upper left pixel and size. Raises ValueError outside the frame."""
         if column < 0 or row < 0 or column + size[0] > self.size[0] or row + size[1] > self.size[1]:
-            raise ValueError(
-                f"a crop of {size[0]} x {size[1]} pixels at ({column}, {row}) leaves the frame of "
-                f"{self.size[0]} x {self.size[1]}"
-            )
+            crop, frame = (f"{columns} x {rows}" for columns, rows in (size, self.size))
+            raise ValueError(f"a crop of {crop} pixels at ({column}, {row}) leaves the frame of {frame}")
         return self._with_image_map((1.0, 1.0), (-float(column), -float(row)), size)
 
     def magnified(self: M, factor: Real) -> M:
@@ -216,11 +200,8 @@ class CameraModel(ABC):
     @property
     def focal_lengths(self) -> tuple[float, float]:
         """(hs, vs): the focal length in units of a column's width and of a row's height."""
-        scale = self.a @ self.a
-        return (
-            float(np.linalg.norm(np.cross(self.a, self.h)) / scale),
-            float(np.linalg.norm(np.cross(self.a, self.v)) / scale),
-        )
+        hs, vs = (float(np.linalg.norm(np.cross(self.a, one)) / (self.a @ self.a)) for one in (self.h, self.v))
+        return hs, vs
 
     @property
     def right(self) -> Float[np.ndarray, "3"]:
@@ -255,9 +236,20 @@ class CameraModel(ABC):
 
     def __post_init__(self) -> None:
         for field in fields(cast(Any, self)):
-            if field.name not in ("size", "linearity"):
-                object.__setattr__(self, field.name, _frozen_vector(field.name, getattr(self, field.name)))
-        object.__setattr__(self, "size", _checked_size(self.size))
+            if field.name in ("size", "linearity"):
+                continue
+            # a copy; turns -0.0 into 0.0, so that equal cameras have equal hashes
+            vector = np.asarray(getattr(self, field.name), dtype=np.float64) + 0.0
+            if vector.shape != (3,):
+                raise ValueError(f"{field.name} must have three components, not shape {vector.shape}")
+            if not np.all(np.isfinite(vector)):
+                raise ValueError(f"{field.name} must be finite, not {vector.tolist()}")
+            vector.flags.writeable = False
+            object.__setattr__(self, field.name, vector)
+        columns, rows = self.size
+        if int(columns) != columns or int(rows) != rows or columns < 1 or rows < 1:
+            raise ValueError(f"size must be two positive integers (columns, rows), not {self.size}")
+        object.__setattr__(self, "size", (int(columns), int(rows)))
         length = float(np.linalg.norm(self.a))
         if abs(length - 1) > UNIT_TOLERANCE:
             raise ValueError(f"a must be a unit vector (to {UNIT_TOLERANCE:g}); its length is {length!r}")
@@ -270,14 +262,9 @@ class CameraModel(ABC):
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):
             return NotImplemented
-        theirs = other._fields()
-        return all(np.array_equal(value, theirs[name]) for name, value in self._fields().items())
+        return all(np.array_equal(value, getattr(other, name)) for name, value in self._fields().items())
 
     def __hash__(self) -> int:
-        return self._hash
-
-    @cached_property
-    def _hash(self) -> int:
         values = (value.tobytes() if isinstance(value, np.ndarray) else value for value in self._fields().values())
         return hash((type(self), *values))
 
@@ -310,8 +297,8 @@ def mount_looking_down(camera: CameraModel) -> CameraModel:
         raise ValueError("the camera's picture is mirrored: u right, v down and A forward must be right-handed")
     axis = _unit(camera.a)
     right = _unit(camera.right - (camera.right @ axis) * axis)
-    turn = Rotation.from_matrix(np.stack([right, np.cross(right, axis), -axis]))
-    return camera.moved(RigidTransform.from_components(-turn.apply(camera.c.copy()), turn))
+    rotation = Rotation.from_matrix(np.stack([right, np.cross(right, axis), -axis]))
+    return camera.moved(RigidTransform.from_components(-rotation.apply(camera.c.copy()), rotation))
 
 
 def dot(vector: Vector, x: Vector, y: Vector, z: Vector) -> Vector:
@@ -332,21 +319,3 @@ def _unit(vector: Vector) -> Vector:
 
 def _blocks(count: int) -> list[slice]:
     return [slice(start, min(start + _BLOCK, count)) for start in range(0, count, _BLOCK)]
-
-
-def _frozen_vector(name: str, value: ArrayLike) -> Vector:
-    """Return a read-only copy of three finite components; raise a ValueError that names the field."""
-    vector = np.asarray(value, dtype=np.float64) + 0.0  # a copy; turns -0.0 into 0.0, so that equal cameras hash alike
-    if vector.shape != (3,):
-        raise ValueError(f"{name} must have three components, not shape {vector.shape}")
-    if not np.all(np.isfinite(vector)):
-        raise ValueError(f"{name} must be finite, not {vector.tolist()}")
-    vector.flags.writeable = False
-    return vector
-
-
-def _checked_size(size: tuple[int, int]) -> tuple[int, int]:
-    columns, rows = size
-    if int(columns) != columns or int(rows) != rows or columns < 1 or rows < 1:
-        raise ValueError(f"size must be two positive integers (columns, rows), not {size}")
-    return int(columns), int(rows)

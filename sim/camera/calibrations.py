@@ -4,25 +4,43 @@ All are YAML with a camera matrix and OpenCV's distortion in OpenCV's axes (z fo
 from the centre of the upper left one). They are converted to the nearest camera of the CAHV family (`from_opencv`,
 `from_opencv_fisheye`), which is exact for lenses of k1 and k2 alone. A residual above `MAX_RMS_PX` over the frame or
 `MAX_PX` anywhere in it is an error (docs/adr/0020). Cameras of a chain are given in the axes of its first.
+
+OpenCV's camera looks along z with x right and y down; its pixels count as ours. Its pinhole model distorts about the
+direction z with k1, k2, k3 (radial) and p1, p2 (tangential):
+
+    r^2 = x^2 + y^2        x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
+                           y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
+
+Its rational model divides the radial factor by 1 + k4 r^2 + k5 r^4 + k6 r^6. Its fisheye model moves a ray at the
+angle theta from z to the distance theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala & Brandt
+2006).
+
+CAHVOR about O = A equals the pinhole model with k3 = p1 = p2 = 0; others are fitted by tilting O. CAHVORE about O = A
+with linearity 0 and a fixed pupil equals the fisheye model with k3 = k4 = 0.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, TypeVar
 
 import numpy as np
 import yaml
+from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.spatial.transform import RigidTransform
+from scipy.optimize import least_squares
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.camera.assembly import Source
 from marsyard.sim.camera.base import CameraModel
-from marsyard.sim.camera.opencv import Residual, from_opencv, from_opencv_fisheye
+from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
+
+Array = NDArray[np.float64]
+C = TypeVar("C", bound=CameraModel)
 
 #: Maximum residual of the fitted camera: RMS over the frame, less than a calibration's own residual (0.1 to 0.5 px);
 #: and anywhere in the frame, which is in a corner.
@@ -40,6 +58,21 @@ _ALLOWED = (
     "a calibration of OpenCV (camera_matrix, distortion_coefficients, image_width, image_height), ROS (the same and "
     "distortion_model), Kalibr (cam0: ...) or EuRoC (intrinsics, resolution, ...)"
 )
+
+#: Samples along each side of the frame, including its outer edge.
+_SAMPLES = 33
+#: A closed form with a smaller residual is exact and is not fitted.
+_EXACT_PX = 1e-9
+#: Residual of a pixel that is not visible in a camera during the fit.
+_INVISIBLE_PX = 1e3
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Root mean square and maximum of the distance between two cameras' pixels over the frame."""
+
+    rms_px: float
+    max_px: float
 
 
 @dataclass(frozen=True)
@@ -66,13 +99,12 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
         return super().compose_node(parent, index)
 
 
-def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> Any:
-    return loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None
-
-
 # the second is OpenCV 5's tag of one-dimensional matrices
 for _kind in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _matrix)
+    _Loader.add_constructor(
+        f"tag:yaml.org,2002:{_kind}",
+        lambda loader, node: loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None,
+    )
 
 
 def is_calibration(head: bytes) -> bool:
@@ -87,26 +119,6 @@ def read_calibrations(path: str | Path) -> tuple[Calibration, ...]:
     the CAHV family cannot represent; it names file, field and allowed values.
     """
     source = Source(str(path))
-    data = _parse(source)
-    names = [name for name in data if isinstance(name, str) and _CHAIN.match(name) and isinstance(data[name], Mapping)]
-    if names:
-        return _chain([(name, data[name]) for name in names], source)
-    reader = _Reader(source, data, "")
-    name = str(data.get("camera_name", ""))
-    intrinsics = reader.kalibr() if "intrinsics" in data else reader.opencv()
-    return (_calibration(name, intrinsics, None, reader),)
-
-
-class _Intrinsics(NamedTuple):
-    """Camera matrix, distortion coefficients, (columns, rows) and whether the lens is a fisheye."""
-
-    matrix: NDArray[np.float64]
-    distortion: NDArray[np.float64]
-    size: tuple[int, int]
-    fisheye: bool
-
-
-def _parse(source: Source) -> Mapping[str, Any]:
     text = source.text().encode("latin-1").decode("utf-8-sig", errors="replace")
     try:
         data = yaml.load(_DIRECTIVE.sub("", text), Loader=_Loader)  # noqa: S506  (a SafeLoader)
@@ -115,36 +127,18 @@ def _parse(source: Source) -> Mapping[str, Any]:
         raise source.error("file", f"is not valid YAML ({message[:200]})", _ALLOWED) from fault
     if not isinstance(data, Mapping):
         raise source.error("file", "holds no named values", _ALLOWED)
-    return data
-
-
-def _chain(parts: Sequence[tuple[str, Mapping[str, Any]]], source: Source) -> tuple[Calibration, ...]:
+    names = [name for name in data if isinstance(name, str) and _CHAIN.match(name) and isinstance(data[name], Mapping)]
+    if not names:
+        return (_Reader(source, data, "").calibration(str(data.get("camera_name", "")), None),)
     pose: RigidTransform | None = None
-    read = []
-    for number, (name, data) in enumerate(parts):
-        reader = _Reader(source, data, f"{name}.")
+    calibrations = []
+    for number, name in enumerate(names):
+        reader = _Reader(source, data[name], f"{name}.")
         if number:
             step = reader.transform("T_cn_cnm1")
             pose = step if pose is None else step * pose
-        read.append(_calibration(name, reader.kalibr(), pose, reader))
-    return tuple(read)
-
-
-def _calibration(name: str, lens: _Intrinsics, pose: RigidTransform | None, reader: _Reader) -> Calibration:
-    camera: CameraModel
-    try:
-        fit = from_opencv_fisheye if lens.fisheye else from_opencv
-        camera, residual = fit(lens.matrix, lens.distortion, lens.size, pose)
-    except ValueError as fault:
-        raise reader.error("camera", str(fault), "a camera matrix, and a distortion that is one-to-one") from fault
-    if not (residual.rms_px <= MAX_RMS_PX and residual.max_px <= MAX_PX):
-        raise reader.error(
-            "distortion",
-            f"the nearest camera of the CAHV family is {residual.rms_px:.2g} px off over the frame (RMS), "
-            f"{residual.max_px:.2g} px at most",
-            f"{MAX_RMS_PX:g} and {MAX_PX:g} px; crop the picture, or calibrate with fewer coefficients",
-        )
-    return Calibration(name, camera, residual)
+        calibrations.append(reader.calibration(name, pose))
+    return tuple(calibrations)
 
 
 @dataclass(frozen=True)
@@ -159,38 +153,48 @@ class _Reader:
         """Create the error for a field."""
         return self.source.error(f"{self.prefix}{field}", fault, allowed)
 
-    def opencv(self) -> _Intrinsics:
-        """Read the intrinsics of an OpenCV or ROS file."""
-        matrix = self.numbers(("camera_matrix", "cameraMatrix", "K"), "a matrix of 3 x 3 numbers")
-        if len(matrix) != 9:
-            raise self.error("camera_matrix", f"has {len(matrix)} numbers", "3 x 3")
-        names = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D")
+    def calibration(self, name: str, pose: RigidTransform | None) -> Calibration:
+        """Read the camera; lens models are given by name, in OpenCV's files also by the number of coefficients."""
+        if self.prefix or "intrinsics" in self.data:  # Kalibr, EuRoC
+            model = self.data.get("camera_model", "pinhole")
+            if model != "pinhole":
+                raise self.error("camera_model", f"{model!r}", "pinhole")
+            intrinsics = self.numbers(("intrinsics",), "fx, fy, cx, cy")
+            if len(intrinsics) != 4:
+                raise self.error("intrinsics", f"has {len(intrinsics)} numbers", "fx, fy, cx, cy")
+            fx, fy, cx, cy = intrinsics
+            matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+            names: tuple[str, ...] = ("distortion_coeffs", "distortion_coefficients")
+            is_fisheye = False
+        else:
+            flat = self.numbers(("camera_matrix", "cameraMatrix", "K"), "a matrix of 3 x 3 numbers")
+            if len(flat) != 9:
+                raise self.error("camera_matrix", f"has {len(flat)} numbers", "3 x 3")
+            matrix = np.array(flat, dtype=np.float64).reshape(3, 3)
+            names = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D")
+            is_fisheye = bool(self.data.get("fisheye_model", False))
         coefficients = self.numbers(names, "a list of numbers", missing=[])
-        flagged = bool(self.data.get("fisheye_model", False))
-        return self._intrinsics(np.reshape(matrix, (3, 3)), coefficients, fisheye=flagged)
-
-    def kalibr(self) -> _Intrinsics:
-        """Read the intrinsics of a Kalibr or EuRoC file."""
-        model = self.data.get("camera_model", "pinhole")
-        if model != "pinhole":
-            raise self.error("camera_model", f"{model!r}", "pinhole")
-        intrinsics = self.numbers(("intrinsics",), "fx, fy, cx, cy")
-        if len(intrinsics) != 4:
-            raise self.error("intrinsics", f"has {len(intrinsics)} numbers", "fx, fy, cx, cy")
-        fx, fy, cx, cy = intrinsics
-        coefficients = self.numbers(("distortion_coeffs", "distortion_coefficients"), "a list of numbers", missing=[])
-        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        return self._intrinsics(matrix, coefficients, fisheye=False)
-
-    def _intrinsics(self, matrix: NDArray[np.float64], coefficients: list[float], *, fisheye: bool) -> _Intrinsics:
-        """Combine the values; the lens model is given by its name, in OpenCV files by the number of coefficients."""
-        model = self.data.get("distortion_model")
-        if model is not None and model not in _PINHOLE | _FISHEYE:
-            raise self.error("distortion_model", f"{model!r}", ", ".join(sorted(_PINHOLE | _FISHEYE)))
-        fisheye = fisheye or model in _FISHEYE
-        while not fisheye and len(coefficients) > 8 and coefficients[-1] == 0.0:
+        lens = self.data.get("distortion_model")
+        if lens is not None and lens not in _PINHOLE | _FISHEYE:
+            raise self.error("distortion_model", f"{lens!r}", ", ".join(sorted(_PINHOLE | _FISHEYE)))
+        is_fisheye = is_fisheye or lens in _FISHEYE
+        while not is_fisheye and len(coefficients) > 8 and coefficients[-1] == 0.0:
             coefficients = coefficients[:-1]  # thin prism and tilt, unused
-        return _Intrinsics(np.asarray(matrix, dtype=np.float64), np.array(coefficients), self.size(), fisheye)
+        size = self.size()
+        try:
+            camera: CameraModel
+            fit = from_opencv_fisheye if is_fisheye else from_opencv
+            camera, residual = fit(matrix, np.array(coefficients), size, pose)
+        except ValueError as fault:
+            raise self.error("camera", str(fault), "a camera matrix, and a distortion that is one-to-one") from fault
+        if not (residual.rms_px <= MAX_RMS_PX and residual.max_px <= MAX_PX):
+            raise self.error(
+                "distortion",
+                f"the nearest camera of the CAHV family is {residual.rms_px:.2g} px off over the frame (RMS), "
+                f"{residual.max_px:.2g} px at most",
+                f"{MAX_RMS_PX:g} and {MAX_PX:g} px; crop the picture, or calibrate with fewer coefficients",
+            )
+        return Calibration(name, camera, residual)
 
     def size(self) -> tuple[int, int]:
         """(columns, rows)."""
@@ -210,9 +214,9 @@ class _Reader:
     def numbers(self, names: Sequence[str], allowed: str, missing: list[float] | None = None) -> list[float]:
         """Read finite numbers from a list, nested lists or a matrix with `data`."""
         name = next((one for one in names if one in self.data), None)
+        if name is None and missing is not None:
+            return missing
         if name is None:
-            if missing is not None:
-                return missing
             raise self.error(names[0], "missing", allowed)
         value = self.data[name]
         items = value.get("data") if isinstance(value, Mapping) else value
@@ -223,13 +227,12 @@ class _Reader:
 
     def transform(self, name: str) -> RigidTransform:
         """Read a rigid transform, written as a matrix of 4 x 4."""
-        flat = self.numbers((name,), "a rigid transform as a matrix of 4 x 4 numbers")
-        matrix = np.array(flat)
+        matrix = np.array(self.numbers((name,), "a rigid transform as a matrix of 4 x 4 numbers"))
         if matrix.size == 16:
             matrix = matrix.reshape(4, 4)
-            turn = matrix[:3, :3]
-            rigid = np.allclose(turn @ turn.T, np.eye(3), rtol=0.0, atol=_ORTHONORMAL) and np.linalg.det(turn) > 0.0
-            if rigid and np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+            rotation = matrix[:3, :3]
+            orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), rtol=0.0, atol=_ORTHONORMAL)
+            if orthonormal and np.linalg.det(rotation) > 0.0 and np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0]):
                 return RigidTransform.from_matrix(matrix)
         raise self.error(name, "is not rigid", "a rotation and a translation as a matrix of 4 x 4 numbers")
 
@@ -246,3 +249,187 @@ def _flat(value: Any) -> list[float] | None:
     except (ValueError, OverflowError):
         return None
     return [number] if math.isfinite(number) else None
+
+
+def from_opencv(
+    matrix: Float[np.ndarray, "3 3"],
+    distortion: Float[np.ndarray, "coefficients"],
+    size: tuple[int, int],
+    camera_from_world: RigidTransform | None = None,
+) -> tuple[Cahvor, Residual]:
+    """Fit the CAHVOR camera nearest to OpenCV's pinhole camera; return it with its residual over the frame.
+
+    Exact if all coefficients but k1 and k2 are zero; otherwise fitted by least squares.
+
+    - matrix: camera matrix, pixels; may have a skew
+    - distortion: none, (k1, k2, p1, p2), (k1, k2, p1, p2, k3) or (k1, k2, p1, p2, k3, k4, k5, k6)
+    - camera_from_world: transform from the new camera's frame of reference to OpenCV's axes; identity by default
+
+    Raises ValueError if the matrix is no camera matrix, the number of coefficients differs, or the distortion is not
+    one-to-one within the frame.
+    """
+    if len(distortion) not in (0, 4, 5, 8) or not np.all(np.isfinite(distortion)):
+        raise ValueError(
+            f"distortion must be none, (k1, k2, p1, p2), (k1, k2, p1, p2, k3) or (k1, k2, p1, p2, k3, k4, k5, k6), "
+            f"finite, not {distortion}"
+        )
+    coefficients = np.concatenate([distortion, np.zeros(8 - len(distortion))])
+    linear, pixels, distorted = _undistorted_camera(matrix, size, camera_from_world)
+    perpendicular = np.cross(linear.a, np.eye(3)[np.argmin(np.abs(linear.a))])
+    perpendicular /= np.linalg.norm(perpendicular)
+    tilt_axes = np.stack([perpendicular, np.cross(linear.a, perpendicular)])
+    points = _undistorted(distorted, coefficients)
+    directions = _in_world(np.concatenate([points, np.ones((len(points), 1))], axis=1), camera_from_world)
+    start = Cahvor.from_cahv(linear, r=(0.0, coefficients[0], coefficients[1]))
+
+    def vary(change: Array) -> Cahvor:
+        """Tilt O, change rho1 and rho2, rotate the image plane, rescale and shift H and V."""
+        rotation = Rotation.from_rotvec(change[4:7]).as_matrix()
+        scale_u, scale_v, shift_u, shift_v = change[7:]
+        o = start.o + change[0] * tilt_axes[0] + change[1] * tilt_axes[1]
+        return replace(
+            start,
+            a=rotation @ start.a,
+            h=rotation @ (start.h * (1 + scale_u) + shift_u * start.a),
+            v=rotation @ (start.v * (1 + scale_v) + shift_v * start.a),
+            o=o / np.linalg.norm(o),
+            r=start.r + np.array([0.0, *change[2:4]]),
+        )
+
+    scales = np.array([1e-3, 1e-3, 1e-2, 1e-2, 1e-3, 1e-3, 1e-3, 1e-3, 1e-3, 1.0, 1.0])
+    return _fit(start, vary, (directions, pixels), scales, method="lm")
+
+
+def from_opencv_fisheye(
+    matrix: Float[np.ndarray, "3 3"],
+    distortion: Float[np.ndarray, "coefficients"],
+    size: tuple[int, int],
+    camera_from_world: RigidTransform | None = None,
+) -> tuple[Cahvore, Residual]:
+    """Fit the CAHVORE camera nearest to OpenCV's fisheye (Kannala & Brandt); return it with its residual.
+
+    Exact if k3 and k4 are zero; otherwise scale, radial terms and linearity are fitted by least squares. `distortion`
+    is (k1, k2, k3, k4); the other parameters and the errors are those of `from_opencv`.
+    """
+    if len(distortion) != 4 or not np.all(np.isfinite(distortion)):
+        raise ValueError(f"distortion of a fisheye must be (k1, k2, k3, k4), finite, not {distortion}")
+    linear, pixels, distorted = _undistorted_camera(matrix, size, camera_from_world)
+    directions = _in_world(_fisheye_directions(distorted, distortion), camera_from_world)
+    start = Cahvore.from_cahv(linear, r=(0.0, distortion[0], distortion[1]), linearity=0.0)
+
+    def vary(change: Array) -> Cahvore:
+        (hc, vc), a, scale = start.image_centre, start.a, float(change[0])
+        h, v = start.h + scale * (start.h - hc * a), start.v + scale * (start.v - vc * a)
+        return replace(start, h=h, v=v, r=start.r + np.array([0.0, *change[1:3]]), linearity=float(change[3]))
+
+    limits, scales = np.array([0.5, 10.0, 10.0, 1.0]), np.array([1e-3, 1e-3, 1e-3, 1e-1])
+    return _fit(start, vary, (directions, pixels), scales, bounds=(-limits, limits))
+
+
+def _fit(
+    start: C, vary: Callable[[Array], C], samples: tuple[Array, Array], scales: Array, **options: Any
+) -> tuple[C, Residual]:
+    """Fit a camera to samples (directions, pixels) from `start`; `scales` are typical sizes of the parameters."""
+    directions, pixels = samples
+    residual = _residual(_far_pixels(start, directions) - pixels)
+    if residual.max_px <= _EXACT_PX:
+        return start, residual
+
+    def differences(change: Array) -> Array:
+        projected = _far_pixels(vary(change), directions)
+        return np.nan_to_num(projected - pixels, nan=_INVISIBLE_PX).ravel()
+
+    fit = least_squares(differences, np.zeros(len(scales)), x_scale=scales, xtol=1e-14, ftol=1e-14, **options)
+    camera = vary(np.asarray(fit.x))
+    return camera, _residual(_far_pixels(camera, directions) - pixels)
+
+
+def _undistorted_camera(
+    matrix: Array, size: tuple[int, int], camera_from_world: RigidTransform | None
+) -> tuple[Cahv, Array, Array]:
+    """The camera without distortion, pixels over its frame, and their points (x, y) in the plane z = 1."""
+    allowed = matrix[1, 0] == 0 and np.array_equal(matrix[2], [0.0, 0.0, 1.0])
+    if not (allowed and matrix[0, 0] > 0 and matrix[1, 1] > 0):
+        raise ValueError("matrix must be ((fx, skew, cx), (0, fy, cy), (0, 0, 1)) with fx and fy positive")
+    world_from_camera = np.eye(4) if camera_from_world is None else camera_from_world.inv().as_matrix()
+    rotation = world_from_camera[:3, :3]
+    columns, rows = (np.linspace(-0.5, extent - 0.5, _SAMPLES) for extent in size)
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    y = (pixels[:, 1] - matrix[1, 2]) / matrix[1, 1]
+    points = np.stack([(pixels[:, 0] - matrix[0, 2] - matrix[0, 1] * y) / matrix[0, 0], y], axis=-1)
+    linear = Cahv(world_from_camera[:3, 3], rotation[:, 2], rotation @ matrix[0], rotation @ matrix[1], size)
+    return linear, pixels, points
+
+
+def _fisheye_directions(points: Array, coefficients: Array) -> Array:
+    """Invert OpenCV's fisheye: directions (z along the axis) of its points (x, y), shape (n, 2); Newton's method."""
+    distance = np.hypot(points[:, 0], points[:, 1])
+    theta = np.minimum(distance, np.pi)
+    for _ in range(50):
+        gain, slope = _fisheye_gain(theta, coefficients)
+        step = (theta * gain - distance) / slope
+        theta = np.clip(theta - step, 0.0, np.pi)
+        if np.max(np.abs(step)) < 1e-14:
+            break
+    angles = np.linspace(0.0, float(theta.max()), 1000)
+    reached = theta * _fisheye_gain(theta, coefficients)[0]
+    if not (np.max(np.abs(reached - distance)) < 1e-9 and np.all(_fisheye_gain(angles, coefficients)[1] > 0)):
+        raise ValueError("the distortion folds over within the frame: some pixels have no direction, or several")
+    across = np.divide(np.sin(theta), distance, out=np.ones_like(theta), where=distance > 0)
+    return np.stack([points[:, 0] * across, points[:, 1] * across, np.cos(theta)], axis=-1)
+
+
+def _in_world(directions: Array, camera_from_world: RigidTransform | None) -> Array:
+    """Rotate directions from OpenCV's axes to the camera's frame of reference."""
+    return directions if camera_from_world is None else directions @ camera_from_world.as_matrix()[:3, :3]
+
+
+def _far_pixels(camera: CameraModel, directions: Array) -> Array:
+    return camera.project(camera.c + directions)[0]
+
+
+def _undistorted(distorted: Array, coefficients: Array) -> Array:
+    """Invert the pinhole distortion by Newton's method in two dimensions."""
+    points = distorted.copy()
+    for _ in range(50):
+        image, slope = _distorted(points, coefficients)
+        step = np.linalg.solve(slope, (image - distorted)[..., np.newaxis])[..., 0]
+        points -= step
+        if np.max(np.abs(step)) < 1e-14:
+            break
+    image, slope = _distorted(points, coefficients)
+    if not (np.max(np.abs(image - distorted)) < 1e-9 and np.all(np.linalg.det(slope) > 0)):
+        raise ValueError("the distortion folds over within the frame: some pixels have no direction, or several")
+    return points
+
+
+def _distorted(points: Array, coefficients: Array) -> tuple[Array, Array]:
+    """OpenCV's pinhole distortion of (x, y), shape (n, 2), and its derivative, shape (n, 2, 2)."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
+    x, y = points.T
+    square = x * x + y * y
+    over = 1 + square * (k1 + square * (k2 + square * k3))
+    under = 1 + square * (k4 + square * (k5 + square * k6))
+    gain = over / under
+    slope = (k1 + square * (2 * k2 + square * 3 * k3) - gain * (k4 + square * (2 * k5 + square * 3 * k6))) / under
+    across = 2 * (x * y * slope + p1 * x + p2 * y)
+    distorted = np.stack(
+        [x * gain + 2 * p1 * x * y + p2 * (square + 2 * x * x), y * gain + p1 * (square + 2 * y * y) + 2 * p2 * x * y],
+        axis=-1,
+    )
+    by_x = np.stack([gain + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, across], axis=-1)
+    by_y = np.stack([across, gain + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=-1)
+    return distorted, np.stack([by_x, by_y], axis=-2)
+
+
+def _fisheye_gain(theta: Array, coefficients: Array) -> tuple[Array, Array]:
+    """Distance over angle of OpenCV's fisheye, and the derivative of the distance."""
+    k1, k2, k3, k4 = coefficients
+    square = theta * theta
+    gain = 1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))
+    return gain, 1 + square * (3 * k1 + square * (5 * k2 + square * (7 * k3 + square * 9 * k4)))
+
+
+def _residual(differences: Array) -> Residual:
+    squares = np.sum(differences * differences, axis=-1)
+    return Residual(rms_px=float(np.sqrt(np.mean(squares))), max_px=float(np.sqrt(np.max(squares))))

@@ -74,8 +74,14 @@ class Cahv(CameraModel):
         """
         if not (np.all(np.isfinite(focal_lengths)) and min(focal_lengths) > 0):
             raise ValueError(f"focal lengths must be positive and finite, not {focal_lengths}")
-        forward = _unit("axis", np.asarray(axis, dtype=np.float64))
-        across = _unit("right", np.asarray(right, dtype=np.float64))
+        units = []
+        for name, triple in (("axis", axis), ("right", right)):
+            vector = np.asarray(triple, dtype=np.float64)
+            length = float(np.linalg.norm(vector))
+            if vector.shape != (3,) or not (np.isfinite(length) and length > 0):
+                raise ValueError(f"{name} must be a finite vector of three components that are not all zero")
+            units.append(vector / length)
+        forward, across = units
         perpendicular = across - (across @ forward) * forward
         if np.linalg.norm(perpendicular) < 1e-6:
             raise ValueError("axis and right must not be parallel")
@@ -102,13 +108,10 @@ class Cahv(CameraModel):
         image_centre: tuple[Real, Real] | None = None,
     ) -> Cahv:
         """Create a camera from its focal length and pixel pitch (one, or along columns and rows); see `from_axes`."""
-        if isinstance(pixel_pitch_m, tuple):
-            column_pitch_m, row_pitch_m = pixel_pitch_m
-        else:
-            column_pitch_m = row_pitch_m = pixel_pitch_m
-        if not (column_pitch_m > 0 and row_pitch_m > 0):
+        column_m, row_m = pixel_pitch_m if isinstance(pixel_pitch_m, tuple) else (pixel_pitch_m, pixel_pitch_m)
+        if not (column_m > 0 and row_m > 0):
             raise ValueError(f"the pixel pitch must be positive, not {pixel_pitch_m} m")
-        focal_lengths = (focal_m / column_pitch_m, focal_m / row_pitch_m)
+        focal_lengths = (focal_m / column_m, focal_m / row_m)
         return cls.from_axes(focal_lengths, size, axis=axis, right=right, centre=centre, image_centre=image_centre)
 
     @classmethod
@@ -136,13 +139,6 @@ def _gradient(image_vector: NDArray[np.float64], axis: NDArray[np.float64], pixe
     return x, y, z
 
 
-def _unit(name: str, vector: Vector) -> Vector:
-    length = float(np.linalg.norm(vector))
-    if vector.shape != (3,) or not (np.isfinite(length) and length > 0):
-        raise ValueError(f"{name} must be a finite vector of three components that are not all zero")
-    return np.asarray(vector / length)
-
-
 class RadialModel(CameraModel):
     """A camera with radial distortion about an optical axis O: base class of CAHVOR and CAHVORE.
 
@@ -167,18 +163,13 @@ class RadialModel(CameraModel):
         if not self._axis @ self.a > 0:
             raise ValueError("o must point to the same side of the image plane as a")
         if not self.r[0] > -1:
-            raise ValueError(
-                f"r must begin with a number above -1 (1 + r[0] scales the image), not {float(self.r[0])!r}"
-            )
+            rho0 = float(self.r[0])
+            raise ValueError(f"r must begin with a number above -1 (1 + r[0] scales the image), not {rho0!r}")
 
     @cached_property
     def _axis(self) -> NDArray[np.float64]:
         """O normalised: labels round it to six digits."""
         return np.asarray(self.o / np.linalg.norm(self.o))
-
-    @property
-    def _pupil_axis(self) -> NDArray[np.float64]:
-        return self._axis
 
     @cached_property
     def _axis_image(self) -> tuple[float, float, float]:
@@ -206,10 +197,11 @@ class RadialModel(CameraModel):
             return np.inf, np.inf
         return float(tau), float(tau * (k1 + tau * (k3 + tau * k5)) ** 2)
 
-    def _off_axis(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Gradient]:
-        """Component of P - C along O, and the vector lambda perpendicular to O."""
+    def _off_axis(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Gradient, Vector]:
+        """Component of P - C along O, the vector lambda perpendicular to O, and its length."""
         along = dot(self._axis, x, y, z)
-        return along, (x - along * self._axis[0], y - along * self._axis[1], z - along * self._axis[2])
+        x, y, z = x - along * self._axis[0], y - along * self._axis[1], z - along * self._axis[2]
+        return along, (x, y, z), np.sqrt(x * x + y * y + z * z)
 
     def _radial_gradient(self, off: Gradient, kappa: Vector, kappa_gradient: Gradient) -> tuple[Gradient, Gradient]:
         """Gradients of the pixel of O + kappa lambda, from kappa's."""
@@ -217,7 +209,8 @@ class RadialModel(CameraModel):
         onto = self._axis_image
         depth = onto[2] + kappa * across[2]
 
-        def gradient(k: int, vector: NDArray[np.float64]) -> Gradient:
+        gradients = []
+        for k, vector in enumerate((self.h, self.v)):
             pixel = (onto[k] + kappa * across[k]) / depth
             slope = (across[k] - pixel * across[2]) / depth
             x, y, z = (
@@ -225,9 +218,8 @@ class RadialModel(CameraModel):
                 + slope * kappa_gradient[i]
                 for i in range(3)
             )
-            return x, y, z
-
-        return gradient(0, self.h), gradient(1, self.v)
+            gradients.append((x, y, z))
+        return gradients[0], gradients[1]
 
 
 @final
@@ -271,7 +263,7 @@ class Cahvor(RadialModel):
         tau = np.maximum((x * x + y * y + z * z) / (omega * omega) - 1, 0)
         kappa = (1 + (self.r[0] + tau * (self.r[1] + tau * self.r[2]))) / omega
         mu_slope = (self.r[1] + 2 * self.r[2] * tau) * 2 / omega**3
-        along, off = self._off_axis(x, y, z)
+        along, off, _ = self._off_axis(x, y, z)
         # d tau = 2 (lambda / omega^2 - tau / omega O).dP, because lambda is perpendicular to O
         kappa_x, kappa_y, kappa_z = (
             mu_slope * (off[i] - tau * omega * self._axis[i]) - kappa / along * self._axis[i] for i in range(3)
@@ -345,10 +337,6 @@ class Cahvore(RadialModel):
             return np.tan(scale * theta) / scale
         return np.sin(scale * theta) / scale if scale < -_ZERO_LINEARITY else theta
 
-    def _chi_slope(self, theta: Vector) -> Vector:
-        cosine = np.cos(self.linearity * theta)
-        return 1 / (cosine * cosine) if self.linearity > _ZERO_LINEARITY else cosine
-
     def _theta(self, chi: Vector) -> Vector:
         """Inverse of `_chi`; beyond the end of its range, the angle at the end."""
         scale = self.linearity
@@ -382,8 +370,7 @@ class Cahvore(RadialModel):
         return np.where(solved, theta, np.nan), upsilon
 
     def _image(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
-        along, off = self._off_axis(x, y, z)
-        across = np.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])
+        along, off, across = self._off_axis(x, y, z)
         theta, _ = self._angle(along, across)
         kappa = self._kappa(self._chi(theta), along, across)
         onto = self._axis_image
@@ -398,13 +385,14 @@ class Cahvore(RadialModel):
         return gain * np.where(across > 0, chi / across, 1 / along)
 
     def _image_gradient(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
-        along, off = self._off_axis(x, y, z)
-        across = np.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])
+        along, off, across = self._off_axis(x, y, z)
         theta, upsilon = self._angle(along, across)
         chi = self._chi(theta)
         kappa = self._kappa(chi, along, across)
         (k1, k3, k5), tau = self._polynomial, chi * chi
-        slope = (k1 + tau * (3 * k3 + tau * 5 * k5)) * self._chi_slope(theta)
+        cosine = np.cos(self.linearity * theta)
+        chi_slope = 1 / (cosine * cosine) if self.linearity > _ZERO_LINEARITY else cosine
+        slope = (k1 + tau * (3 * k3 + tau * 5 * k5)) * chi_slope
         # kappa = f(chi) / across; on the axis lambda vanishes, and with it the effect of kappa's gradient
         inverse = np.where(across > 0, 1 / across, 0.0)
         by_across = (slope * np.cos(theta) / upsilon - kappa) * inverse
@@ -413,10 +401,8 @@ class Cahvore(RadialModel):
         return self._radial_gradient(off, kappa, (kappa_x, kappa_y, kappa_z))
 
     def _sight(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
-        along, off = self._off_axis(*self._image_plane_direction(u, v))
-        along = np.where(along > 0, along, np.nan)
-        across = np.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2])
-        distorted = across / along
+        along, off, across = self._off_axis(*self._image_plane_direction(u, v))
+        distorted = across / np.where(along > 0, along, np.nan)
         ratio = kernels.undistortion(self._polynomial, self._limits, distorted * distorted)
         theta = self._theta(distorted * ratio)
         theta = np.where(theta < self._theta_limit, theta, np.nan)
@@ -424,4 +410,4 @@ class Cahvore(RadialModel):
         outward = np.where(across > 0, sine / across, 0.0)
         x, y, z = (cosine * self._axis[i] + outward * off[i] for i in range(3))
         shift = np.where(theta > 0, theta / sine - 1, 0.0) * self._pupil(theta)[0]
-        return (x, y, z), shift
+        return (x, y, z), shift[:, np.newaxis] * self._axis

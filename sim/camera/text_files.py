@@ -1,4 +1,6 @@
-"""JPL's text files of camera models (.cahv, .cahvor, .cahvore), as written by the programs CCALADJ and cmod.
+"""Camera models of files of any format; JPL's text files (.cahv, .cahvor, .cahvore).
+
+The text files are those of the programs CCALADJ and cmod:
 
     Model = CAHVOR = perspective, distortion
     Dimensions = 1024 1024
@@ -14,11 +16,15 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import NamedTuple
 
 from marsyard.sim.camera.assembly import Source, create_camera, linearity_of_type
 from marsyard.sim.camera.base import CameraModel
+from marsyard.sim.camera.calibrations import is_calibration, read_calibrations
 from marsyard.sim.camera.models import Cahvore
+from marsyard.sim.camera.pds import is_pds3, is_xml, read_pds3, read_pds4
+
+#: Number of bytes that identify a format.
+_HEAD = 4096
 
 #: Frames of written cameras, as stated in their files.
 BODY_FRAME = "body (metres); the body's pose in the world, where it is known, is stated next to this file"
@@ -34,9 +40,35 @@ _ASSIGNMENT = re.compile(r"\s*(?P<name>[A-Za-z][A-Za-z_ ]*?)\s*=\s*(?P<value>.*?
 _MODEL = re.compile(r"(?P<name>CAHV|CAHVOR|CAHVORE(?P<type>\d+)?)(?:\s*,\s*(?P<parameter>[^\s=]+))?\s*(?:=.*)?$")
 
 
-class _Line(NamedTuple):
-    number: int
-    value: str
+def read_cameras(
+    path: str | Path, *, subframe_folded_in: bool = False, size: tuple[int, int] | None = None
+) -> tuple[CameraModel, ...]:
+    """Read every camera model of a file, by its format.
+
+    Formats: a PDS3 label or product (`read_pds3`), a PDS4 label (`read_pds4`), a JPL text file (`read_cahvor`), a
+    calibration of OpenCV, ROS, Kalibr or EuRoC in YAML (`read_calibrations`, which also reports the residuals).
+
+    - subframe_folded_in: PDS labels: the model of a subframe, or of averaged pixels, describes the stored picture
+    - size: (columns, rows) of the pictures, for JPL text files without the line Dimensions
+
+    Raises CameraFileError if the file cannot be read or is wrong; it names file, field and allowed values.
+    """
+    head = Source(str(path)).head(_HEAD)
+    if is_pds3(head):
+        return read_pds3(path, subframe_folded_in=subframe_folded_in)
+    if is_xml(head):
+        return read_pds4(path, subframe_folded_in=subframe_folded_in)
+    if is_calibration(head):
+        return tuple(one.camera for one in read_calibrations(path))
+    return (read_cahvor(path, size=size),)
+
+
+def read_camera(path: str | Path, *, subframe_folded_in: bool = False) -> CameraModel:
+    """Read the only camera model of a file, as `read_cameras`. Raises CameraFileError also if it has several."""
+    cameras = read_cameras(path, subframe_folded_in=subframe_folded_in)
+    if len(cameras) != 1:
+        raise Source(str(path)).error("camera models", f"{len(cameras)} of them", "one, or use read_cameras")
+    return cameras[0]
 
 
 def read_cahvor(path: str | Path, *, size: tuple[int, int] | None = None) -> CameraModel:
@@ -47,11 +79,64 @@ def read_cahvor(path: str | Path, *, size: tuple[int, int] | None = None) -> Cam
     allowed values.
     """
     source = Source(str(path))
-    lines = _assignments(source.text(), source)
-    name, linearity = _model(_required(lines, "Model", source), source)
-    size = _size(lines, size, source)
-    vectors = {letter: _vector(letter, _required(lines, letter, source), source) for letter in name}
+    lines: dict[str, tuple[str, int]] = {}
+    for number, line in enumerate(source.text().splitlines(), start=1):
+        match = _ASSIGNMENT.match(line.partition("#")[0])
+        if match is not None and match["name"] in lines:
+            name = match["name"]
+            raise source.error(name, f"given twice, in lines {lines[name][1]} and {number}", "once")
+        if match is not None:
+            lines[match["name"]] = match["value"], number
+
+    def required(name: str) -> tuple[str, int]:
+        if name not in lines:
+            raise source.error(name, "missing", f"a line '{name} = ...'")
+        return lines[name]
+
+    value, number = required("Model")
+    model = _MODEL.match(value)
+    if model is None:
+        allowed = "CAHV, CAHVOR, CAHVORE1, CAHVORE2 or CAHVORE3,<linearity>"
+        raise source.error("Model", f"{value!r} in line {number}", allowed)
+    name = "CAHVORE" if model["name"].startswith("CAHVORE") else model["name"]
+    kind = None if model["type"] is None else int(model["type"])
+    linearity = None
+    if name == "CAHVORE":
+        word = model["parameter"]
+        parameter = None if word is None else _parse_number("Model", word, number, source)
+        linearity = linearity_of_type(kind, parameter, "Model", source)
+    size = _read_size(lines.get("Dimensions"), size, source)
+    vectors = {}
+    for letter in name:
+        value, number = required(letter)
+        words = value.split()
+        if len(words) != 3:
+            raise source.error(letter, f"{len(words)} words in line {number}", "three finite numbers")
+        vectors[letter] = [_parse_number(letter, word, number, source) for word in words]
     return create_camera(name, vectors, size, linearity, source)
+
+
+def _parse_number(name: str, word: str, number: int, source: Source) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        raise source.error(name, f"{word!r} in line {number} is not a number", "finite numbers") from None
+
+
+def _read_size(line: tuple[str, int] | None, given: tuple[int, int] | None, source: Source) -> tuple[int, int]:
+    """(columns, rows) by the line Dimensions, or as given if the file has none."""
+    if line is None:
+        if given is None:
+            raise source.error("Dimensions", "missing", "a line 'Dimensions = columns rows', or size = [columns, rows]")
+        return given
+    words = line[0].split()
+    if len(words) != 2 or not all(word.isdecimal() and int(word) > 0 for word in words):
+        fault = f"{line[0]!r} in line {line[1]}"
+        raise source.error("Dimensions", fault, "two positive integers, columns and rows")
+    stated = int(words[0]), int(words[1])
+    if given is not None and given != stated:
+        raise source.error("Dimensions", f"{stated[0]} {stated[1]}", f"the given size, {given[0]} {given[1]}")
+    return stated
 
 
 def write_cahvor(camera: CameraModel, path: str | Path, comment: str = "", *, frame: str = "") -> None:
@@ -68,65 +153,3 @@ def write_cahvor(camera: CameraModel, path: str | Path, comment: str = "", *, fr
     lines += ["", f"Hs    = {hs!r}", f"Hc    = {hc!r}", f"Vs    = {vs!r}", f"Vc    = {vc!r}"]
     lines += [f"Theta = {theta!r} ({theta * 57.29577951308232:.6f} deg)"]
     Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _assignments(text: str, source: Source) -> dict[str, _Line]:
-    lines: dict[str, _Line] = {}
-    for number, line in enumerate(text.splitlines(), start=1):
-        match = _ASSIGNMENT.match(line.partition("#")[0])
-        if match is None:
-            continue
-        name = match["name"]
-        if name in lines:
-            raise source.error(name, f"given twice, in lines {lines[name].number} and {number}", "once")
-        lines[name] = _Line(number, match["value"])
-    return lines
-
-
-def _required(lines: dict[str, _Line], name: str, source: Source) -> _Line:
-    if name not in lines:
-        raise source.error(name, "missing", f"a line '{name} = ...'")
-    return lines[name]
-
-
-def _model(line: _Line, source: Source) -> tuple[str, float | None]:
-    match = _MODEL.match(line.value)
-    allowed = "CAHV, CAHVOR, CAHVORE1, CAHVORE2 or CAHVORE3,<linearity>"
-    if match is None:
-        raise source.error("Model", f"{line.value!r} in line {line.number}", allowed)
-    if not match["name"].startswith("CAHVORE"):
-        return match["name"], None
-    parameter = None if match["parameter"] is None else _number("Model", match["parameter"], line, source)
-    kind = None if match["type"] is None else int(match["type"])
-    return "CAHVORE", linearity_of_type(kind, parameter, "Model", source)
-
-
-def _size(lines: dict[str, _Line], given: tuple[int, int] | None, source: Source) -> tuple[int, int]:
-    """(columns, rows) by the file, or as given if the file does not state them."""
-    if "Dimensions" not in lines:
-        if given is None:
-            raise source.error("Dimensions", "missing", "a line 'Dimensions = columns rows', or size = [columns, rows]")
-        return given
-    line = lines["Dimensions"]
-    words = line.value.split()
-    if len(words) != 2 or not all(word.isdecimal() and int(word) > 0 for word in words):
-        fault = f"{line.value!r} in line {line.number}"
-        raise source.error("Dimensions", fault, "two positive integers, columns and rows")
-    stated = int(words[0]), int(words[1])
-    if given is not None and given != stated:
-        raise source.error("Dimensions", f"{stated[0]} {stated[1]}", f"the given size, {given[0]} {given[1]}")
-    return stated
-
-
-def _vector(name: str, line: _Line, source: Source) -> list[float]:
-    words = line.value.split()
-    if len(words) != 3:
-        raise source.error(name, f"{len(words)} words in line {line.number}", "three finite numbers")
-    return [_number(name, word, line, source) for word in words]
-
-
-def _number(name: str, word: str, line: _Line, source: Source) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        raise source.error(name, f"{word!r} in line {line.number} is not a number", "finite numbers") from None

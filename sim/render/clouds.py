@@ -24,7 +24,7 @@ class CloudParameters(Parameters):
     """Fair-weather clouds. The defaults are small cumuli over a desert at noon; they are assumed, not from a paper."""
 
     base_m: Annotated[float, Field(gt=0.0, le=20000.0, description="height of the layer above the ground, m")] = 2500.0
-    cover: Annotated[float, Field(ge=0.0, le=0.9, description="share of the ground in the clouds' shadows")] = 0.3
+    cover: Annotated[float, Field(ge=0.0, le=0.9, description="fraction of the ground in the clouds' shadows")] = 0.3
     size_m: Annotated[
         float, Field(ge=50.0, le=10000.0, description="mean length of a straight line's passage through a cloud, m")
     ] = 800.0
@@ -83,7 +83,10 @@ class CloudLayer:
         noise = np.fft.rfft2(rng.standard_normal((CELLS, CELLS)))
         if parameters.cover == 0.0:
             return cls(parameters, ground_m + parameters.base_m, _frozen(np.zeros((CELLS, CELLS))))
-        wave = _squared_wave_numbers(parameters.size_m * PERIOD_SIZES)
+        # squared wave numbers of the real transform's terms, rad2/m2
+        spacing = parameters.size_m * PERIOD_SIZES / CELLS
+        y, x = 2.0 * np.pi * np.fft.fftfreq(CELLS, spacing), 2.0 * np.pi * np.fft.rfftfreq(CELLS, spacing)
+        wave = y[:, None] ** 2 + x**2
         cut = float(ndtri(1.0 - parameters.cover))
         total = sum(variance for _, variance in OCTAVES)
         bend = sum(variance / (2.0 * length**2) for length, variance in OCTAVES) / total
@@ -120,27 +123,16 @@ class CloudLayer:
         _cells, height, east, north, loss = self.coefficients(sun, time_s)
         towards = np.asarray(sun.direction, dtype=np.float64)
         up = np.maximum(height - points[..., 2], 0.0) / towards[2]
-        x = (points[..., 0] + up * towards[0] - east) / self.cell_m
-        y = (points[..., 1] + up * towards[1] - north) / self.cell_m
+        x, y = ((points[..., k] + up * towards[k] - drift) / self.cell_m for k, drift in ((0, east), (1, north)))
         finite = np.isfinite(x) & np.isfinite(y)
         cells = np.where(finite, np.stack([y, x]), 0.0)
         cover = map_coordinates(self.cover.astype(np.float64), cells, order=1, mode="grid-wrap")
-        passed: Float64[np.ndarray, "*batch"] = np.where(finite, 1.0 - loss * cover, np.nan)
-        return passed
+        return np.asarray(np.where(finite, 1.0 - loss * cover, np.nan))
 
 
 def no_cover() -> Float32[np.ndarray, "one one"]:
     """The cover of a scene without clouds, of the same numba type as a layer's."""
     return _frozen(np.zeros((1, 1)))
-
-
-def _squared_wave_numbers(period_m: float) -> Float64[np.ndarray, "rows half"]:
-    """Squared wave numbers of a real transform's terms, rad2/m2."""
-    spacing = period_m / CELLS
-    y = 2.0 * np.pi * np.fft.fftfreq(CELLS, spacing)
-    x = 2.0 * np.pi * np.fft.rfftfreq(CELLS, spacing)
-    squared: Float64[np.ndarray, "rows half"] = y[:, None] ** 2 + x**2
-    return squared
 
 
 def _frozen(cover: Float64[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "rows columns"]:

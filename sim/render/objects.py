@@ -46,46 +46,49 @@ class Objects:
 
         Raises ValueError for more triangles than a picture can number.
         """
-        if len(faces) > MAX_TRIANGLES:
-            raise ValueError(f"{len(faces)} triangles; at most {MAX_TRIANGLES} can be drawn at once")
         changes = np.flatnonzero(np.diff(name_of_face if body_of_face is None else body_of_face)) + 1
-        first = np.concatenate([[0], changes, [len(faces)]]).astype(np.int64) if len(faces) else np.zeros(1, np.int64)
-        counts = np.diff(first)
+        first = np.concatenate([[0], changes]) if len(faces) else np.empty(0, dtype=np.int64)
         # np.take is several times faster than indexing for a scene's million triangles
-        return cls(
-            triangles=np.take(np.asarray(vertices, dtype=np.float64), faces, axis=0),
-            normals=np.take(np.asarray(vertex_normals, dtype=np.float64), faces, axis=0),
-            body_of_triangle=np.repeat(np.arange(counts.size, dtype=np.int32), counts),
-            first_triangle=first,
-            albedo=np.full(counts.size, float(albedo)),
-            names=np.asarray(name_of_face, dtype=np.int64)[first[:-1]],
+        return cls._of_bodies(
+            np.take(np.asarray(vertices, dtype=np.float64), faces, axis=0),
+            np.take(np.asarray(vertex_normals, dtype=np.float64), faces, axis=0),
+            np.diff(first, append=len(faces)),
+            np.full(first.size, float(albedo)),
+            np.asarray(name_of_face, dtype=np.int64)[first],
         )
 
     @classmethod
     def joined(cls, parts: Sequence[Objects]) -> Objects:
         """Join the bodies of several sets."""
-        bodies = np.cumsum([0] + [len(part.albedo) for part in parts])
-        starts = np.cumsum([0] + [len(part.triangles) for part in parts])
-        first = [part.first_triangle[:-1] + start for part, start in zip(parts, starts, strict=False)]
-        numbers = [part.body_of_triangle + np.int32(body) for part, body in zip(parts, bodies, strict=False)]
-        if starts[-1] > MAX_TRIANGLES:
-            raise ValueError(f"{starts[-1]} triangles; at most {MAX_TRIANGLES} can be drawn at once")
-        whole = cls(
-            triangles=np.concatenate([part.triangles for part in parts]),
-            normals=np.concatenate([part.normals for part in parts]),
-            body_of_triangle=np.concatenate(numbers).astype(np.int32),
-            first_triangle=np.concatenate([*first, starts[-1:]]).astype(np.int64),
-            albedo=np.concatenate([part.albedo for part in parts]),
-            names=np.concatenate([part.names for part in parts]),
-        )
-        return _with_spheres(whole, np.concatenate([part.spheres for part in parts]))
+        names = ("triangles", "normals", "albedo", "names", "spheres")
+        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        return cls._of_bodies(counts=np.concatenate([np.diff(part.first_triangle) for part in parts]), **arrays)
+
+    @classmethod
+    def _of_bodies(
+        cls,
+        triangles: Float64[np.ndarray, "triangles 3 3"],
+        normals: Float64[np.ndarray, "triangles 3 3"],
+        counts: Int64[np.ndarray, "bodies"],
+        albedo: Float64[np.ndarray, "bodies"],
+        names: Int64[np.ndarray, "bodies"],
+        spheres: Float64[np.ndarray, "bodies 4"] | None = None,
+    ) -> Objects:
+        """Number bodies of so many triangles; known spheres are not computed again for thousands of rocks."""
+        if len(triangles) > MAX_TRIANGLES:
+            raise ValueError(f"{len(triangles)} triangles; at most {MAX_TRIANGLES} can be drawn at once")
+        body_of_triangle = np.repeat(np.arange(counts.size, dtype=np.int32), counts)
+        first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        objects = cls(triangles, normals, body_of_triangle, first, albedo, names)
+        if spheres is not None:
+            objects.__dict__["spheres"] = spheres
+        return objects
 
     @classmethod
     def none(cls) -> Objects:
         """Return an empty set."""
-        return cls.of_mesh(
-            np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3), np.int32), np.empty(0, np.int32), albedo=1.0
-        )
+        points, faces = np.empty((0, 3)), np.empty((0, 3), np.int32)
+        return cls.of_mesh(points, points, faces, np.empty(0, np.int32), albedo=1.0)
 
     def __len__(self) -> int:
         return len(self.albedo)
@@ -93,30 +96,26 @@ class Objects:
     @cached_property
     def spheres(self) -> Float64[np.ndarray, "bodies 4"]:
         """Centre and radius of a sphere around each body, about the centre of its bounding box."""
-        spheres: Float64[np.ndarray, "bodies 4"] = body_spheres(self.triangles, self.first_triangle)
-        return spheres
+        return np.asarray(body_spheres(self.triangles, self.first_triangle))
 
     def in_cone(
         self, apex: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], half_angle_rad: float
     ) -> Int64[np.ndarray, "kept"]:
         """Numbers of the triangles that face a cone's apex, of all bodies whose spheres reach into the cone."""
         kept = spheres_in_cone(self.spheres, apex, axis, half_angle_rad)
-        numbers: Int64[np.ndarray, "kept"] = select_facing(self.triangles, self._triangles_of(kept), *apex)
-        return numbers
+        return np.asarray(select_facing(self.triangles, self._triangles_of(kept), *apex))
 
     def only(self, kept: Bool[np.ndarray, "bodies"]) -> Objects:
         """Select some of the bodies, which are numbered again."""
-        counts = np.diff(self.first_triangle)
         triangles = self._triangles_of(kept)
-        some = Objects(
-            triangles=np.take(self.triangles, triangles, axis=0),
-            normals=np.take(self.normals, triangles, axis=0),
-            body_of_triangle=np.repeat(np.arange(np.count_nonzero(kept), dtype=np.int32), counts[kept]),
-            first_triangle=np.concatenate([[0], np.cumsum(counts[kept])]).astype(np.int64),
-            albedo=self.albedo[kept],
-            names=self.names[kept],
+        return self._of_bodies(
+            np.take(self.triangles, triangles, axis=0),
+            np.take(self.normals, triangles, axis=0),
+            np.diff(self.first_triangle)[kept],
+            self.albedo[kept],
+            self.names[kept],
+            self.spheres[kept],
         )
-        return _with_spheres(some, self.spheres[kept])
 
     def _triangles_of(self, kept: Bool[np.ndarray, "bodies"]) -> Int64[np.ndarray, "kept"]:
         return np.flatnonzero(np.repeat(kept, np.diff(self.first_triangle)))
@@ -135,17 +134,8 @@ def spheres_in_cone(
     half_angle_rad: float,
 ) -> Bool[np.ndarray, "bodies"]:
     """Select the spheres that reach into a cone."""
-    away = spheres[:, :3] - apex
+    away, radius = spheres[:, :3] - apex, spheres[:, 3]
     distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
     off_axis = np.arccos(np.clip(away @ axis / distance, -1.0, 1.0))
-    widening = np.arcsin(np.clip(spheres[:, 3] / distance, 0.0, 1.0))
-    reaching: Bool[np.ndarray, "bodies"] = off_axis <= half_angle_rad + np.where(
-        distance <= spheres[:, 3], np.pi, widening
-    )
-    return reaching
-
-
-def _with_spheres(objects: Objects, spheres: Float64[np.ndarray, "bodies 4"]) -> Objects:
-    """Set the spheres of objects, which spares computing those of a scene's thousands of rocks again."""
-    objects.__dict__["spheres"] = spheres
-    return objects
+    widening = np.where(distance <= radius, np.pi, np.arcsin(np.clip(radius / distance, 0.0, 1.0)))
+    return np.asarray(off_axis <= half_angle_rad + widening)

@@ -129,9 +129,7 @@ class Texture:
         return float(self.coarsest_m), np.asarray(self.amplitudes, dtype=np.float64)
 
 
-@cache
-def _scattered_irradiance(sun_z: float, depth: float, asymmetry: float) -> float:
-    return float(scattered_irradiance(sun_z, depth, asymmetry))
+_scattered_irradiance = cache(scattered_irradiance)
 
 
 @cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -14,7 +15,7 @@ from marsyard.sim.frames import turn_matrix
 from marsyard.sim.render.backend import RenderingError
 from marsyard.sim.render.kernels.structs import Rays
 from marsyard.sim.render.kernels.views import max_image_radius, min_component, pixel_angles, sum_of_vectors
-from marsyard.sim.render.shadows import Cone
+from marsyard.sim.render.scene import Cone
 
 #: Samples along each side of the pinhole views: a camera takes the first that exceeds its own pixels by `_SPARE_PX`,
 #: else the last (full frames of 1024 x 1024 and 45 deg are drawn at about their own resolution).
@@ -87,11 +88,23 @@ class PixelRays:
         view_of_pixel = np.zeros((rows, columns), dtype=np.uint8)
         axes: list[Float64[np.ndarray, "3 3"]] = []
         focal: list[float] = []
-        for part in _parts(directions):
-            view_of_pixel[part] = len(axes)
-            axes.append(_view_axes(directions[part]))
-            # the focal length at which these rays just fill the view
-            focal.append(float((side / 2.0 - MARGIN_PX) / max_image_radius(directions[part], axes[-1])))
+        # the picture is cut into quarters until each part fits a view
+        pending = [(slice(0, rows), slice(0, columns))]
+        while pending:
+            part = pending.pop(0)
+            part_axes = _view_axes(directions[part])
+            if (directions[part] @ part_axes[2]).min() >= np.cos(WIDEST_HALF_ANGLE_RAD):
+                view_of_pixel[part] = len(axes)
+                axes.append(part_axes)
+                # the focal length at which these rays just fill the view
+                focal.append(float((side / 2.0 - MARGIN_PX) / max_image_radius(directions[part], part_axes)))
+                continue
+            (top, bottom), (left, right) = ((extent.start, extent.stop) for extent in part)
+            if bottom - top < 4 or right - left < 4:
+                raise RenderingError("neighbouring pixels of the camera look in wholly different directions")
+            row, column = (top + bottom) // 2, (left + right) // 2
+            quarters = product((slice(top, row), slice(row, bottom)), (slice(left, column), slice(column, right)))
+            pending += list(quarters)
         if starts.strides[:2] == (0, 0):
             centre, origins = starts[0, 0].copy(), np.zeros((rows * columns, 3), dtype=np.float32)
         else:
@@ -108,28 +121,6 @@ class PixelRays:
             focal_px=np.array(focal),
             view_of_pixel=view_of_pixel.ravel(),
         )
-
-
-def _parts(directions: Float64[np.ndarray, "rows columns 3"]) -> list[tuple[slice, slice]]:
-    """Cut the picture into quarters until each part fits a view."""
-    rows, columns = directions.shape[:2]
-    pending, parts = [(slice(0, rows), slice(0, columns))], []
-    while pending:
-        part = pending.pop(0)
-        axes = _view_axes(directions[part])
-        if (directions[part] @ axes[2]).min() >= np.cos(WIDEST_HALF_ANGLE_RAD):
-            parts.append(part)
-            continue
-        (top, bottom), (left, right) = ((side.start, side.stop) for side in part)
-        if bottom - top < 4 or right - left < 4:
-            raise RenderingError("neighbouring pixels of the camera look in wholly different directions")
-        middle_row, middle_column = (top + bottom) // 2, (left + right) // 2
-        pending += [
-            (vertical, horizontal)
-            for vertical in (slice(top, middle_row), slice(middle_row, bottom))
-            for horizontal in (slice(left, middle_column), slice(middle_column, right))
-        ]
-    return parts
 
 
 def _view_axes(directions: Float64[np.ndarray, "rows columns 3"]) -> Float64[np.ndarray, "3 3"]:

@@ -11,26 +11,52 @@ the ray through the pixel's centre.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import ctypes
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, Int64
+from jaxtyping import Float, Float32, Float64, Int, Int32, Int64
+from numba import config
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.frames import turn_matrix
-from marsyard.sim.render.backend import Backend, DepthRenderer, PinholeView, RenderingError
+from marsyard.sim.render.backend import Backend, DepthRenderer, RenderingError
 from marsyard.sim.render.kernels.edges import mark_edges, split_rays, trace_subpixel_rays
 from marsyard.sim.render.kernels.primary import GRAZING, trace_primary_rays
 from marsyard.sim.render.kernels.shading import shade
-from marsyard.sim.render.kernels.structs import Ground, Hits, Light, Picture, Pose, Rays, Views
-from marsyard.sim.render.mesh import cells_in_hull, ground_mesh, ground_struct, lines_in_view
-from marsyard.sim.render.process import in_parts, keep_freed_memory, return_freed_memory
+from marsyard.sim.render.kernels.strips import STRIP
+from marsyard.sim.render.kernels.structs import Array32, Extent, Ground, Hits, Light, Picture, Pose, Rays, Views
+from marsyard.sim.render.kernels.views import build_mesh, spans_in_hull
 from marsyard.sim.render.rays import VIEW_SIDE_PX, PixelRays
 from marsyard.sim.render.scene import Scene
+from marsyard.sim.terrain import Surface
+
+if TYPE_CHECKING:
+    import trimesh
+
+#: Number of levels that kernels take: they are compiled for one number of arrays, which takes a minute. Terrains of
+#: 2**15 samples along a side have as many.
+LEVELS = 12
+#: Replaces the ceilings of a surface that are not worth their time: no ray is known to be clear.
+NO_CEILING = np.full((1, 1), np.inf, dtype=np.float32)
+#: Pixels below which starting threads costs more than they save.
+MIN_PIXELS = 20_000
+#: Options of glibc's mallopt (malloc.h): size from which memory is mapped separately, and size of the free end of the
+#: heap from which it is returned to the system.
+_M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
+#: Terrains are larger than this and mapped, pictures smaller.
+_MAPPED_FROM_BYTES = 32 << 20
+_KEPT_BYTES = 1 << 30
+#: Scenes after which freed memory is returned to the system; after every scene it would take a tenth of a rover's run.
+_SCENES_KEPT = 16
+#: Rays along each side of a picture by which the visible ground is bounded.
+_PROBES = 9
 
 
 def edge_pixels(
@@ -81,12 +107,7 @@ class Frame:
         )
         along = np.where(np.isfinite(distance), distance, np.nan).reshape(-1, 1)
         points_body = self.rays.centre + origins + along * directions.astype(np.float64)
-        points: Float64[np.ndarray, "pixels 3"] = self.world_from_body.apply(points_body)
-        return points.reshape(*distance.shape, 3)
-
-
-#: Scenes after which freed memory is returned to the system; after every scene it would take a tenth of a rover's run.
-_SCENES_KEPT = 16
+        return np.asarray(self.world_from_body.apply(points_body)).reshape(*distance.shape, 3)
 
 
 class Renderer:
@@ -112,8 +133,7 @@ class Renderer:
         clearance = pose.position[2] - float(scene.surface.height(pose.position[0], pose.position[1]))
         if clearance <= 0.0:
             raise RenderingError(f"the camera is {-clearance:.2f} m below the ground at {pose.position}")
-        self._load(scene, rays, pose)
-        views = self._draw(scene, rays, pose, clearance)
+        views = self._draw_views(scene, rays, pose, clearance)
         columns, rows = rays.size
         highest_ray = np.arcsin(np.clip((pose.rotation @ rays.axis)[2], -1.0, 1.0)) + rays.half_angle_rad
         grazing = bool(np.sin(min(highest_ray, 0.5 * np.pi)) > -GRAZING)
@@ -124,7 +144,7 @@ class Renderer:
             some = views._replace(view_of_pixel=rays.view_of_pixel[part])
             trace_primary_rays(ground, some, pose, Rays(*_part(rays.rays, part)), tree, Hits(*_part(hits, part)))
 
-        in_parts(trace, rows * columns)
+        run_in_parts(trace, rows * columns)
         picture = _shade(scene, ground, pose, rays.rays, hits, light)
         radiance, body = picture.radiance.reshape(rows, columns), picture.body.reshape(rows, columns)
         range_m, normal = hits.distance.reshape(rows, columns), picture.normal.reshape(rows, columns, 3)
@@ -149,25 +169,35 @@ class Renderer:
             self._views[side_px] = DepthRenderer(side_px, self._backend)
         return self._views[side_px]
 
-    def _load(self, scene: Scene, rays: PixelRays, pose: Pose) -> None:
-        """Load the ground and the objects that this picture shows."""
-        points = _ground_in_view(scene, rays, pose)
-        (west, south), (east, north) = points.min(axis=0), points.max(axis=0)
-        x = lines_in_view(scene.centre_m[0] + scene.mesh_offsets, west, east)
-        y = lines_in_view(scene.centre_m[1] + scene.mesh_offsets, south, north)
-        numbers = scene.objects.in_cone(pose.position, pose.rotation @ rays.axis, rays.half_angle_rad)
-        ground = ground_mesh(scene.surface, x, y, cells_in_hull(x, y, points))
-        self._view_renderer(rays.view_side_px).load(ground, scene.objects.triangles[numbers], numbers)
+    def _draw_views(self, scene: Scene, rays: PixelRays, pose: Pose, clearance_m: float) -> Views:
+        """Depth and triangle numbers of the camera's pinhole views."""
         if self._last is not scene:
             self._last = scene
             self._scenes += 1
             if self._scenes % _SCENES_KEPT == 0:
                 return_freed_memory()
-
-    def _draw(self, scene: Scene, rays: PixelRays, pose: Pose, clearance_m: float) -> Views:
-        """Depth and triangle numbers of the camera's pinhole views."""
+        # the visible ground lies between two planes: a ray ends at the lower one, or where the mesh does
+        columns, rows = rays.size
+        probes = np.ix_(np.linspace(0, rows - 1, _PROBES).astype(int), np.linspace(0, columns - 1, _PROBES).astype(int))
+        directions = rays.directions.reshape(rows, columns, 3)[probes].reshape(-1, 3) @ pose.rotation.T
+        position, (low, high) = pose.position, scene.height_range_m
+        falls = np.minimum(directions[:, 2], -1e-9)
+        levels = (low, max(high, position[2]))
+        ends = [np.clip((level - position[2]) / falls, 0.0, 2.0 * scene.mesh_reach_m) for level in levels]
+        points = np.concatenate([position[:2] + end[:, None] * directions[:, :2] for end in ends])
+        # between the probes the border bulges by a small fraction of their span at most
+        margin = 0.02 * (points.max(axis=0) - points.min(axis=0)) + 2.0 * scene.mesh_finest_m
+        corners = margin * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
+        points = (points[:, None] + corners).reshape(-1, 2)
+        x, y = (
+            lines_in_view(centre + scene.mesh_offsets, first, last)
+            for centre, first, last in zip(scene.centre_m, points.min(axis=0), points.max(axis=0), strict=True)
+        )
+        numbers = scene.objects.in_cone(pose.position, pose.rotation @ rays.axis, rays.half_angle_rad)
+        ground = ground_mesh(scene.surface, x, y, cells_in_hull(x, y, points))
         renderer = self._view_renderer(rays.view_side_px)
-        drawn = []
+        renderer.load(ground, scene.objects.triangles[numbers], numbers)
+        pictures = []
         for view_from_body, focal in zip(rays.view_from_body, rays.focal_px, strict=True):
             world_from_view = np.eye(4)
             world_from_view[:3, :3] = pose.rotation @ view_from_body.T
@@ -175,13 +205,10 @@ class Renderer:
             # a twentieth of the height above the ground: nearer relief and objects are cut off; depth is only a first
             # guess, so its coarseness far away is harmless
             far = 2.0 * scene.mesh_reach_m + clearance_m
-            drawn.append(renderer.draw(PinholeView(world_from_view, float(focal), 0.05 * clearance_m, far)))
+            pictures.append(renderer.draw(world_from_view, float(focal), 0.05 * clearance_m, far))
         # a single view is not copied
-        depth, numbers = (
-            pictures[0][np.newaxis] if len(pictures) == 1 else np.stack(pictures)
-            for pictures in zip(*drawn, strict=True)
-        )
-        return Views(depth, numbers, rays.focal_px, rays.view_from_body, rays.view_of_pixel)
+        depth, ids = (one[0][np.newaxis] if len(one) == 1 else np.stack(one) for one in zip(*pictures, strict=True))
+        return Views(depth, ids, rays.focal_px, rays.view_from_body, rays.view_of_pixel)
 
 
 def _empty_hits(count: int, scene: Scene) -> Hits:
@@ -206,35 +233,98 @@ def _shade(scene: Scene, ground: Ground, pose: Pose, rays: Rays, hits: Hits, lig
         some_rays, some_hits, some_pixels = (_part(arrays, part) for arrays in (rays, hits, picture))
         shade(ground, pose, Rays(*some_rays), Hits(*some_hits), light, occluders, materials, Picture(*some_pixels))
 
-    in_parts(shade_part, count)
+    run_in_parts(shade_part, count)
     return picture
-
-
-#: Rays along each side of a picture by which the visible ground is bounded.
-_PROBES = 9
-
-
-def _ground_in_view(scene: Scene, rays: PixelRays, pose: Pose) -> Float64[np.ndarray, "points 2"]:
-    """Points whose convex hull contains the ground that a picture can show.
-
-    The ground lies between two planes: a ray ends at the lower one; one that never meets it ends where the mesh does.
-    """
-    columns, rows = rays.size
-    probes = np.ix_(np.linspace(0, rows - 1, _PROBES).astype(int), np.linspace(0, columns - 1, _PROBES).astype(int))
-    directions = rays.directions.reshape(rows, columns, 3)[probes].reshape(-1, 3) @ pose.rotation.T
-    position = pose.position
-    low, high = scene.height_range_m
-    farthest = 2.0 * scene.mesh_reach_m
-    falls = np.minimum(directions[:, 2], -1e-9)
-    ends = [np.clip((level - position[2]) / falls, 0.0, farthest) for level in (low, max(high, position[2]))]
-    points = np.concatenate([position[:2] + end[:, None] * directions[:, :2] for end in ends])
-    # between the probes the border bulges by a small fraction of their span at most
-    margin = 0.02 * (points.max(axis=0) - points.min(axis=0)) + 2.0 * scene.mesh_finest_m
-    corners = margin * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
-    return np.asarray((points[:, None] + corners).reshape(-1, 2))
 
 
 @cache
 def process_renderer(backend: Backend) -> Renderer:
     """Return the renderer of this process, created at the first call."""
     return Renderer(backend)
+
+
+def run_in_parts(work: Callable[[slice], None], pixels: int, threads: int | None = None) -> None:
+    """Run `work` on slices of all pixels in threads; the result does not depend on their number.
+
+    `threads` is by default numba's (`NUMBA_NUM_THREADS`; one in a campaign's worker). Kernels release Python's lock.
+    """
+    count = config.NUMBA_NUM_THREADS if threads is None else threads
+    if count == 1 or pixels < MIN_PIXELS:
+        work(slice(0, pixels))
+        return
+    # parts begin where kernels begin a strip of pixels anyway
+    size = -(-pixels // count // STRIP) * STRIP
+    parts = [slice(first, min(first + size, pixels)) for first in range(0, pixels, size)]
+    list(_pool(count).map(work, parts))
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="pixels")
+
+
+def keep_freed_memory() -> None:
+    """Keep memory that pictures free for the next ones, where the C library is glibc: 4 % of a descent's case."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _MAPPED_FROM_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+
+
+def return_freed_memory() -> None:
+    """Return freed memory to the system; without this the C library keeps some 1 MB a scene."""
+    malloc_trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if malloc_trim is not None:
+        malloc_trim(0)
+
+
+def pyramid(surface: Surface) -> tuple[Array32, ...]:
+    """The levels of a surface, the last of them repeated."""
+    return surface.levels + surface.levels[-1:] * (LEVELS - len(surface.levels))
+
+
+def ground_struct(surface: Surface, extent_m: Extent, *, ceilings: bool) -> Ground:
+    """Pack a surface for kernels, with or without upper bounds of its levels' heights."""
+    bounds = surface.ceilings if ceilings else (NO_CEILING,)
+    bounds += bounds[-1:] * (LEVELS - len(bounds))
+    return Ground(pyramid(surface), bounds, len(surface.levels) - 1, surface.spacing_m, extent_m)
+
+
+def ground_mesh(
+    surface: Surface,
+    x: Float[np.ndarray, "columns"],
+    y: Float[np.ndarray, "rows"],
+    spans: Int[np.ndarray, "strips 2"] | None = None,
+) -> trimesh.Trimesh:
+    """Triangulate the ground over the grid of these lines, in world coordinates.
+
+    Each vertex takes its height from the level whose samples are about as far apart as the grid's lines there, so that
+    the mesh does not alias the terrain. `spans` holds the first cell and the end of those to include in each strip
+    between two lines of y; by default all.
+    """
+    import trimesh  # here, as it is slow to import
+
+    if spans is None:
+        spans = np.tile([0, x.size - 1], (y.size - 1, 1))
+    level_of_x, level_of_y = (
+        np.clip(np.floor(np.log2(np.gradient(lines) / surface.spacing_m)), 0, len(surface.levels) - 1).astype(int)
+        for lines in (x, y)
+    )
+    vertices, faces = build_mesh(pyramid(surface), surface.spacing_m, x, y, level_of_x, level_of_y, spans)
+    return trimesh.Trimesh(vertices, faces, process=False, validate=False)
+
+
+def cells_in_hull(
+    x: Float[np.ndarray, "columns"], y: Float[np.ndarray, "rows"], points: Float[np.ndarray, "points 2"]
+) -> Int[np.ndarray, "strips 2"]:
+    """Spans of a grid's cells, for `ground_mesh`, that reach into the convex hull of points not all on one line."""
+    return np.asarray(spans_in_hull(x, y, points[ConvexHull(points).vertices]))
+
+
+def lines_in_view(lines: Float[np.ndarray, "count"], low: float, high: float) -> Float[np.ndarray, "kept"]:
+    """Select the lines between two bounds and one more to either side."""
+    first = max(int(np.searchsorted(lines, low)) - 2, 0)
+    last = min(int(np.searchsorted(lines, high)) + 2, lines.size)
+    if last - first < 3:
+        first, last = max(min(first, lines.size - 3), 0), min(max(last, 3), lines.size)
+    return lines[first:last]

@@ -43,12 +43,30 @@ def rover_objects(
     Join it with a scene's rocks: ``Objects.joined([scene.objects, rover_objects(...)])``. `baseline_m` is the distance
     of the widest pair of cameras: the head is a little wider.
     """
+    length, width = _BODY_FRACTION[0] * rover.body_length_m, _BODY_FRACTION[1] * rover.body_width_m
+    x, y, z = mast.base_m
     parts = [
-        _body(rover, mast),
-        _undercarriage(rover, stance.differential_rad, stance.bogies_rad),
-        _transform(_head(baseline_m), mast.rover_from_head(azimuth_rad, elevation_rad)),
-        _elevation_axis(mast, azimuth_rad, elevation_rad),
+        # body, deck, and mast up to the elbow
+        _box((length, width, rover.deck_m - rover.clearance_m), (0.0, 0.0, 0.5 * (rover.deck_m + rover.clearance_m))),
+        _box((rover.body_length_m, rover.body_width_m, _DECK_M), (0.0, 0.0, rover.deck_m)),
+        _rod((x, y, rover.deck_m), (x, y, z + mast.elbow_m[2]), _MAST_RADIUS_M),
     ]
+    centres = wheel_centres(rover, stance.differential_rad, stance.bogies_rad)
+    for side, bogie in enumerate(bogie_pivots(rover, stance.differential_rad)):
+        front, middle, rear = centres[3 * side : 3 * side + 3]
+        rocker = np.array([rover.rocker_pivot_x_m, bogie[1], rover.rocker_pivot_z_m])
+        legs = ((rocker, front), (rocker, bogie), (bogie, middle), (bogie, rear))
+        parts += [_rod(start, end, 0.5 * _LEG_M) for start, end in legs]
+    half = np.array([0.0, 0.5 * rover.wheel_width_m, 0.0])
+    parts += [_rod(centre - half, centre + half, rover.wheel_radius_m) for centre in centres]
+    # the bar that carries the cameras, behind their centres, which lie on the y axis of the head's frame
+    depth, height, wider = _HEAD_M
+    rover_from_head = mast.rover_from_head(azimuth_rad, elevation_rad)
+    middle_of_head = (-_BEHIND_M - 0.5 * depth, 0.0, 0.0)
+    parts.append(_transform(_box((depth, baseline_m + wider, height), middle_of_head), rover_from_head))
+    # the elevation axis, from the elbow to the head's middle
+    elbow, end = rover_from_head.apply(np.array([-mast.head_m, middle_of_head]))
+    parts.append(_rod(elbow, end, _MAST_RADIUS_M))
     triangles = _transform(np.concatenate(parts), stance.world_from_rover)
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals = across / np.linalg.norm(across, axis=1, keepdims=True)
@@ -80,59 +98,19 @@ def rover_sphere(
 def may_cast_shadow(
     spheres: Float64[np.ndarray, "bodies 4"],
     sun_direction: Float64[np.ndarray, "3"],
-    place_m: Float64[np.ndarray, "3"],
+    position_m: Float64[np.ndarray, "3"],
     radius_m: float,
 ) -> bool:
-    """Whether bodies in spheres may hide the sun from a point within a radius of a position; false is certain."""
-    away = spheres[:, :3] - place_m
+    """Whether bodies in spheres may hide the sun from a point within a radius of a position; False is exact."""
+    away = spheres[:, :3] - position_m
     along = away @ sun_direction
-    reach = spheres[:, 3] + radius_m
+    distance = spheres[:, 3] + radius_m
     across = np.linalg.norm(away - along[:, None] * sun_direction, axis=1)
-    return bool(np.any((across <= reach) & (along >= -reach)))
+    return bool(np.any((across <= distance) & (along >= -distance)))
 
 
 def _length(*parts: float | Float64[np.ndarray, "3"]) -> float:
     return float(np.linalg.norm(np.hstack(parts)))
-
-
-def _body(rover: RoverParameters, mast: MastGeometry) -> Triangles:
-    """Body, deck, and mast up to the elbow."""
-    length, width = (
-        share * size for share, size in zip(_BODY_FRACTION, (rover.body_length_m, rover.body_width_m), strict=True)
-    )
-    body = _box((length, width, rover.deck_m - rover.clearance_m), (0.0, 0.0, 0.5 * (rover.deck_m + rover.clearance_m)))
-    deck = _box((rover.body_length_m, rover.body_width_m, _DECK_M), (0.0, 0.0, rover.deck_m))
-    x, y, z = mast.base_m
-    top = z + mast.elbow_m[2]
-    return np.concatenate([body, deck, _rod((x, y, rover.deck_m), (x, y, top), _MAST_RADIUS_M)])
-
-
-def _undercarriage(rover: RoverParameters, differential_rad: float, bogies_rad: tuple[float, float]) -> Triangles:
-    """Wheels, and the legs that carry them."""
-    centres = wheel_centres(rover, differential_rad, bogies_rad)
-    parts = []
-    for side, bogie in enumerate(bogie_pivots(rover, differential_rad)):
-        front, middle, rear = centres[3 * side : 3 * side + 3]
-        rocker = np.array([rover.rocker_pivot_x_m, bogie[1], rover.rocker_pivot_z_m])
-        parts += [
-            _rod(a, b, 0.5 * _LEG_M) for a, b in ((rocker, front), (rocker, bogie), (bogie, middle), (bogie, rear))
-        ]
-    half = np.array([0.0, 0.5 * rover.wheel_width_m, 0.0])
-    parts += [_rod(centre - half, centre + half, rover.wheel_radius_m) for centre in centres]
-    return np.concatenate(parts)
-
-
-def _head(baseline_m: float) -> Triangles:
-    """The bar that carries the cameras, in the head's frame: behind the cameras' centres, which lie on its y axis."""
-    depth, height, wider = _HEAD_M
-    return _box((depth, baseline_m + wider, height), (-_BEHIND_M - 0.5 * depth, 0.0, 0.0))
-
-
-def _elevation_axis(mast: MastGeometry, azimuth_rad: float, elevation_rad: float) -> Triangles:
-    """From the elbow to the head's middle."""
-    head = mast.rover_from_head(azimuth_rad, elevation_rad)
-    elbow = head.apply(-mast.head_m)
-    return _rod(elbow, head.apply(np.array([-_BEHIND_M - 0.5 * _HEAD_M[0], 0.0, 0.0])), _MAST_RADIUS_M)
 
 
 def _box(size_m: tuple[float, float, float], middle_m: tuple[float, float, float]) -> Triangles:
@@ -162,11 +140,9 @@ def _rod(
 ) -> Triangles:
     """A closed cylinder between two points."""
     along = np.subtract(end, start)
-    length = float(np.linalg.norm(along))
-    beside = np.eye(3)[int(np.argmin(np.abs(along)))]
-    x = np.cross(beside, along)
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(along)))], along)
     x /= np.linalg.norm(x)
-    y = np.cross(along / length, x)
+    y = np.cross(along / float(np.linalg.norm(along)), x)
     axes = np.stack([radius_m * x, radius_m * y, along], axis=1)
     return np.asarray(np.asarray(start) + _unit_rod() @ axes.T)
 

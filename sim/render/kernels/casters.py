@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numba import njit
 
-from marsyard.sim.render.kernels.strips import numbers, times
+from marsyard.sim.render.kernels.strips import rotate, unpack_matrix
 from marsyard.sim.render.kernels.structs import Flags, Longs
 from marsyard.sim.terrain.kernels import Array
 
@@ -26,12 +26,12 @@ BodyGrids = tuple[Array, Longs, Longs, Longs, Array]
 #: Linear functions of each triangle (constant, slope along u, slope along v): the weights of its second and third
 #: corner, and s of its plane; unit vectors u and v across the sun's direction, and s along it; grids.
 Casters = tuple[Array, Array, Grid, BodyGrids]
+#: Least u and v, greatest u, v and s; or least u and v, cells per metre along both, and greatest s.
+Rect = tuple[float, float, float, float, float]
 #: Triangles per cell of a body's grid, if each lay in one cell, and the largest number of cells along a side.
 PER_CELL, MAX_CELLS = 4, 1024
 #: Slack of all bounds, metres: more than rounding.
 SLACK_M = 1e-6
-
-
 #: Twice the area in which the sun sees a triangle, square metres, below which it is seen edge-on and hides nothing.
 EDGE_ON = 1e-18
 
@@ -68,7 +68,7 @@ def _project_along_sun(triangles: Array, axes: Array) -> tuple[Array, Array]:
 
 
 @njit(cache=True)
-def _joint_bounds(bounds: Array, first: int, end: int) -> tuple[float, float, float, float, float]:
+def _joint_bounds(bounds: Array, first: int, end: int) -> Rect:
     """Joint bounds of some rows of bounds."""
     u0, v0, u1, v1, s1 = math.inf, math.inf, -math.inf, -math.inf, -math.inf
     for n in range(first, end):
@@ -81,7 +81,7 @@ def _joint_bounds(bounds: Array, first: int, end: int) -> tuple[float, float, fl
 
 
 @njit(cache=True)
-def _side(items: float) -> int:
+def _cells_per_side(items: float) -> int:
     """Cells along a side for about one of so many items to a cell."""
     return min(max(math.ceil(math.sqrt(items)), 1), MAX_CELLS)
 
@@ -93,18 +93,16 @@ def _cell(value: float, low: float, per_metre: float, count: int) -> int:
 
 
 @njit(cache=True)
-def _enter(bounds: Array, n: int, outline: Array, side: int, first: int, ends: Longs, items: Longs) -> None:
-    """Enter a row of bounds in the list of each cell that it touches, of a grid over an outline.
+def _add_to_cells(bounds: Array, n: int, outline: Array, side: int, first: int, ends: Longs, items: Longs) -> None:
+    """Add a row of bounds to the list of each cell that it touches, of a grid over an outline.
 
     `first` is the grid's first cell; `ends` are the current ends of cells' lists, updated. Without space for items,
     they are only counted.
     """
-    for i in range(
-        _cell(bounds[n, 1], outline[1], outline[3], side), _cell(bounds[n, 3], outline[1], outline[3], side) + 1
-    ):
-        for j in range(
-            _cell(bounds[n, 0], outline[0], outline[2], side), _cell(bounds[n, 2], outline[0], outline[2], side) + 1
-        ):
+    low, high = _cell(bounds[n, 1], outline[1], outline[3], side), _cell(bounds[n, 3], outline[1], outline[3], side)
+    left, right = _cell(bounds[n, 0], outline[0], outline[2], side), _cell(bounds[n, 2], outline[0], outline[2], side)
+    for i in range(low, high + 1):
+        for j in range(left, right + 1):
             cell = first + i * side + j
             if items.size > 0:
                 items[ends[cell]] = n
@@ -128,7 +126,7 @@ def _list_in_cells(
         ends = starts[:-1].copy() if filling else starts[1:]
         for grid in range(grids):
             for n in range(first_row[grid], first_row[grid + 1]):
-                _enter(bounds, n, outlines[grid], sides[grid], first_cells[grid], ends, items)
+                _add_to_cells(bounds, n, outlines[grid], sides[grid], first_cells[grid], ends, items)
         if not filling:
             for k in range(cells):
                 starts[k + 1] += starts[k]
@@ -137,7 +135,7 @@ def _list_in_cells(
 
 
 @njit(cache=True)
-def _outline(rect: Array, side: int) -> tuple[float, float, float, float, float]:
+def _outline(rect: Rect, side: int) -> Rect:
     """Least u and v, cells per metre along both, and greatest s of a grid over some bounds."""
     return rect[0], rect[1], side / (rect[2] - rect[0]), side / (rect[3] - rect[1]), rect[4]
 
@@ -153,9 +151,9 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
     cells = 0
     for body in range(bodies):
         first, end = first_triangle[body], first_triangle[body + 1]
-        side = _side((end - first) / PER_CELL)
-        rects[body] = _joint_bounds(bounds, first, end)
-        outlines[body] = _outline(rects[body], side)
+        side = _cells_per_side((end - first) / PER_CELL)
+        rect = _joint_bounds(bounds, first, end)
+        rects[body], outlines[body] = rect, _outline(rect, side)
         shapes[body, 0], shapes[body, 1] = side, cells
         cells += side * side
     starts, items = _list_in_cells(bounds, first_triangle, outlines, shapes[:, 0].copy(), shapes[:, 1].copy())
@@ -163,13 +161,10 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
     for k in range(items.size):
         tops[k] = bounds[items[k], 4]
     # one grid over all bodies
-    sides = np.array([_side(float(bodies))])
-    whole = np.empty((1, 5))
-    whole[0] = (0.0, 0.0, 1.0, 1.0, 0.0)
+    sides = np.array([_cells_per_side(float(bodies))])
+    whole = np.array([[0.0, 0.0, 1.0, 1.0, 0.0]])
     if bodies > 0:
-        rects_of_all = np.empty((1, 5))
-        rects_of_all[0] = _joint_bounds(rects, 0, bodies)
-        whole[0] = _outline(rects_of_all[0], sides[0])
+        whole[0] = _outline(_joint_bounds(rects, 0, bodies), sides[0])
     first_items, bodies_listed = _list_in_cells(rects, np.array([0, bodies]), whole, sides, np.zeros(1, dtype=np.int64))
     grid: Grid = (whole[0, :4].copy(), sides, first_items, bodies_listed)
     return linear, axes, grid, (outlines, shapes, starts, items, tops)
@@ -182,12 +177,12 @@ def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) ->
     All positions in one call: passing so many arrays takes longer than most positions do.
     """
     linear, axes, (grid, sides, starts, items), (outlines, shapes, first_items, listed, tops) = casters
-    to_axes = numbers(axes)
+    to_axes = unpack_matrix(axes)
     side = sides[0]
     west, south, per_u, per_v = grid[0], grid[1], grid[2], grid[3]
-    for place in range(x.size):
-        u, v, s = times(to_axes, x[place], y[place], z[place])
-        hidden[place] = False
+    for position in range(x.size):
+        u, v, s = rotate(to_axes, x[position], y[position], z[position])
+        hidden[position] = False
         column = (u - west) * per_u
         row = (v - south) * per_v
         # bounds have slack: a ray on the border meets nothing
@@ -195,7 +190,7 @@ def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) ->
             continue
         of_all = int(row) * side + int(column)
         k = starts[of_all]
-        while k < starts[of_all + 1] and not hidden[place]:
+        while k < starts[of_all + 1] and not hidden[position]:
             body = items[k]
             k += 1
             if outlines[body, 4] < s:
@@ -214,5 +209,5 @@ def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) ->
                 third = linear[n, 3] + linear[n, 4] * u + linear[n, 5] * v
                 above = linear[n, 6] + linear[n, 7] * u + linear[n, 8] * v > s
                 if above and second >= 0.0 and third >= 0.0 and second + third <= 1.0:
-                    hidden[place] = True
+                    hidden[position] = True
                     break

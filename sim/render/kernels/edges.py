@@ -19,7 +19,6 @@ from marsyard.sim.render.kernels.structs import (
     Ints,
     Longs,
     Pose,
-    Ray,
     Rays,
     world_ray,
 )
@@ -174,16 +173,6 @@ def _gather_neighbours(
 
 
 @njit(cache=True, fastmath={"contract"})
-def _middle_ray(pose: Pose, rays: Rays, first: int, last: int, origin: Array32, direction: Array32) -> Ray:
-    """The ray through a pixel's centre, the mean of its first ray and its last; with buffers for it in body axes."""
-    for axis in range(3):
-        origin[0, axis] = 0.5 * (rays.origins[first, axis] + rays.origins[last, axis])
-        direction[0, axis] = 0.5 * (rays.directions[first, axis] + rays.directions[last, axis])
-    middle: Ray = world_ray(pose, Rays(origin, direction, rays.pixel_angles), 0)
-    return middle
-
-
-@njit(cache=True, fastmath={"contract"})
 def trace_subpixel_rays(
     ground: Ground, pose: Pose, tree: Hierarchy, columns: int, pixels: Longs, rays: Rays, seen: Hits, hits: Hits
 ) -> None:
@@ -194,7 +183,7 @@ def trace_subpixel_rays(
     order; `seen` holds the hits of all pixels, `hits` is the output.
     """
     fields, ceilings, _top_level, spacing, extent = ground
-    share = rays.directions.shape[0] // max(pixels.size, 1)
+    rays_per_pixel = rays.directions.shape[0] // max(pixels.size, 1)
     ranges = np.empty(9)
     levels = np.empty(9, dtype=np.int64)
     listed = np.empty(MAX_LISTED, dtype=np.int64)
@@ -203,9 +192,13 @@ def trace_subpixel_rays(
         pixel = pixels[k]
         count, sky, objects, farthest = _gather_neighbours(seen, pixel, columns, ranges, levels)
         in_list = -1
-        first, last = k * share, (k + 1) * share
+        first, last = k * rays_per_pixel, (k + 1) * rays_per_pixel
         if objects:
-            middle = _middle_ray(pose, rays, first, last - 1, origin, direction)
+            # the ray through the pixel's centre is the mean of its first ray and its last
+            for axis in range(3):
+                origin[0, axis] = 0.5 * (rays.origins[first, axis] + rays.origins[last - 1, axis])
+                direction[0, axis] = 0.5 * (rays.directions[first, axis] + rays.directions[last - 1, axis])
+            middle = world_ray(pose, Rays(origin, direction, rays.pixel_angles), 0)
             spread = BEAM_PX * rays.pixel_angles[first]
             in_list = list_in_beam(tree, middle, spread, math.inf if sky else BEYOND * farthest, listed)
         for n in range(first, last):

@@ -103,12 +103,12 @@ def _cubic_crossing(above: float, rate_above: float, below: float, rate_below: f
     """
     second = 3.0 * (below - above) - 2.0 * rate_above - rate_below
     third = 2.0 * (above - below) + rate_above + rate_below
-    share = guess
+    fraction = guess
     for _ in range(3):
-        value = above + share * (rate_above + share * (second + share * third))
-        slope = rate_above + share * (2.0 * second + share * 3.0 * third)
-        share -= value / slope if slope < 0.0 else 0.0
-    return share if 0.0 < share < 1.0 else guess
+        value = above + fraction * (rate_above + fraction * (second + fraction * third))
+        slope = rate_above + fraction * (2.0 * second + fraction * 3.0 * third)
+        fraction -= value / slope if slope < 0.0 else 0.0
+    return fraction if 0.0 < fraction < 1.0 else guess
 
 
 @njit(cache=True)
@@ -124,14 +124,14 @@ def _bracketed_crossing(level: GroundLevel, ray: Ray, above: Clearance, below: C
     t, below_height, below_rate = below.t, below.height, below.rate
     middle = below
     for iteration in range(MAX_ITERATIONS):
-        share = above_height / (above_height - below_height)
+        fraction = above_height / (above_height - below_height)
         kept = 0.5
         if iteration < CUBIC_ITERATIONS:
-            share = _cubic_crossing(
-                above_height, above_rate * (t - before), below_height, below_rate * (t - before), share
+            fraction = _cubic_crossing(
+                above_height, above_rate * (t - before), below_height, below_rate * (t - before), fraction
             )
             kept = 1.0
-        middle = clearance_at(field, per_metre, ray, before + (t - before) * share)
+        middle = clearance_at(field, per_metre, ray, before + (t - before) * fraction)
         if abs(middle.height) < 1e-3 * spacing * max(-ray.dz, 1e-3) or t - before <= 0.01 * spacing:
             break
         if middle.height < 0.0:

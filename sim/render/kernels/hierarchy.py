@@ -105,7 +105,7 @@ LEAF = 4
 
 
 @njit(cache=True)
-def _spread(value: int) -> int:
+def _spread_bits(value: int) -> int:
     """Spread the bits of a number of 20 bits three apart."""
     value &= 0xFFFFF
     value = (value | value << 32) & 0x1F00000000FFFF
@@ -132,7 +132,7 @@ def morton_codes(triangles: Array) -> Longs:
         code = 0
         for axis in range(3):
             middle = (triangles[n, 0, axis] + triangles[n, 1, axis] + triangles[n, 2, axis]) / 3.0
-            code |= _spread(int((middle - low[axis]) / side * 1048575.0)) << axis
+            code |= _spread_bits(int((middle - low[axis]) / side * 1048575.0)) << axis
         codes[n] = code
     return codes
 
@@ -178,7 +178,7 @@ def _next_node(node: int) -> int:
 
 
 @njit(cache=True, inline="always")
-def _entry(boxes: Array32, node: int, ray: Ray, inverse: tuple[float, float, float]) -> float:
+def _entry_distance(boxes: Array32, node: int, ray: Ray, inverse: tuple[float, float, float]) -> float:
     """Distance at which a ray enters a box, 0 from within, infinite where it does not."""
     a, b = (boxes[node, 0] - ray.x) * inverse[0], (boxes[node, 3] - ray.x) * inverse[0]
     near, far = min(a, b), max(a, b)
@@ -205,7 +205,7 @@ def nearest_hit(tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
     first_leaf = boxes.shape[0] // 2
     node = 0
     while True:
-        if _entry(boxes, node, ray, inverse) < best.distance:
+        if _entry_distance(boxes, node, ray, inverse) < best.distance:
             if node < first_leaf:
                 node = 2 * node + 1
                 continue
@@ -218,20 +218,16 @@ def nearest_hit(tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
 
 
 @njit(cache=True, inline="always")
-def _box_outside(boxes: Array32, node: int, plane: Plane) -> bool:
-    """Whether a node's box lies entirely outside a side of a frustum."""
-    nx, ny, nz, offset, ix, iy, iz = plane
-    return bool(nx * boxes[node, ix] + ny * boxes[node, iy] + nz * boxes[node, iz] > offset)
-
-
-@njit(cache=True, inline="always")
-def _triangle_outside(triangles: Array, n: int, plane: Plane) -> bool:
-    """Whether a triangle lies entirely outside a side of a frustum."""
-    nx, ny, nz, offset, _ix, _iy, _iz = plane
-    outside = True
-    for corner in range(3):
-        outside &= nx * triangles[n, corner, 0] + ny * triangles[n, corner, 1] + nz * triangles[n, corner, 2] > offset
-    return outside
+def _outside_beam(triangles: Array, n: int, sides: tuple[Plane, ...]) -> bool:
+    """Whether a triangle lies entirely outside one of a frustum's four sides (the fifth is the far one)."""
+    for nx, ny, nz, offset, _ix, _iy, _iz in sides[:4]:
+        outside = True
+        for corner in range(3):
+            x, y, z = triangles[n, corner, 0], triangles[n, corner, 1], triangles[n, corner, 2]
+            outside &= nx * x + ny * y + nz * z > offset
+        if outside:
+            return True
+    return False
 
 
 @njit(cache=True, inline="always")
@@ -255,40 +251,31 @@ def list_in_beam(tree: Hierarchy, ray: Ray, spread: float, farthest: float, list
     ux, uy, uz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
     widening = math.tan(spread)
     sx, sy, sz = widening * dx, widening * dy, widening * dz
-    right = _plane(ray, rx - sx, ry - sy, rz - sz, 0.0)
-    left = _plane(ray, -rx - sx, -ry - sy, -rz - sz, 0.0)
-    above = _plane(ray, ux - sx, uy - sy, uz - sz, 0.0)
-    below = _plane(ray, -ux - sx, -uy - sy, -uz - sz, 0.0)
-    end = _plane(ray, dx, dy, dz, farthest)
+    sides = (
+        _plane(ray, rx - sx, ry - sy, rz - sz, 0.0),
+        _plane(ray, -rx - sx, -ry - sy, -rz - sz, 0.0),
+        _plane(ray, ux - sx, uy - sy, uz - sz, 0.0),
+        _plane(ray, -ux - sx, -uy - sy, -uz - sz, 0.0),
+        _plane(ray, dx, dy, dz, farthest),
+    )
     first_leaf = boxes.shape[0] // 2
     count = 0
     node = 0
     while True:
-        missed = (
-            _box_outside(boxes, node, right)
-            or _box_outside(boxes, node, left)
-            or _box_outside(boxes, node, above)
-            or _box_outside(boxes, node, below)
-            or _box_outside(boxes, node, end)
-        )
-        if not missed:
+        outside = False
+        for nx, ny, nz, offset, ix, iy, iz in sides:
+            outside |= nx * boxes[node, ix] + ny * boxes[node, iy] + nz * boxes[node, iz] > offset
+        if not outside:
             if node < first_leaf:
                 node = 2 * node + 1
                 continue
             start = (node - first_leaf) * LEAF
             for k in range(start, min(start + LEAF, order.size)):
-                n = order[k]
-                outside = (
-                    _triangle_outside(triangles, n, right)
-                    or _triangle_outside(triangles, n, left)
-                    or _triangle_outside(triangles, n, above)
-                    or _triangle_outside(triangles, n, below)
-                )
-                if outside:
+                if _outside_beam(triangles, order[k], sides):
                     continue
                 if count == listed.size:
                     return -1
-                listed[count] = n
+                listed[count] = order[k]
                 count += 1
         node = _next_node(node)
         if node == 0:

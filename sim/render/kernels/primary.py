@@ -17,9 +17,9 @@ from marsyard.sim.render.kernels.strips import (
     Near,
     fetch_levels,
     no_cells,
-    numbers,
+    rotate,
     spline,
-    times,
+    unpack_matrix,
 )
 from marsyard.sim.render.kernels.structs import (
     Array32,
@@ -50,7 +50,7 @@ SLACK = 1e-9
 X0, Y0, Z0, DX, DY, DZ, U, V, FORWARD, UPPER_LEFT, UPPER_RIGHT, LOWER_LEFT, LOWER_RIGHT = (ROW * n for n in range(13))
 #: The first guess of distance, and the pixel's footprint along the line of sight there; then, during the search for the
 #: ground, distance, initial distance, positions, samples per metre, and whether the search continues.
-GUESS, STRETCHED, MET, START, X, Y, SCALE, GOING = (ROW * n for n in range(13, 21))
+GUESS, STRETCHED, MET, START, X, Y, SCALE, ACTIVE = (ROW * n for n in range(13, 21))
 ROWS = 21
 
 
@@ -119,10 +119,10 @@ def _rotate_rays(
 ) -> None:
     """Rotate the rays of a strip to world axes."""
     for k in range(min(width, STRIP)):
-        work[DX + k], work[DY + k], work[DZ + k] = times(
+        work[DX + k], work[DY + k], work[DZ + k] = rotate(
             rotation, directions[3 * k], directions[3 * k + 1], directions[3 * k + 2]
         )
-        x, y, z = times(rotation, origins[3 * k], origins[3 * k + 1], origins[3 * k + 2])
+        x, y, z = rotate(rotation, origins[3 * k], origins[3 * k + 1], origins[3 * k + 2])
         work[X0 + k] = centre[0] + x
         work[Y0 + k] = centre[1] + y
         work[Z0 + k] = centre[2] + z
@@ -134,7 +134,7 @@ def _project(
 ) -> None:
     """Project rays into a view's picture; `forward` is their component along its axis."""
     for k in range(min(u.size, STRIP)):
-        x, y, z = times(view, directions[3 * k], directions[3 * k + 1], directions[3 * k + 2])
+        x, y, z = rotate(view, directions[3 * k], directions[3 * k + 1], directions[3 * k + 2])
         u[k] = focal * x / z + middle
         v[k] = focal * y / z + middle
         forward[k] = z
@@ -160,16 +160,8 @@ def _interpolate_guesses(pixel_angles: Array32, width: int, work: Array) -> None
 
 
 @njit(cache=True, error_model="numpy")
-def _update_positions(width: int, work: Array) -> None:
-    """Positions of rays at their distances."""
-    for k in range(min(width, STRIP)):
-        work[X + k] = work[X0 + k] + work[MET + k] * work[DX + k]
-        work[Y + k] = work[Y0 + k] + work[MET + k] * work[DY + k]
-
-
-@njit(cache=True, error_model="numpy")
 def _take_newton_step(near: Near, width: int, work: Array) -> None:
-    """Newton step of the followed rays; `GOING` is 1 for those that continue, else 0."""
+    """Newton step of the followed rays; `ACTIVE` is 1 for those that continue, else 0."""
     for k in range(min(width, STRIP)):
         height, slope_x, slope_y, _albedo = spline(near[0], near[1], k)
         t, start, scale, dz = work[MET + k], work[START + k], work[SCALE + k], work[DZ + k]
@@ -179,9 +171,9 @@ def _take_newton_step(near: Near, width: int, work: Array) -> None:
         failed = closing > CLOSING or abs(t - step - start) > FARTHEST * start
         # after so short a step the error is below 1e-6 of the distance, as curvature is at most about 1 / spacing
         far = step * step >= 2e-6 * start / scale
-        going = work[GOING + k] > 0.0
-        work[MET + k] = (start if failed else t - step) if going else t
-        work[GOING + k] = 1.0 if going and far and not failed else 0.0
+        active = work[ACTIVE + k] > 0.0
+        work[MET + k] = (start if failed else t - step) if active else t
+        work[ACTIVE + k] = 1.0 if active and far and not failed else 0.0
 
 
 @njit(cache=True)
@@ -189,7 +181,7 @@ def _refine_on_ground(
     levels: tuple[Level, ...],
     inverse_spacing: float,
     level_of: Longs,
-    going: Longs,
+    active: Longs,
     count: int,
     width: int,
     work: Array,
@@ -198,27 +190,29 @@ def _refine_on_ground(
     """Bring rays of a strip from their first guess, `MET`, onto the ground by Newton's method; where it fails they
     stay.
 
-    All rays take a step before any takes the next, so that the processor works on several at once. `going` holds the
+    All rays take a step before any takes the next, so that the processor works on several at once. `active` holds the
     numbers of the `count` followed rays; it is overwritten. `near` is a buffer for control values.
     """
     for k in range(width):
         work[START + k] = work[MET + k]
-        work[GOING + k] = 0.0
+        work[ACTIVE + k] = 0.0
     for m in range(count):
-        work[GOING + going[m]] = 1.0
-        work[SCALE + going[m]] = inverse_spacing / (1 << level_of[going[m]])
+        work[ACTIVE + active[m]] = 1.0
+        work[SCALE + active[m]] = inverse_spacing / (1 << level_of[active[m]])
     for _ in range(STEPS):
         if count == 0:
             break
-        _update_positions(width, work)
-        fetch_levels(levels, inverse_spacing, level_of, going, count, work[X : X + ROW], work[Y : Y + ROW], near)
+        for k in range(min(width, STRIP)):
+            work[X + k] = work[X0 + k] + work[MET + k] * work[DX + k]
+            work[Y + k] = work[Y0 + k] + work[MET + k] * work[DY + k]
+        fetch_levels(levels, inverse_spacing, level_of, active, count, work[X : X + ROW], work[Y : Y + ROW], near)
         _take_newton_step(near, width, work)
-        left = 0
+        remaining = 0
         for m in range(count):
-            k = going[m]
-            going[left] = k
-            left += work[GOING + k] > 0.0
-        count = left
+            k = active[m]
+            active[remaining] = k
+            remaining += work[ACTIVE + k] > 0.0
+        count = remaining
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -236,7 +230,7 @@ def _sample_views(views: Views, directions: Array32, first: int, width: int, str
         while end < width and view_of_pixel[first + end] == face:
             end += 1
         _project(
-            numbers(views.view_from_body[face]),
+            unpack_matrix(views.view_from_body[face]),
             views.focal[face],
             side / 2.0 - 0.5,
             directions[3 * start : 3 * end],
@@ -261,11 +255,10 @@ def _sample_views(views: Views, directions: Array32, first: int, width: int, str
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _select_levels(
     spacing: float, top_level: int, views: Views, pixel_angles: Array32, first: int, width: int, strip: _Strip
-) -> bool:
-    """Distance at which each ray of a strip meets the mesh, and the ground's level there; whether any is grazing."""
+) -> None:
+    """Distance at which each ray of a strip meets the mesh, and the ground's level there."""
     depth, ids, view_of_pixel = views.depth, views.numbers, views.view_of_pixel
     work, row, column, shown, level_of = strip.work, strip.row, strip.column, strip.shown, strip.level
-    flat = False
     for k in range(width):
         if shown[k] != 0 or work[GUESS + k] == 0.0:
             face = view_of_pixel[first + k]
@@ -281,31 +274,6 @@ def _select_levels(
         if work[STRETCHED + k] > FINE_UNTIL * spacing:
             level_of[k] = min(int(math.log2(work[STRETCHED + k] / (FINE_UNTIL * spacing))) + 1, top_level)
         work[MET + k] = work[GUESS + k]
-        flat |= work[DZ + k] > -GRAZING
-    return flat
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _trace_grazing_rays(ground: Ground, width: int, strip: _Strip) -> None:
-    """Trace the grazing rays of a strip to the first position where they dip below the ground."""
-    levels, ceilings, _top_level, spacing, extent = ground
-    work, level_of = strip.work, strip.level
-    for k in range(width):
-        if work[DZ + k] > -GRAZING and work[MET + k] < math.inf:
-            n = level_of[k]
-            level = GroundLevel(levels[n], ceilings[n], 1.0 / spacing / (1 << n))
-            work[MET + k] = first_ground(level, extent, _ray(work, k), work[GUESS + k])
-
-
-@njit(cache=True)
-def _select_refined(width: int, strip: _Strip) -> int:
-    """Select the rays for Newton's method: a grazing ray that dips below the ground is already there."""
-    work, refined = strip.work, strip.refined
-    count = 0
-    for k in range(width):
-        refined[count] = k
-        count += work[MET + k] == work[GUESS + k]
-    return count
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -331,29 +299,32 @@ def _write_hits(views: Views, tree: Hierarchy, first: int, width: int, strip: _S
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tree: Hierarchy, hits: Hits) -> None:
     """Trace the ray of every pixel from first guesses in `views` to the ground or a triangle; `hits` is the output."""
-    rotation = numbers(pose.rotation)
+    rotation = unpack_matrix(pose.rotation)
     centre = (pose.position[0], pose.position[1], pose.position[2])
     origins, directions = rays.origins.reshape(-1), rays.directions.reshape(-1)
-    levels, spacing = ground.levels, ground.spacing
+    levels, ceilings, top_level, spacing, extent = ground
     near = no_cells()
-    strip = _Strip(
-        np.empty(ROWS * ROW),
-        np.empty(STRIP, dtype=np.int64),
-        np.empty(STRIP, dtype=np.int64),
-        np.zeros(STRIP, dtype=np.int32),
-        np.empty(STRIP, dtype=np.int64),
-        np.empty(STRIP, dtype=np.int64),
-    )
-    count = rays.directions.shape[0]
-    for first in range(0, count, STRIP):
-        width = min(STRIP, count - first)
+    work, pixels = np.empty(ROWS * ROW), rays.directions.shape[0]
+    longs = np.empty((4, STRIP), dtype=np.int64)
+    level_of, refined = longs[2], longs[3]
+    strip = _Strip(work, longs[0], longs[1], np.zeros(STRIP, dtype=np.int32), level_of, refined)
+    for first in range(0, pixels, STRIP):
+        width = min(STRIP, pixels - first)
         here = slice(3 * first, 3 * (first + width))
         angles = rays.pixel_angles[first : first + width]
-        _rotate_rays(rotation, centre, origins[here], directions[here], width, strip.work)
+        _rotate_rays(rotation, centre, origins[here], directions[here], width, work)
         _sample_views(views, directions[here], first, width, strip)
-        _interpolate_guesses(angles, width, strip.work)
-        if _select_levels(spacing, ground.top_level, views, angles, first, width, strip):
-            _trace_grazing_rays(ground, width, strip)
-        refined = _select_refined(width, strip)
-        _refine_on_ground(levels, 1.0 / spacing, strip.level, strip.refined, refined, width, strip.work, near)
+        _interpolate_guesses(angles, width, work)
+        _select_levels(spacing, top_level, views, angles, first, width, strip)
+        count = 0
+        for k in range(width):
+            if work[DZ + k] > -GRAZING and work[MET + k] < math.inf:
+                # to the first position where a grazing ray dips below the ground
+                n = level_of[k]
+                level = GroundLevel(levels[n], ceilings[n], 1.0 / spacing / (1 << n))
+                work[MET + k] = first_ground(level, extent, _ray(work, k), work[GUESS + k])
+            # a grazing ray that dips below the ground is already there; Newton's method refines the others
+            refined[count] = k
+            count += work[MET + k] == work[GUESS + k]
+        _refine_on_ground(levels, 1.0 / spacing, level_of, refined, count, width, work, near)
         _write_hits(views, tree, first, width, strip, hits)

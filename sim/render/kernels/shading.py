@@ -1,4 +1,4 @@
-"""Kernel that computes the radiance of each pixel."""
+"""Kernels of illumination and reflectance: the radiance of each pixel."""
 
 from __future__ import annotations
 
@@ -9,46 +9,19 @@ import numpy as np
 from numba import njit
 
 from marsyard.sim.render.kernels.casters import Casters, sun_hidden
-from marsyard.sim.render.kernels.photometry import (
-    ALBEDO,
-    BLEND,
-    CHANGE,
-    COARSE_ALBEDO,
-    COARSE_HEIGHT,
-    COARSE_SLOPE_X,
-    COARSE_SLOPE_Y,
-    COS_I,
-    DX,
-    DY,
-    DZ,
-    FOOTPRINT,
-    GROUND,
-    HEIGHT,
-    LIT,
-    NX,
-    NY,
-    NZ,
-    OBJECT_CHANGE,
-    OBJECT_FOOTPRINT,
-    OBJECT_X,
-    OBJECT_Y,
-    OBJECT_Z,
-    ROWS,
-    SCALE,
-    SKY,
-    SLOPE_X,
-    SLOPE_Y,
-    X,
-    Y,
-    Z,
-    add_texture,
-    dim_sun,
-    draw_sky,
-    photometric_angles,
-    reflect,
-)
+from marsyard.sim.render.kernels.photometry import add_texture, sky_brightness
 from marsyard.sim.render.kernels.primary import FLATTEST
-from marsyard.sim.render.kernels.strips import ROW, STRIP, Matrix, Near, fetch_levels, no_cells, numbers, spline, times
+from marsyard.sim.render.kernels.strips import (
+    ROW,
+    STRIP,
+    Matrix,
+    Near,
+    fetch_levels,
+    no_cells,
+    rotate,
+    spline,
+    unpack_matrix,
+)
 from marsyard.sim.render.kernels.structs import (
     Array32,
     Flags,
@@ -68,6 +41,8 @@ from marsyard.sim.render.kernels.structs import (
 from marsyard.sim.render.kernels.sun import (
     UNSURE,
     disc_above,
+    disc_overlap,
+    interpolate_bilinear,
     penumbra,
     shadow_clearance,
     visible_sun_fraction,
@@ -76,6 +51,18 @@ from marsyard.sim.terrain.kernels import Array, Level, sample
 
 #: Footprint, in samples, up to which the finest level is used: the B-spline itself holds nothing finer.
 SHARP_UNTIL = 1.2
+#: Body number of pixels that see the ground, and of pixels that see the sky.
+GROUND, SKY = -1, -2
+#: Rows of a strip's buffer: position and direction of the line of sight, footprint (infinite without ground), terrain
+#: there, normal, log change of albedo by texture, cosines of incidence, emission and phase, visible sun fraction.
+X, Y, Z, DX, DY, DZ, FOOTPRINT, HEIGHT, SLOPE_X, SLOPE_Y, ALBEDO, NX, NY, NZ, CHANGE, COS_I, COS_E, COS_G, LIT = (
+    ROW * n for n in range(19)
+)
+#: Rows of the ground's level: samples per metre, weight of the next coarser level, and the terrain there.
+SCALE, BLEND, COARSE_HEIGHT, COARSE_SLOPE_X, COARSE_SLOPE_Y, COARSE_ALBEDO = (ROW * n for n in range(19, 25))
+#: Rows of objects alone: positions, footprints and changes of albedo.
+OBJECT_X, OBJECT_Y, OBJECT_Z, OBJECT_FOOTPRINT, OBJECT_CHANGE = (ROW * n for n in range(25, 30))
+ROWS = 30
 
 
 class Occluders(NamedTuple):
@@ -126,8 +113,8 @@ def _locate_pixels(
 ) -> None:
     """Positions of the pixels of a strip, and footprints as on the ground; the sky is placed at the camera."""
     for k in range(min(width, STRIP)):
-        dx, dy, dz = times(rotation, directions[3 * k], directions[3 * k + 1], directions[3 * k + 2])
-        x, y, z = times(rotation, origins[3 * k], origins[3 * k + 1], origins[3 * k + 2])
+        dx, dy, dz = rotate(rotation, directions[3 * k], directions[3 * k + 1], directions[3 * k + 2])
+        x, y, z = rotate(rotation, origins[3 * k], origins[3 * k + 1], origins[3 * k + 2])
         t = distance[k] if distance[k] < math.inf else 0.0
         work[X + k] = centre[0] + x + t * dx
         work[Y + k] = centre[1] + y + t * dy
@@ -161,15 +148,6 @@ def _blend_levels(width: int, work: Array) -> None:
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _compute_normals(width: int, work: Array) -> None:
-    """Normals of the ground from its slopes."""
-    for k in range(min(width, STRIP)):
-        slope_x, slope_y = work[SLOPE_X + k], work[SLOPE_Y + k]
-        nz = 1.0 / math.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
-        work[NX + k], work[NY + k], work[NZ + k] = -slope_x * nz, -slope_y * nz, nz
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _interpolate_normal(normals: Array, triangle: int, second: float, third: float, k: int, work: Array) -> None:
     """Interpolate a triangle's normal by the weights of its second and third corner."""
     rest = 1.0 - second - third
@@ -178,21 +156,6 @@ def _interpolate_normal(normals: Array, triangle: int, second: float, third: flo
     nz = rest * normals[triangle, 0, 2] + second * normals[triangle, 1, 2] + third * normals[triangle, 2, 2]
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
     work[NX + k], work[NY + k], work[NZ + k] = nx / length, ny / length, nz / length
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _object_footprint(across: float, k: int, work: Array) -> float:
-    """Footprint on an object of a pixel of width `across` across its line of sight."""
-    facing = -(work[DX + k] * work[NX + k] + work[DY + k] * work[NY + k] + work[DZ + k] * work[NZ + k])
-    footprint: float = across / math.sqrt(max(facing, 0.05))
-    return footprint
-
-
-@njit(cache=True)
-def _write_normals(width: int, work: Array, normal: Array32) -> None:
-    """Write the normals of a strip."""
-    for k in range(min(width, STRIP)):
-        normal[3 * k], normal[3 * k + 1], normal[3 * k + 2] = work[NX + k], work[NY + k], work[NZ + k]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -242,7 +205,10 @@ def _sample_ground(
             fetch_levels(levels, per_metre, strip.level, strip.blended, n_blended, x, y, near)
             _evaluate_splines(near, width, work[COARSE_HEIGHT : COARSE_HEIGHT + 4 * ROW])
         _blend_levels(width, work)
-    _compute_normals(width, work)
+    for k in range(min(width, STRIP)):
+        slope_x, slope_y = work[SLOPE_X + k], work[SLOPE_Y + k]
+        nz = 1.0 / math.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
+        work[NX + k], work[NY + k], work[NZ + k] = -slope_x * nz, -slope_y * nz, nz
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -269,7 +235,8 @@ def _sample_objects(
         body[k] = body_of_triangle[triangle]
         work[ALBEDO + k] = albedo[body[k]]
         work[OBJECT_X + seen], work[OBJECT_Y + seen], work[OBJECT_Z + seen] = work[X + k], work[Y + k], work[Z + k]
-        work[OBJECT_FOOTPRINT + seen] = _object_footprint(distance[k] * pixel_angles[k], k, work)
+        facing = -(work[DX + k] * work[NX + k] + work[DY + k] * work[NY + k] + work[DZ + k] * work[NZ + k])
+        work[OBJECT_FOOTPRINT + seen] = distance[k] * pixel_angles[k] / math.sqrt(max(facing, 0.05))
         work[OBJECT_CHANGE + seen] = 0.0
         other[seen] = k
         seen += 1
@@ -350,14 +317,62 @@ def _cast_shadows(
             other[queried] = k
             queried += 1
     if queried > 0:
-        xs, ys, zs = (
-            work[OBJECT_X : OBJECT_X + queried],
-            work[OBJECT_Y : OBJECT_Y + queried],
-            work[OBJECT_Z : OBJECT_Z + queried],
-        )
+        xs, ys = work[OBJECT_X : OBJECT_X + queried], work[OBJECT_Y : OBJECT_Y + queried]
+        zs = work[OBJECT_Z : OBJECT_Z + queried]
         sun_hidden(casters, xs, ys, zs, hidden)
         for m in range(queried):
             work[LIT + other[m]] *= 0.0 if hidden[m] else 1.0
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def photometric_angles(sun: tuple[float, float, float], width: int, work: Array) -> None:
+    """Cosines of incidence, emission and phase."""
+    for k in range(min(width, STRIP)):
+        dx, dy, dz = work[DX + k], work[DY + k], work[DZ + k]
+        nx, ny, nz = work[NX + k], work[NY + k], work[NZ + k]
+        work[COS_I + k] = sun[0] * nx + sun[1] * ny + sun[2] * nz
+        work[COS_E + k] = max(-(dx * nx + dy * ny + dz * nz), 1e-3)
+        work[COS_G + k] = min(max(-(dx * sun[0] + dy * sun[1] + dz * sun[2]), -1.0), 1.0)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def reflect(law: tuple[float, float, float, float, float, float], width: int, work: Array, radiance: Array32) -> None:
+    """Radiance factor of ground under sun and sky: Lunar-Lambert with an opposition surge."""
+    lunar, amplitude, surge_width, normalisation, sky_share, bounced = law
+    for k in range(min(width, STRIP)):
+        nz, cos_i, cos_g = work[NZ + k], work[COS_I + k], work[COS_G + k]
+        tan_half = math.sqrt(max(1.0 - cos_g, 0.0) / max(1.0 + cos_g, 1e-9))
+        surge = 1.0 + amplitude / (1.0 + tan_half / surge_width)
+        brightness = normalisation * surge * (2.0 * lunar * cos_i / (cos_i + work[COS_E + k]) + (1.0 - lunar) * cos_i)
+        value = sky_share * 0.5 * (1.0 + nz) + bounced * 0.5 * (1.0 - nz)
+        value += work[LIT + k] * brightness if cos_i > 0.0 else 0.0
+        radiance[k] = work[ALBEDO + k] * value
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def dim_sun(light: Light, distance: Array, work: Array) -> None:
+    """Dim the sun by the shadow of a round body at the camera, and by clouds."""
+    sun, law, drift, cover = light.sun, light.law, light.drift, light.cover
+    for k in range(distance.size):
+        if work[COS_I + k] <= 0.0:
+            continue
+        cos_g = work[COS_G + k]
+        if law[6] > 0.0 and cos_g > 0.9:
+            work[LIT + k] *= 1.0 - disc_overlap(0.5 * law[6] / distance[k], law[7], math.acos(cos_g))
+        if drift[4] > 0.0:
+            up = max(drift[1] - work[Z + k], 0.0) / sun[2]
+            x, y = work[X + k] + up * sun[0] - drift[2], work[Y + k] + up * sun[1] - drift[3]
+            work[LIT + k] *= 1.0 - drift[4] * interpolate_bilinear(cover, drift[0], x, y)[0]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def draw_sky(light: Light, pixel_angles: Array32, body: Ints, work: Array, radiance: Array32) -> None:
+    """Radiance factor of the pixels that see the sky."""
+    sun, sky, radius = light.sun, light.sky, light.law[7]
+    for k in range(body.size):
+        if body[k] == SKY:
+            cos_g = work[DX + k] * sun[0] + work[DY + k] * sun[1] + work[DZ + k] * sun[2]
+            radiance[k] = sky_brightness(sky, sun[2], radius, work[DZ + k], cos_g, pixel_angles[k])
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
@@ -373,7 +388,7 @@ def shade(
 ) -> None:
     """Compute radiance factor, body and normal of every pixel: geometry, texture, illumination, then photometry."""
     towards = (light.sun[0], light.sun[1], light.sun[2])
-    rotation = numbers(pose.rotation)
+    rotation = unpack_matrix(pose.rotation)
     centre = (pose.position[0], pose.position[1], pose.position[2])
     law = light.law
     reflectance = (law[0], law[1], law[2], law[3], law[4], law[5])
@@ -383,14 +398,8 @@ def shade(
     terrain = levels[occluders.shadow.level]
     near = no_cells()
     work = np.empty(ROWS * ROW)
-    strip = _Strip(
-        work,
-        np.empty(STRIP, dtype=np.int64),
-        np.empty(STRIP, dtype=np.int64),
-        np.empty(STRIP, dtype=np.int64),
-        np.empty(STRIP, dtype=np.int64),
-        np.empty(STRIP, dtype=np.bool_),
-    )
+    longs = np.empty((4, STRIP), dtype=np.int64)
+    strip = _Strip(work, longs[0], longs[1], longs[2], longs[3], np.empty(STRIP, dtype=np.bool_))
     count = rays.directions.shape[0]
     for first in range(0, count, STRIP):
         last = min(first + STRIP, count)
@@ -411,5 +420,7 @@ def shade(
         if law[6] > 0.0 or light.drift[4] > 0.0:
             dim_sun(light, met.distance, work)
         reflect(reflectance, width, work, radiance)
-        _write_normals(width, work, normals[here:there])
+        for k in range(width):
+            n = here + 3 * k
+            normals[n], normals[n + 1], normals[n + 2] = work[NX + k], work[NY + k], work[NZ + k]
         draw_sky(light, angles, body, work, radiance)

@@ -35,15 +35,15 @@ def no_cells() -> Near:
 
 
 @njit(cache=True, inline="always")
-def numbers(matrix: Array) -> Matrix:
-    """The numbers of a 3 x 3 matrix, read once before a loop."""
+def unpack_matrix(matrix: Array) -> Matrix:
+    """Unpack a 3 x 3 matrix, once before a loop."""
     (a, b, c), (d, e, f) = (matrix[0, 0], matrix[0, 1], matrix[0, 2]), (matrix[1, 0], matrix[1, 1], matrix[1, 2])
     return a, b, c, d, e, f, matrix[2, 0], matrix[2, 1], matrix[2, 2]
 
 
 @njit(cache=True, inline="always")
-def times(m: Matrix, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """A matrix times a vector."""
+def rotate(m: Matrix, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Multiply a matrix by a vector."""
     return (
         m[0] * x + m[1] * y + m[2] * z,
         m[3] * x + m[4] * y + m[5] * z,
@@ -53,12 +53,12 @@ def times(m: Matrix, x: float, y: float, z: float) -> tuple[float, float, float]
 
 @njit(cache=True, error_model="numpy")
 def fetch_cells(
-    field: Level, scale: float, x: Array, y: Array, which: Longs, count: int, cells: Array32, shares: Array
+    field: Level, scale: float, x: Array, y: Array, which: Longs, count: int, cells: Array32, fractions: Array
 ) -> None:
     """Copy the sixteen control values around positions of a level into rows, and their fractions of a cell.
 
-    `which` holds the numbers of the `count` positions; `scale` is samples per metre. `cells` and `shares` are outputs
-    of `CELLS` and 2 `ROW` numbers, each position's at its own number.
+    `which` holds the numbers of the `count` positions; `scale` is samples per metre. `cells` and `fractions` are
+    outputs of `CELLS` and 2 `ROW` numbers, each position's at its own number.
     """
     side = field.shape[0]
     mask = side - 1
@@ -68,16 +68,16 @@ def fetch_cells(
         k = which[m]
         gx, gy = x[k] * scale, y[k] * scale
         fx, fy = math.floor(gx), math.floor(gy)
-        shares[k], shares[ROW + k] = gx - fx, gy - fy
+        fractions[k], fractions[ROW + k] = gx - fx, gy - fy
         j, i = int(fx), int(fy)
         j0, j1, j2, j3 = (j - 1) & mask, j & mask, (j + 1) & mask, (j + 2) & mask
         for row in range(4):
             line = ((i + row - 1) & mask) * side
-            place = np.uint64(4 * row * ROW + k)
-            kept[place] = pairs[np.uint64(line + j0)]
-            kept[place + np.uint64(ROW)] = pairs[np.uint64(line + j1)]
-            kept[place + np.uint64(2 * ROW)] = pairs[np.uint64(line + j2)]
-            kept[place + np.uint64(3 * ROW)] = pairs[np.uint64(line + j3)]
+            entry = np.uint64(4 * row * ROW + k)
+            kept[entry] = pairs[np.uint64(line + j0)]
+            kept[entry + np.uint64(ROW)] = pairs[np.uint64(line + j1)]
+            kept[entry + np.uint64(2 * ROW)] = pairs[np.uint64(line + j2)]
+            kept[entry + np.uint64(3 * ROW)] = pairs[np.uint64(line + j3)]
 
 
 @njit(cache=True)
@@ -92,7 +92,7 @@ def fetch_levels(
     near: Near,
 ) -> None:
     """As `fetch_cells`, each position on its own level; the last array of `near` is overwritten."""
-    cells, shares, alike = near
+    cells, fractions, on_level = near
     lowest, highest = len(levels) - 1, 0
     for m in range(count):
         lowest = min(lowest, level_of[which[m]])
@@ -100,19 +100,19 @@ def fetch_levels(
     for level in range(lowest, highest + 1):
         found = 0
         for m in range(count):
-            alike[found] = which[m]
+            on_level[found] = which[m]
             found += level_of[which[m]] == level
-        fetch_cells(levels[level], inverse_spacing / (1 << level), x, y, alike, found, cells, shares)
+        fetch_cells(levels[level], inverse_spacing / (1 << level), x, y, on_level, found, cells, fractions)
 
 
 @njit(cache=True, inline="always")
-def spline(cells: Array32, shares: Array, k: int) -> tuple[float, float, float, float]:
+def spline(cells: Array32, fractions: Array, k: int) -> tuple[float, float, float, float]:
     """Height, slopes along x and y by sample, and albedo at the k-th position.
 
     The same sums in the same order as `marsyard.sim.terrain.kernels.sample`.
     """
-    wx0, wx1, wx2, wx3, dx0, dx1, dx2, dx3 = bspline_weights(shares[k])
-    wy0, wy1, wy2, wy3, dy0, dy1, dy2, dy3 = bspline_weights(shares[ROW + k])
+    wx0, wx1, wx2, wx3, dx0, dx1, dx2, dx3 = bspline_weights(fractions[k])
+    wy0, wy1, wy2, wy3, dy0, dy1, dy2, dy3 = bspline_weights(fractions[ROW + k])
     height, slope_x, slope_y, albedo = 0.0, 0.0, 0.0, 0.0
     for first, weight, change in ((0, wy0, dy0), (8 * ROW, wy1, dy1), (16 * ROW, wy2, dy2), (24 * ROW, wy3, dy3)):
         h0, a0 = cells[first + 2 * k], cells[first + 2 * k + 1]

@@ -26,7 +26,7 @@ Extent = tuple[float, float, float, float, float]
 
 
 class Ground(NamedTuple):
-    """The surface's pyramid (`marsyard.sim.render.mesh.pyramid`): levels, ceilings, number of the coarsest level,
+    """The surface's pyramid (`marsyard.sim.render.renderer.pyramid`): levels, ceilings, number of the coarsest level,
     spacing of level 0, metres, and extent of the ground.
     """
 

@@ -57,8 +57,8 @@ def sweep_shadow(height: Array32, along: float, drop: float, slip: float, reach:
     shadow = np.empty_like(height)
     away = np.empty(height.shape, dtype=np.uint8)
     whole = math.floor(slip)
-    share = np.float32(slip - whole)
-    rest = np.float32(1.0) - share
+    fraction = np.float32(slip - whole)
+    rest = np.float32(1.0) - fraction
     fall = np.float32(drop)
     before = np.full(columns, np.float32(-1e9), dtype=np.float32)
     caster = np.empty(columns, dtype=np.float32)
@@ -74,7 +74,7 @@ def sweep_shadow(height: Array32, along: float, drop: float, slip: float, reach:
         for j in range(columns):
             a = (j + whole) & column_mask
             b = (a + 1) & column_mask
-            before[j] = rest * caster[a] + share * caster[b] - fall
+            before[j] = rest * caster[a] + fraction * caster[b] - fall
             rows_before[j] = max(rows_away[a], rows_away[b]) + 1
         if step < rows:
             for j in range(columns):
@@ -84,7 +84,7 @@ def sweep_shadow(height: Array32, along: float, drop: float, slip: float, reach:
 
 
 @njit(cache=True, inline="always")
-def _interpolate(
+def interpolate_bilinear(
     field: Array32, inverse_spacing: float, x: float, y: float
 ) -> tuple[float, tuple[int, int], tuple[int, int]]:
     """Interpolate a periodic field bilinearly; return the value, and rows and columns of the four posts around."""
@@ -102,7 +102,7 @@ def _interpolate(
 def shadow_clearance(shadow: GroundShadow, x: float, y: float, z: float) -> tuple[float, float]:
     """Height of a position above the ground's shadow, metres, and distance of the shadow's caster in rows."""
     across, along = (y, x) if shadow.along_x else (x, y)
-    edge, (i0, i1), (j0, j1) = _interpolate(shadow.height, 1.0 / shadow.spacing, across, along)
+    edge, (i0, i1), (j0, j1) = interpolate_bilinear(shadow.height, 1.0 / shadow.spacing, across, along)
     away = shadow.reach
     farthest = max(max(away[i0, j0], away[i0, j1]), max(away[i1, j0], away[i1, j1]))
     return z - edge, float(farthest * REACH_ROWS)
@@ -138,35 +138,41 @@ def disc_overlap(first: float, second: float, apart: float) -> float:
 
 
 @njit(cache=True)
-def _lowest_near(
-    field: Level, per_metre: float, place: tuple[float, float, float], sun: Array, nearest: float
+def _clearance_ratio(
+    field: Level, per_metre: float, position: tuple[float, float, float], sun: Array, t: float
+) -> float:
+    """Clearance over distance of the line to the sun at a distance."""
+    x, y, z = position
+    height, _slope_x, _slope_y, _albedo = sample(field, per_metre, x + t * sun[0], y + t * sun[1])
+    ratio: float = (z + t * sun[2] - height) / t
+    return ratio
+
+
+@njit(cache=True)
+def _min_clearance_ratio(
+    field: Level, per_metre: float, position: tuple[float, float, float], sun: Array, nearest: float
 ) -> float:
     """Least clearance over distance of the line to the sun near a distance: the vertex of a parabola."""
-    x, y, z = place
     step = min(0.25 / per_metre, 0.5 * nearest)
-    before, middle, after = 0.0, 0.0, 0.0
-    at = nearest
-    for k in range(4):
-        t = nearest + (k - 1) * step if k < 3 else at
-        height, _slope_x, _slope_y, _albedo = sample(field, per_metre, x + t * sun[0], y + t * sun[1])
-        ratio = (z + t * sun[2] - height) / t
-        if k == 0:
-            before = ratio
-        elif k == 1:
-            middle = ratio
-        elif k == 2:
-            after = ratio
-            bend = before - 2.0 * middle + after
-            if bend > 0.0:
-                at = nearest + min(max(0.5 * (before - after) / bend, -1.0), 1.0) * step
-        else:
-            middle = min(middle, ratio)
-    return middle
+    before = _clearance_ratio(field, per_metre, position, sun, nearest - step)
+    middle: float = _clearance_ratio(field, per_metre, position, sun, nearest)
+    after = _clearance_ratio(field, per_metre, position, sun, nearest + step)
+    bend = before - 2.0 * middle + after
+    if bend <= 0.0:
+        return middle
+    vertex = nearest + min(max(0.5 * (before - after) / bend, -1.0), 1.0) * step
+    lowest: float = min(middle, _clearance_ratio(field, per_metre, position, sun, vertex))
+    return lowest
 
 
 @njit(cache=True)
 def visible_sun_fraction(
-    field: Level, per_metre: float, shadow: GroundShadow, place: tuple[float, float, float], sun: Array, radius: float
+    field: Level,
+    per_metre: float,
+    shadow: GroundShadow,
+    position: tuple[float, float, float],
+    sun: Array,
+    radius: float,
 ) -> float:
     """Fraction of the sun's disc that a position on the ground sees over the ground, by steps towards the sun.
 
@@ -175,7 +181,7 @@ def visible_sun_fraction(
     ends where the swept shadow shows that the remaining path is clear. `field` is the finest level, `radius` the
     angular radius of the disc.
     """
-    x, y, z = place
+    x, y, z = position
     spacing = 1.0 / per_metre
     _height, slope_x, slope_y, _albedo = sample(field, per_metre, x, y)
     if sun[2] - slope_x * sun[0] - slope_y * sun[1] <= 0.0:
@@ -203,13 +209,6 @@ def visible_sun_fraction(
         # half the clearance: no slope up to 60 deg is stepped over
         t += max(0.5 * spacing, 0.5 * (clearance - radius * t))
     if lowest < radius:
-        lowest = min(lowest, _lowest_near(field, per_metre, place, sun, nearest) * across)
+        lowest = min(lowest, _min_clearance_ratio(field, per_metre, position, sun, nearest) * across)
     fraction: float = disc_above(lowest / radius)
     return fraction
-
-
-@njit(cache=True, inline="always")
-def cloud_cover(cover: Array32, inverse_cell: float, x: float, y: float) -> float:
-    """Cover of a periodic layer of clouds at one position, bilinear between its cells."""
-    between: float = _interpolate(cover, inverse_cell, x, y)[0]
-    return between

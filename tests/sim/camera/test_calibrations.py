@@ -321,7 +321,7 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("text", "old", "new", "fault"), FAULTS, ids=[f"{old!r} {new!r}" for _, old, new, _ in FAULTS])
-def test_faults_are_named(tmp_path: Path, text: str, old: str, new: str, fault: str) -> None:
+def test_faults_name_field_and_allowed_values(tmp_path: Path, text: str, old: str, new: str, fault: str) -> None:
     assert old in text
     path = written(tmp_path, text.replace(old, new, 1), "faulty.yaml")
     with pytest.raises(CameraFileError, match=fault) as raised:
@@ -330,7 +330,7 @@ def test_faults_are_named(tmp_path: Path, text: str, old: str, new: str, fault: 
     assert "allowed" in str(raised.value)
 
 
-def test_a_lens_that_cahvor_cannot_hold_is_refused(tmp_path: Path) -> None:
+def test_lens_beyond_cahvor_is_refused(tmp_path: Path) -> None:
     """Strong decentring is no shift of an axis: some per cent of tangential distortion are pixels off whatever O is."""
     text = OPENCV.replace("2.1257384355991209e-003", "0.05").replace("-3.9487502777272009e-004", "-0.04")
     with pytest.raises(CameraFileError, match=r"px at most; allowed: 0.3 and 3 px; crop the picture"):

@@ -56,7 +56,7 @@ def test_motions_compose(first: RigidTransform, second: RigidTransform) -> None:
     assert np.allclose(vectors(camera.moved(first).moved(first.inv())), vectors(camera), rtol=0, atol=1e-11)
 
 
-def test_motion_turns_the_lens_too(hazcam: Cahvore) -> None:
+def test_motion_rotates_the_lens(hazcam: Cahvore) -> None:
     turn = Rotation.from_rotvec([0.3, 0.2, 0.1])
     moved = hazcam.moved(RigidTransform.from_rotation(turn))
     assert np.allclose(moved.o, turn.apply(np.array(hazcam.o)), atol=1e-15)
@@ -290,7 +290,7 @@ def test_derived_quantities_of_the_navcam(navcam: Cahvor) -> None:
     assert np.degrees(2 * half_angles.max()) == pytest.approx(61.4, abs=0.1)  # 45 x 45 degrees, across the corners
 
 
-def test_corner_rays_go_round_clockwise(camera: CameraModel) -> None:
+def test_corner_rays_are_in_clockwise_order(camera: CameraModel) -> None:
     origins, directions = camera.corner_rays()
     pixels = camera.project(origins + directions)[0]
     assert np.allclose(pixels, [[-0.5, -0.5], [1023.5, -0.5], [1023.5, 1023.5], [-0.5, 1023.5]], rtol=0, atol=1e-9)

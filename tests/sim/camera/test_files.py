@@ -186,7 +186,7 @@ LABEL_FAULTS = [
 
 
 @pytest.mark.parametrize(("old", "new", "fault"), LABEL_FAULTS, ids=[f"{new!r}" for _, new, _ in LABEL_FAULTS])
-def test_label_faults_are_named(tmp_path: Path, old: str, new: str, fault: str) -> None:
+def test_label_faults_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
     assert old in LABEL
     path = written(tmp_path, LABEL.replace(old, new), "faulty.IMG")
     with pytest.raises(CameraFileError, match=fault) as raised:
@@ -281,7 +281,7 @@ TEXT_FAULTS = [
 
 
 @pytest.mark.parametrize(("old", "new", "fault"), TEXT_FAULTS, ids=[f"{new!r}" for _, new, _ in TEXT_FAULTS])
-def test_text_faults_are_named(tmp_path: Path, old: str, new: str, fault: str) -> None:
+def test_text_faults_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
     assert old in TEXT
     path = written(tmp_path, TEXT.replace(old, new, 1), "faulty.cahvor")
     with pytest.raises(CameraFileError, match=fault) as raised:
@@ -290,7 +290,7 @@ def test_text_faults_are_named(tmp_path: Path, old: str, new: str, fault: str) -
     assert "allowed" in str(raised.value)
 
 
-def test_files_that_are_not_there_or_no_cameras(tmp_path: Path) -> None:
+def test_missing_files_and_other_formats_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CameraFileError, match=r"absent.cahvor: file: cannot be read \(No such file"):
         read_camera(tmp_path / "absent.cahvor")
     with pytest.raises(CameraFileError, match="cannot be read"):
@@ -337,9 +337,7 @@ def test_curiositys_labels_are_read(tmp_path: Path, ending: str) -> None:
         ("AVERAGING_WIDTH           = 1", "AVERAGING_WIDTH           = 2 <pixel>", "PIXEL_AVERAGING_WIDTH: 2"),
     ],
 )
-def test_subframes_of_curiosity_are_read_only_where_the_model_is_said_to_be_theirs(
-    tmp_path: Path, old: str, new: str, field: str
-) -> None:
+def test_curiositys_subframes_need_subframe_folded_in(tmp_path: Path, old: str, new: str, field: str) -> None:
     path = tmp_path / "curiosity.lbl"
     path.write_text(CURIOSITY.replace(old, new))
     with pytest.raises(CameraFileError, match=field):
@@ -347,7 +345,7 @@ def test_subframes_of_curiosity_are_read_only_where_the_model_is_said_to_be_thei
     assert read_pds3(path, subframe_folded_in=True)[0].size == (1020, 1024)
 
 
-def test_text_files_without_dimensions_take_the_size_that_is_given(tmp_path: Path) -> None:
+def test_text_files_without_dimensions_use_the_given_size(tmp_path: Path) -> None:
     stated, unstated = tmp_path / "stated.cahvor", tmp_path / "unstated.cahvor"
     stated.write_text(TEXT)
     unstated.write_text(TEXT.replace("Dimensions = 1024 1024\n", ""))

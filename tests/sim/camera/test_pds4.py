@@ -161,7 +161,7 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("old", "new", "fault"), FAULTS, ids=[f"{old!r} {new!r}" for old, new, _ in FAULTS])
-def test_faults_are_named(tmp_path: Path, old: str, new: str, fault: str) -> None:
+def test_faults_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
     assert old in WHOLE
     with pytest.raises(CameraFileError, match=fault) as raised:
         read_pds4(written(tmp_path, WHOLE.replace(old, new)))

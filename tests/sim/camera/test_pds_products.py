@@ -116,7 +116,7 @@ def test_opportunitys_pictures_have_their_labels_statistics(
         ('"made_data.IMG"', 0),
     ],
 )
-def test_pictures_in_a_file_beside_their_label(tmp_path: Path, pointer: str, before: int) -> None:
+def test_pictures_in_a_file_next_to_their_label(tmp_path: Path, pointer: str, before: int) -> None:
     """Curiosity's pose group, too."""
     label = LABEL.replace("PDS_VERSION_ID = PDS3", "ODL_VERSION_ID = ODL3")
     label = label.replace("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS")

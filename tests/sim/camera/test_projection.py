@@ -336,7 +336,7 @@ def test_leading_dimensions_are_kept(camera: CameraModel, shape: tuple[int, ...]
     assert camera.projection_jacobian(points).shape == (*shape, 2, 3)
 
 
-def test_a_point_alone_gives_what_it_gives_among_many(camera: CameraModel) -> None:
+def test_single_point_equals_the_point_among_many(camera: CameraModel) -> None:
     """Bit for bit, so that results do not depend on how work is divided."""
     points = camera.c + 3 * camera.rays(camera.pixel_grid()[::4, ::4].reshape(-1, 2))[1]
     together = camera.project(points)[0]

@@ -38,7 +38,7 @@ def _from_above(
 
 
 @pytest.mark.parametrize("cover", [0.1, 0.3, 0.6])
-def test_cover_and_size_are_what_was_asked_for(cover: float) -> None:
+def test_cover_and_size_equal_the_parameters(cover: float) -> None:
     layers = [_layer(seed, cover=cover, size_m=900.0, edge_m=20.0) for seed in range(4)]
     assert np.mean([layer.cover.mean() for layer in layers]) == pytest.approx(cover, rel=0.01)
     inside = np.stack([layer.cover > 0.5 for layer in layers])
@@ -83,7 +83,7 @@ def test_shadows_move_with_the_wind(renderer: Renderer, descent_camera: Callable
     assert np.abs(stayed.radiance - first.radiance).max() > 0.05
 
 
-def test_no_cover_is_no_clouds_to_the_last_bit(
+def test_zero_cover_equals_no_clouds_bit_for_bit(
     renderer: Renderer, descent_camera: Callable[..., Cahvor], rough: Surface
 ) -> None:
     camera = PixelRays.of(descent_camera(128))
@@ -96,7 +96,7 @@ def test_no_cover_is_no_clouds_to_the_last_bit(
     )
 
 
-def test_light_that_clouds_scatter_down_is_no_more_than_they_keep() -> None:
+def test_scattered_light_does_not_exceed_the_removed_light() -> None:
     for depth in (0.0, 0.5, 5.0, 50.0):
         given = CloudParameters(optical_depth=depth, cover=0.4)
         kept = 0.4 * (1.0 - given.direct_transmittance(SUN)) * SUN.direction[2]
@@ -109,7 +109,7 @@ def test_the_same_generator_draws_the_same_clouds() -> None:
     assert _layer(7).cover.tobytes() != _layer(8).cover.tobytes()
 
 
-def test_a_layer_knows_nothing_of_where_no_ground_is_seen() -> None:
+def test_transmittance_of_the_sky_is_nan() -> None:
     points = np.array([[np.nan, np.nan, np.nan], [3.0, 4.0, 5.0]])
     passed = _layer().transmittance(points, SUN, 0.0)
     assert np.isnan(passed[0])

@@ -65,7 +65,7 @@ def reference(renderer: Renderer, rocky: View) -> np.ndarray:
     return supersampled(renderer, replace(single, footprint=float(SAMPLES)), SAMPLES)
 
 
-def test_rays_within_a_pixel_are_spread_evenly_about_its_middle() -> None:
+def test_subpixel_rays_are_spread_evenly_about_the_centre() -> None:
     camera = _camera((7, 5))
     rays = PixelRays.of(camera)
     pixels = np.array([0, 17, 34])
@@ -110,7 +110,7 @@ def test_outlines_are_those_of_256_rays_a_pixel(
     assert abs(at_edges) < 0.1 * error(one.radiance)
 
 
-def test_truth_is_that_of_the_pixels_middles(renderer: Renderer, rocky: View) -> None:
+def test_truth_is_that_of_pixel_centres(renderer: Renderer, rocky: View) -> None:
     rays = rocky.rays(rocky.camera)
     one = renderer.render(replace(rocky.scene, edge_rays=1), rays, rocky.world_from_body)
     several = renderer.render(rocky.scene, rays, rocky.world_from_body)

@@ -15,7 +15,7 @@ from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene,
 from marsyard.sim.render.backend import RenderingError
 from marsyard.sim.render.kernels.ground import cross_ground, entry_distance, exit_distance, skip_empty_blocks
 from marsyard.sim.render.kernels.structs import GroundLevel, Ray
-from marsyard.sim.render.mesh import NO_CEILING
+from marsyard.sim.render.renderer import NO_CEILING
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
 
@@ -147,7 +147,7 @@ def test_ranges_agree_with_an_independent_ray_cast_over_rough_ground(
 
 
 @pytest.mark.parametrize("bounded", [True, False], ids=["by ceilings", "by steps"])
-def test_flat_rays_meet_the_first_crest_that_hides_what_is_behind(rough: Surface, bounded: bool) -> None:
+def test_grazing_rays_meet_the_first_occluding_crest(rough: Surface, bounded: bool) -> None:
     """Rays that graze rough ground hundreds of samples away, against steps of a thirtieth of a sample."""
     rng = np.random.default_rng(3)
     count, ground = 400, Ground(rough)
@@ -170,7 +170,7 @@ def test_flat_rays_meet_the_first_crest_that_hides_what_is_behind(rough: Surface
 
 
 @pytest.mark.parametrize("bounded", [True, False], ids=["by ceilings", "by steps"])
-def test_ground_is_met_up_to_the_very_end_of_the_search_and_none_beyond(rough: Surface, bounded: bool) -> None:
+def test_search_finds_ground_up_to_its_end_and_none_beyond(rough: Surface, bounded: bool) -> None:
     """Without ceilings steps are longer than what is left: ground before a thing was passed over with the thing."""
     rng = np.random.default_rng(4)
     ground = Ground(rough)
@@ -184,7 +184,7 @@ def test_ground_is_met_up_to_the_very_end_of_the_search_and_none_beyond(rough: S
         assert cross_ground(level, Ray(*origin, *ray), near, t - 1e-3) == np.inf
 
 
-def test_a_ray_meets_no_ground_before_it_is_as_low_as_the_highest() -> None:
+def test_entry_distance_is_where_a_ray_reaches_the_highest_ground() -> None:
     extent = (-10.0, 10.0, -20.0, 20.0, 3.0)
     assert entry_distance(extent, Ray(0.0, 0.0, 5.0, 1.0, 0.0, -0.1)) == pytest.approx(20.0)
     assert entry_distance(extent, Ray(0.0, 0.0, 3.0, 1.0, 0.0, -0.1)) == 0.0
@@ -194,7 +194,7 @@ def test_a_ray_meets_no_ground_before_it_is_as_low_as_the_highest() -> None:
     assert exit_distance(extent, Ray(2.0, -1.0, 0.0, 0.5, -0.1, 0.0)) == pytest.approx(16.0)
 
 
-def test_a_ray_skips_the_blocks_of_ground_that_it_is_clear_of(rough: Surface) -> None:
+def test_blocks_below_a_ray_are_skipped(rough: Surface) -> None:
     """To the first block whose ceiling it is not above, in all directions and over the border of the period."""
     ceiling = rough.ceilings[0]
     level, block = GroundLevel(rough.levels[0], ceiling, 1.0 / rough.spacing_m), CEILING_BLOCK * rough.spacing_m
@@ -236,7 +236,7 @@ def test_pixels_above_the_horizon_see_the_sky(
     assert np.isnan(frame.points_world()[:60]).all()
 
 
-def test_what_is_out_of_view_does_not_change_the_picture(
+def test_objects_out_of_view_do_not_change_the_picture(
     renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
     """Where nothing but ground is in view no triangle is drawn: the search for one must not read what is not there."""
@@ -265,7 +265,7 @@ def test_refuses_a_camera_below_the_ground(
         renderer.render(Scene(rough, (0.0, 0.0), OVERHEAD, PAINT), PixelRays.of(descent_camera(64)), buried)
 
 
-def test_same_picture_whatever_was_drawn_before(
+def test_picture_does_not_depend_on_earlier_pictures(
     renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
     rays = PixelRays.of(descent_camera(256))

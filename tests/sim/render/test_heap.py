@@ -7,7 +7,7 @@ SIZE = 20_000_000
 #: Frees as much as some pictures take, and tells how much more memory is in use then, and after it has gone back.
 SCRIPT = f"""
 import os, sys
-from marsyard.sim.render.process import keep_freed_memory, return_freed_memory
+from marsyard.sim.render.renderer import keep_freed_memory, return_freed_memory
 
 def used():
     with open("/proc/self/statm") as file:
@@ -30,7 +30,7 @@ def _in_use(word: str) -> tuple[int, int]:
     return freed, returned
 
 
-def test_freed_memory_is_kept_until_it_is_given_back() -> None:
+def test_freed_memory_is_kept_until_it_is_returned() -> None:
     freed, returned = _in_use("keep")
     assert freed > 0.9 * SIZE
     assert returned < 0.1 * SIZE

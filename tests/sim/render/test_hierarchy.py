@@ -61,7 +61,7 @@ def test_a_beam_lists_all_triangles_that_its_rays_meet(thicket: Objects, axis: n
     assert listed <= set(np.flatnonzero(near).tolist())
 
 
-def test_a_beam_tells_where_triangles_are_more_than_it_has_room_for(thicket: Objects) -> None:
+def test_beam_reports_an_overflow_of_its_list(thicket: Objects) -> None:
     ahead = direction(1.0, 0.2)
     room = np.empty(1500, dtype=np.int64)
     count = list_in_beam(thicket.hierarchy, Ray(*EYE, *ahead), 0.3, 9.0, room)

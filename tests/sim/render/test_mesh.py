@@ -3,12 +3,13 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from marsyard.sim.render.mesh import cells_in_hull, graded_offsets, ground_mesh
+from marsyard.sim.render.renderer import cells_in_hull, ground_mesh
+from marsyard.sim.render.scene import graded_offsets
 from marsyard.sim.terrain import Surface
 
 
 @given(finest=st.floats(0.5, 20.0), stretch=st.floats(1.01, 1000.0), count=st.integers(8, 200).map(lambda n: 2 * n + 1))
-def test_offsets_reach_as_far_and_start_as_fine_as_asked(finest: float, stretch: float, count: int) -> None:
+def test_offsets_have_the_given_extent_and_spacing(finest: float, stretch: float, count: int) -> None:
     reach = stretch * finest * (count - 1) / 2
     offsets = graded_offsets(reach, finest, count)
     gaps = np.diff(offsets)
@@ -36,7 +37,7 @@ def test_mesh_is_closed_faces_up_and_follows_the_ground(rough: Surface) -> None:
 
 
 @given(st.lists(st.tuples(st.floats(-30.0, 30.0), st.floats(-30.0, 30.0)), min_size=3, max_size=9), st.integers(0, 9))
-def test_cells_of_a_hull_hold_all_of_it_and_little_else(corners: list[tuple[float, float]], seed: int) -> None:
+def test_cells_in_hull_cover_it_closely(corners: list[tuple[float, float]], seed: int) -> None:
     """Also where it reaches beyond the grid, or between two of its lines."""
     places = np.array(corners) + np.array([[0.0, 0.0], [0.3, 0.1], [0.1, 0.4], *[[0.0, 0.0]] * (len(corners) - 3)])
     assume(np.linalg.matrix_rank(places - places[0], tol=1e-3) == 2)
@@ -56,7 +57,7 @@ def test_cells_of_a_hull_hold_all_of_it_and_little_else(corners: list[tuple[floa
         assert lines[spans[strip, 1]] >= low[0]
 
 
-def test_some_cells_of_a_mesh_are_those_of_the_whole(rough: Surface) -> None:
+def test_partial_mesh_equals_the_whole_mesh(rough: Surface) -> None:
     """The spans leave strips out, overlap by a corner, and do not touch at all."""
     lines = graded_offsets(300.0, 5.0, 17)
     spans = np.zeros((16, 2), dtype=int)

@@ -17,7 +17,7 @@ def _bodies() -> Objects:
     return Objects.of_mesh(vertices, rng.normal(size=vertices.shape), faces, names, albedo=0.2)
 
 
-def test_spheres_hold_their_bodies_and_touch_them() -> None:
+def test_spheres_enclose_their_bodies_tightly() -> None:
     objects = _bodies()
     for body, sphere in enumerate(objects.spheres):
         corners = objects.triangles[objects.body_of_triangle == body].reshape(-1, 3)
@@ -26,7 +26,7 @@ def test_spheres_hold_their_bodies_and_touch_them() -> None:
     assert Objects.none().spheres.shape == (0, 4)
 
 
-def test_some_of_the_bodies_are_those_that_were_asked_for() -> None:
+def test_only_selects_bodies() -> None:
     objects = _bodies()
     kept = np.array([True, False, False, True])
     some = objects.only(kept)
@@ -39,7 +39,7 @@ def test_some_of_the_bodies_are_those_that_were_asked_for() -> None:
     assert len(objects.only(np.zeros(4, dtype=bool))) == 0
 
 
-def test_a_cone_meets_what_faces_it_of_the_bodies_whose_spheres_reach_into_it() -> None:
+def test_cone_selects_facing_triangles_of_bodies_within_it() -> None:
     """A triangle faces a place that lies on the side from which its corners run counter-clockwise."""
     objects = _bodies()
     eye = objects.spheres[2, :3] + np.array([0.0, 0.0, 200.0])

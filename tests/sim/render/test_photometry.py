@@ -44,7 +44,7 @@ def _brightness(renderer: Renderer, flat: Surface, law: Photometry, to_sun: np.n
 
 
 @each_law
-def test_sun_and_eye_can_change_places(renderer: Renderer, flat: Surface, law: Photometry) -> None:
+def test_reflectance_law_is_reciprocal(renderer: Renderer, flat: Surface, law: Photometry) -> None:
     rng = np.random.default_rng(9)
     for _ in range(3):
         azimuths, heights = rng.uniform(0.0, 2.0 * np.pi, 2), np.arcsin(rng.uniform(0.15, 1.0, 2))
@@ -55,7 +55,7 @@ def test_sun_and_eye_can_change_places(renderer: Renderer, flat: Surface, law: P
 
 
 @each_law
-def test_the_law_returns_the_stated_share_of_light(law: Photometry) -> None:
+def test_albedo_is_the_reflected_fraction_of_light(law: Photometry) -> None:
     """Sun and eye drawn in proportion to their cosines: the mean of I/F over cos i is the spherical albedo."""
     one, two, turn = qmc.Sobol(3, rng=np.random.default_rng(1)).random_base2(17).T
     cos_i, cos_e = np.sqrt(1.0 - one), np.sqrt(1.0 - two)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from marsyard.sim.render.mesh import LEVELS, NO_CEILING, ground_struct
+from marsyard.sim.render.renderer import LEVELS, NO_CEILING, ground_struct
 from marsyard.sim.terrain import Surface
 
 

@@ -80,7 +80,7 @@ def test_the_head_hides_nothing_from_its_cameras(azimuth_deg: float, elevation_d
         assert met.min() > (0.9 if azimuth_deg else 100.0)
 
 
-def test_it_leans_with_the_ground() -> None:
+def test_rover_tilts_with_the_ground() -> None:
     stance = settle(MER, uphill_east(10.0), 0.0, 0.0, EAST)
     objects = rover_objects(MER, stance, MER_MAST, 0.0, 0.0)
     level = rover_objects(MER, settle(MER, Plane(), 0.0, 0.0, EAST), MER_MAST, 0.0, 0.0)
@@ -89,7 +89,7 @@ def test_it_leans_with_the_ground() -> None:
     )
 
 
-def test_the_masts_shadow_falls_where_the_sun_says(renderer: Renderer) -> None:
+def test_mast_shadow_lies_opposite_the_sun(renderer: Renderer) -> None:
     samples = np.zeros((64, 64, 2), dtype=np.float32)
     samples[..., 1] = 0.2
     surface = Surface.from_samples(samples, 1.0)
@@ -117,7 +117,7 @@ def test_the_masts_shadow_falls_where_the_sun_says(renderer: Renderer) -> None:
 
 
 @pytest.mark.parametrize(("rover", "mast"), [(MER, MER_MAST), (ROCKY_8, RESEARCH_MAST)])
-def test_the_sphere_holds_the_rover_however_it_stands(rover: RoverParameters, mast: MastGeometry) -> None:
+def test_sphere_contains_the_rover_in_any_stance(rover: RoverParameters, mast: MastGeometry) -> None:
     rng = np.random.default_rng(2)
     farthest = []
     for _ in range(20):
@@ -130,7 +130,7 @@ def test_the_sphere_holds_the_rover_however_it_stands(rover: RoverParameters, ma
     assert 0.7 < max(farthest) <= 1.0
 
 
-def test_what_a_rover_cannot_shade() -> None:
+def test_positions_that_a_rover_cannot_shade() -> None:
     objects = rover_objects(MER, settle(MER, Plane(), 0.0, 0.0, EAST), MER_MAST, 0.0, 0.0)
     low = direction(EAST, np.radians(20.0))
     # the mast's tip, 1.6 m up, throws its shadow 4.4 m to the west and none to the east

@@ -12,7 +12,7 @@ from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Frame, Objects, Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.kernels.casters import sun_hidden
 from marsyard.sim.render.kernels.ground import height_range
-from marsyard.sim.render.shadows import (
+from marsyard.sim.render.scene import (
     NO_SHADOW,
     casters_towards,
     ground_in_cones,
@@ -112,7 +112,7 @@ def test_penumbra_of_a_ridge(renderer: Renderer, descent_camera: Callable[..., C
 
 
 @pytest.mark.parametrize("elevation", [-0.2, 0.15, 1.0, np.pi / 2])
-def test_places_are_hidden_from_the_sun_as_all_triangles_say(elevation: float) -> None:
+def test_hidden_positions_agree_with_all_triangles(elevation: float) -> None:
     """Triangles of all sizes and any shape, some of them upright, in bodies that overlap."""
     rng = np.random.default_rng(8)
     middles = rng.uniform(-5.0, 5.0, (60, 1, 1, 3))
@@ -134,7 +134,7 @@ def test_places_are_hidden_from_the_sun_as_all_triangles_say(elevation: float) -
 
 
 @pytest.mark.parametrize("azimuth_deg", [20.0, 110.0, 200.0, 290.0, 45.0])
-def test_a_shadow_swept_where_it_is_seen_is_the_whole_ground_s_there(rough: Surface, azimuth_deg: float) -> None:
+def test_partial_shadow_sweep_equals_the_whole_sweep(rough: Surface, azimuth_deg: float) -> None:
     """Also over the border of the terrain's period."""
     sun = Sun(direction(np.radians(azimuth_deg), np.radians(35.0)))
     heights = height_range(rough.levels[0])
@@ -177,7 +177,7 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(rough: Surface, azimuth_de
     assert scene.in_light(just_below, Photometry()).shadow is not NO_SHADOW
 
 
-def test_ground_in_cones_holds_all_places_in_them() -> None:
+def test_ground_in_cones_bounds_all_positions_in_them() -> None:
     rng = np.random.default_rng(2)
     tip, half = np.array([3.0, -2.0, 1.5]), 0.12
     axis = direction(2.0, -0.3)

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.camera import Cahvor
 from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene, Sun, Texture, process
+from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene, Sun, Texture
+from marsyard.sim.render.renderer import run_in_parts
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 
@@ -23,17 +24,17 @@ def test_every_pixel_belongs_to_one_part(pixels: int, count: int) -> None:
     def visit(part: slice) -> None:
         visits[part] += 1
 
-    process.in_parts(visit, pixels, count)
+    run_in_parts(visit, pixels, count)
     np.testing.assert_array_equal(visits, 1)
 
 
-def test_a_thread_that_fails_is_heard() -> None:
+def test_exception_in_a_thread_is_raised() -> None:
     def fail(part: slice) -> None:
         if part.start > 0:
             raise ValueError("the second half")
 
     with pytest.raises(ValueError, match="the second half"):
-        process.in_parts(fail, 100_000, 2)
+        run_in_parts(fail, 100_000, 2)
 
 
 def test_pictures_do_not_depend_on_threads(
@@ -49,10 +50,10 @@ def test_pictures_do_not_depend_on_threads(
     )
     rays = PixelRays.of(descent_camera().cropped(400, 400, (161, 161)))
     pose = rigid(Rotation.from_euler("x", 4.0, degrees=True), np.array([380.0, 200.0, 400.0]))
-    monkeypatch.setattr("marsyard.sim.render.renderer.in_parts", partial(process.in_parts, threads=1))
+    monkeypatch.setattr("marsyard.sim.render.renderer.run_in_parts", partial(run_in_parts, threads=1))
     alone = renderer.render(scene, rays, pose)
     assert np.any(alone.body >= 0)
-    monkeypatch.setattr("marsyard.sim.render.renderer.in_parts", partial(process.in_parts, threads=3))
+    monkeypatch.setattr("marsyard.sim.render.renderer.run_in_parts", partial(run_in_parts, threads=3))
     shared = renderer.render(scene, rays, pose)
     for name in ("radiance", "range_m", "body", "normal"):
         np.testing.assert_array_equal(getattr(alone, name), getattr(shared, name))

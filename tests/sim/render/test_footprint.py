@@ -10,7 +10,7 @@ from marsyard.sim.frames import direction
 from marsyard.sim.render import Objects, PixelRays, Sun, process_renderer
 from marsyard.sim.render.backend import default_backend
 from marsyard.sim.render.kernels.structs import Footprint
-from marsyard.sim.render.shadows import EVERYWHERE, shadow_footprint
+from marsyard.sim.render.scene import EVERYWHERE, shadow_footprint
 from marsyard.sim.sensor import preset
 from marsyard.sim.terrain import RockParameters, TerrainParameters, site
 
@@ -28,7 +28,7 @@ def _inside(footprint: Footprint, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("elevation", [0.2, 0.7, 1.5])
-def test_every_place_in_a_shadow_is_in_reach(elevation: float) -> None:
+def test_footprint_contains_every_shaded_position(elevation: float) -> None:
     """Rays to the sun that pass through a sphere, from ground of any height above the lowest; and few others."""
     rng = np.random.default_rng(0)
     spheres = np.column_stack(
@@ -49,13 +49,13 @@ def test_every_place_in_a_shadow_is_in_reach(elevation: float) -> None:
     assert _inside(footprint, *anywhere.T).mean() < 0.15 + 0.1 / np.tan(elevation)
 
 
-def test_without_things_or_sun_nothing_is_said() -> None:
+def test_footprint_without_objects_or_sun_is_everywhere() -> None:
     one = np.array([[0.0, 0.0, 0.0, 1.0]])
     assert shadow_footprint(np.empty((0, 4)), direction(0.0, 1.0), 0.0) is EVERYWHERE
     assert shadow_footprint(one, direction(0.0, -0.1), 0.0) is EVERYWHERE
 
 
-def test_pictures_are_the_same_with_and_without() -> None:
+def test_pictures_with_and_without_footprint_are_equal() -> None:
     """Bit for bit, over ground with many rocks under a low sun."""
     ground = SiteGround.of(site("gusev").model_copy(update={"descent": ROCKY}))
     rays = PixelRays.of(preset("mer-descent-flown").cameras()[0].binned(4, 4))
@@ -71,7 +71,7 @@ def test_pictures_are_the_same_with_and_without() -> None:
 
 
 @pytest.mark.parametrize("elevation", [0.25, 1.0])
-def test_a_picture_is_the_same_with_what_concerns_it_alone(elevation: float) -> None:
+def test_picture_of_potentially_visible_objects_is_equal(elevation: float) -> None:
     """Bit for bit: a subframe from a mast among rocks under a low and a high sun, from either side."""
     terrain = ROCKY.model_copy(update={"spacing_m": 0.05, "rms_slope_deg": 5.0, "slope_baseline_m": 1.0})
     terrain = terrain.model_copy(update={"outer_scale_m": 10.0, "craters_per_km2": 0.0})

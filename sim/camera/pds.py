@@ -1,0 +1,393 @@
+"""PDS3 and PDS4 labels: camera models; of PDS3 products also the picture and the rover's pose.
+
+PDS3: each group GEOMETRIC_CAMERA_MODEL (Curiosity: GEOMETRIC_CAMERA_MODEL_PARMS) gives MODEL_TYPE, the letters of its
+components (MODEL_COMPONENT_ID) and the components, in the frame named by REFERENCE_COORD_SYSTEM_NAME (a rover's frame,
+metres: x forward, y right, z down). The vectors are returned in that frame. The picture's size is that of the label's
+IMAGE object. Labels are attached to the product or detached; Curiosity's begin with ODL_VERSION_ID.
+
+PDS4: the class `geom:Camera_Model_Parameters` of the geometry dictionary. Vectors are returned in the frame named by
+the label (`Coordinate_Space_Reference`). The picture's size is that of the label's image array. Prefixes and versions
+of namespaces do not matter.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from jaxtyping import UInt16
+from scipy.spatial.transform import RigidTransform, Rotation
+
+from marsyard.sim.camera.assembly import MAX_BYTES, MODELS, Source, create_camera, linearity_of_type
+from marsyard.sim.camera.base import CameraModel
+from marsyard.sim.files import check_regular
+from marsyard.sim.frames import rigid
+
+_GROUP = "GEOMETRIC_CAMERA_MODEL"
+_GROUPS = (_GROUP, f"{_GROUP}_PARMS")
+_FIRST_BYTES = 1 << 16
+_START = re.compile(rb"^\s*(?:PDS|ODL)_VERSION_ID\s*=", re.MULTILINE)
+_START_WITHIN = 4096
+_END = re.compile(rb"^END\s*$", re.MULTILINE)
+_METRES = ("METER", "METERS", "METRE", "METRES", "M", "N/A")
+#: Groups of the rover's pose; the second is Curiosity's.
+_ROVERS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS")
+#: `9`, `20481 <BYTES>`, `("PICTURE.IMG", 9)`, `("PICTURE.IMG", 20481 <BYTES>)`, `"PICTURE.IMG"`.
+_POINTER = re.compile(
+    r"^[ \t]*\^IMAGE[ \t]*=[ \t]*"
+    r"(?:\([ \t]*\"(?P<detached>[^\"\n]+)\"[ \t]*,[ \t]*(?P<at>\d+)[ \t]*(?P<at_bytes><BYTES>)?[ \t]*\)"
+    r"|\"(?P<alone>[^\"\n]+)\"|(?P<number>\d+)[ \t]*(?P<bytes><BYTES>)?)[ \t]*\r?$",
+    re.MULTILINE,
+)
+_RECORD = re.compile(r"^[ \t]*RECORD_BYTES[ \t]*=[ \t]*(\d+)", re.MULTILINE)
+_CLOCK = re.compile(r"^[ \t]*SPACECRAFT_CLOCK_(START|STOP)_COUNT[ \t]*=[ \t]*\"?(\d+\.?\d*)\"?[ \t]*\r?$", re.MULTILINE)
+#: Byte orders of integer samples by the first word of SAMPLE_TYPE; 8-bit samples have none.
+_ORDERS = {"MSB": ">", "LSB": "<", "PC": "<", "SUN": ">", "UNSIGNED": ">", "INTEGER": ">"}
+#: Tolerance on the length of a quaternion.
+_UNIT = 1e-3
+_SUBFRAME = "of a part of the detector or of averaged pixels"
+
+_XML_START = re.compile(rb"\A(\xef\xbb\xbf)?\s*<(\?xml|[A-Za-z_][\w:.-]*[\s>])")
+_PARAMETERS = "Camera_Model_Parameters"
+_POSITION, _DIRECTION, _PIXEL = (tuple(f"{axis}_{kind}" for axis in "xyz") for kind in ("position", "unit", "pixel"))
+_TERMS = ("c0", "c1", "c2")
+#: Element and components of each vector of a model.
+_VECTORS = {
+    "C": ("Vector_Center", _POSITION),
+    "A": ("Vector_Axis", _DIRECTION),
+    "H": ("Vector_Horizontal", _PIXEL),
+    "V": ("Vector_Vertical", _PIXEL),
+    "O": ("Vector_Optical", _DIRECTION),
+    "R": ("Radial_Terms", _TERMS),
+    "E": ("Entrance_Terms", _TERMS),
+}
+_PDS4_METRES = (None, "m", "meter", "metre")
+
+
+@dataclass(frozen=True)
+class Pds3Product:
+    """A picture with its pose and time by its label.
+
+    - counts: as stored
+    - site_from_rover: the rover's pose in the site frame (x north, y east, z down), metres; None if not in the label
+    - time_s: spacecraft clock at the middle of the exposure; None if not in the label
+    """
+
+    counts: UInt16[np.ndarray, "rows columns"]
+    site_from_rover: RigidTransform | None
+    time_s: float | None
+
+
+def read_pds3(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[CameraModel, ...]:
+    """Read every camera model of a PDS3 product (.IMG) or detached label (.LBL), in order; the image is not read.
+
+    The standard does not define whether the model of a subframe, or of a picture with averaged pixels, describes the
+    stored picture or the whole detector. Such labels are refused unless `subframe_folded_in` is set: the vectors then
+    describe the stored picture. Raises CameraFileError if the label cannot be read, has no camera model, or one is
+    incomplete or wrong; it names file, field and allowed values.
+    """
+    source = Source(str(path))
+    label = _parse_blocks(_label_text(source), (*_GROUPS, "IMAGE", "INSTRUMENT_STATE_PARMS"), source)
+    groups = [group for name, group in label.items() if name in _GROUPS]
+    if not groups:
+        raise source.error(_GROUP, "missing or not closed", "a label with at least one such group")
+    size = _picture_size(label, source)
+    fields = {f"IMAGE.{field}": label["IMAGE"].get(field) for field in ("FIRST_LINE", "FIRST_LINE_SAMPLE")}
+    state = label.get("INSTRUMENT_STATE_PARMS")
+    if isinstance(state, Mapping):
+        for field in ("PIXEL_AVERAGING_HEIGHT", "PIXEL_AVERAGING_WIDTH"):
+            fields[f"INSTRUMENT_STATE_PARMS.{field}"] = state.get(field)
+    for field, stated in fields.items():
+        value = getattr(stated, "value", stated)  # a quantity with its unit, as 2 <pixel>
+        if not subframe_folded_in and isinstance(value, int) and value != 1:
+            raise source.error(field, f"{value}: {_SUBFRAME}", "1, or subframe_folded_in=True")
+    return tuple(_pds3_camera(group, size, source) for group in groups)
+
+
+def read_pds3_product(path: str | Path) -> Pds3Product:
+    """Read a picture of 8 or 16-bit integers and its pose; `read_pds3` reads its camera.
+
+    Raises CameraFileError if the label or the picture's file cannot be read, the picture has another type or is cut
+    short, or the rover's pose is invalid; it names file, field and allowed values.
+    """
+    source = Source(str(path))
+    text = _label_text(source)
+    label = _parse_blocks(text, ("IMAGE", *_ROVERS), source)
+    size = _picture_size(label, source)
+    counts = _read_counts(text, label["IMAGE"], size, source)
+    times = [float(match[2]) for match in _CLOCK.finditer(text)]
+    time_s = float(np.mean(times)) if times else None
+    name = next((one for one in _ROVERS if one in label), None)
+    if name is None:
+        return Pds3Product(counts, None, time_s)
+    vectors = []
+    for field, length in (("ORIGIN_OFFSET_VECTOR", 3), ("ORIGIN_ROTATION_QUATERNION", 4)):
+        value = label[name].get(field) if isinstance(label[name], Mapping) else None
+        numeric = isinstance(value, list) and all(isinstance(one, int | float) for one in value)
+        if not numeric or len(value) != length:  # type: ignore[arg-type]  # a list, as just seen
+            raise source.error(f"{name}.{field}", f"{value!r}", f"{length} numbers")
+        vectors.append(np.array(value, dtype=np.float64))
+    offset, quaternion = vectors
+    if abs(float(np.linalg.norm(quaternion)) - 1.0) > _UNIT:
+        raise source.error(f"{name}.ORIGIN_ROTATION_QUATERNION", "is not of length 1", "a unit quaternion")
+    # the label's quaternion has its scalar first
+    return Pds3Product(counts, rigid(Rotation.from_quat(quaternion[[1, 2, 3, 0]]), offset), time_s)
+
+
+def is_pds3(head: bytes) -> bool:
+    """Whether the first bytes of a file are those of a PDS3 label or product."""
+    return _START.search(head[:_START_WITHIN]) is not None
+
+
+def _label_text(source: Source) -> str:
+    """Read the text of a PDS3 label up to its END."""
+    for count in (_FIRST_BYTES, MAX_BYTES):
+        head = source.head(count)
+        if not is_pds3(head):
+            raise source.error("PDS_VERSION_ID", "missing at the head of the file", "a PDS3 label or product")
+        end = _END.search(head)
+        if end is not None:
+            return head[: end.end()].decode("latin-1")
+    raise source.error("END", f"missing in the first {MAX_BYTES} bytes", "a label closed by a line END")
+
+
+def _parse_blocks(text: str, names: Sequence[str], source: Source) -> Any:
+    """Parse the groups and objects of these names in a label.
+
+    pvl's strict parser refuses other parts of real labels (unquoted values that begin with a digit), and its lenient
+    parser never returns from some damaged labels; the blocks are regular.
+    """
+    blocks = re.compile(
+        rf"^[ \t]*(GROUP|OBJECT)[ \t]*=[ \t]*({'|'.join(names)})[ \t]*\r?$.*?^[ \t]*END_\1\b[^\n]*$",
+        re.MULTILINE | re.DOTALL,
+    )
+    try:
+        with warnings.catch_warnings():
+            # pvl warns of a missing optional package and of a deprecated class of its own
+            warnings.simplefilter("ignore", ImportWarning)
+            warnings.simplefilter("ignore", PendingDeprecationWarning)
+            from pvl.decoder import PDSLabelDecoder
+            from pvl.grammar import PDSGrammar
+            from pvl.parser import ODLParser
+
+            grammar = PDSGrammar()
+            parser = ODLParser(grammar=grammar, decoder=PDSLabelDecoder(grammar=grammar))
+            return parser.parse("\n".join(block[0] for block in blocks.finditer(text)) + "\nEND\n")
+    except Exception as fault:  # pvl raises many types, its own and Python's
+        raise source.error("label", f"cannot be parsed ({fault})", "a PDS3 label") from fault
+
+
+def _picture_size(label: Any, source: Source) -> tuple[int, int]:
+    """(columns, rows) of the label's IMAGE object."""
+    if "IMAGE" not in label or not isinstance(label["IMAGE"], Mapping):
+        raise source.error("IMAGE", "missing", "an object with LINES and LINE_SAMPLES")
+    image = label["IMAGE"]
+    extents = []
+    for field in ("LINE_SAMPLES", "LINES"):
+        value = image.get(field)
+        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            raise source.error(f"IMAGE.{field}", _fault(value), "a positive integer")
+        extents.append(value)
+    return extents[0], extents[1]
+
+
+def _pds3_camera(group: Any, size: tuple[int, int], source: Source) -> CameraModel:
+    """Create the camera of a group: its components are found by their letters."""
+
+    def is_number(value: Any) -> bool:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+
+    if not isinstance(group, Mapping):
+        raise source.error(_GROUP, "is not a group", "GROUP = GEOMETRIC_CAMERA_MODEL ... END_GROUP")
+    name, letters, id_field = group.get("MODEL_TYPE"), group.get("MODEL_COMPONENT_ID"), f"{_GROUP}.MODEL_COMPONENT_ID"
+    if not isinstance(name, str) or name not in MODELS:
+        raise source.error(f"{_GROUP}.MODEL_TYPE", _fault(name), ", ".join(MODELS))
+    if not isinstance(letters, list) or not all(isinstance(letter, str) for letter in letters):
+        raise source.error(id_field, _fault(letters), "a list of letters such as (C,A,H,V,O,R)")
+    if len(set(letters)) != len(letters):
+        raise source.error(id_field, f"{letters} repeats a letter", "each letter once")
+    units = group.get("MODEL_COMPONENT_UNIT", ["N/A"] * len(letters))
+    for letter, unit in zip(letters, units, strict=False):
+        if letter in ("C", "E") and str(unit).upper() not in _METRES:
+            raise source.error(f"{_GROUP}.MODEL_COMPONENT_UNIT", f"{unit!r} for {letter}", "METER")
+    vectors: dict[str, list[float]] = {}
+    lens: dict[str, float] = {}
+    for letter in (*name, "T", "P") if name == "CAHVORE" else name:
+        if letter not in letters:
+            if letter in name:
+                raise source.error(id_field, f"has no {letter}", "every letter of the model")
+            continue
+        keyword = f"MODEL_COMPONENT_{letters.index(letter) + 1}"
+        value: Any = group.get(keyword)
+        field = f"{_GROUP}.{keyword} ({letter})"
+        if letter in name:
+            if not isinstance(value, list) or len(value) != 3 or not all(is_number(number) for number in value):
+                raise source.error(field, _fault(value), "three finite numbers")
+            vectors[letter] = [float(number) for number in value]
+        elif not is_number(value):
+            raise source.error(field, _fault(value), "a finite number")
+        else:
+            lens[letter] = float(value)
+    if name != "CAHVORE":
+        return create_camera(name, vectors, size, None, source)
+    linearity = linearity_of_type(lens.get("T"), lens.get("P"), f"{id_field} T, P", source)
+    return create_camera(name, vectors, size, linearity, source)
+
+
+def _fault(value: Any) -> str:
+    return "missing" if value is None else f"{value!r}"
+
+
+def _read_counts(text: str, image: Any, size: tuple[int, int], source: Source) -> UInt16[np.ndarray, "rows columns"]:
+    """Read the picture from the label's file, or from one next to it."""
+    pointer = _POINTER.search(text)
+    if pointer is None:
+        raise source.error("^IMAGE", "missing, or of another form", 'a record, bytes, or ("FILE", record)')
+    name = pointer["detached"] or pointer["alone"]
+    path = Path(source.path)
+    if name is not None:
+        if Path(name).name != name:
+            raise source.error("^IMAGE", f"names {name!r}, a file elsewhere", "a file next to the label")
+        # archives differ in the case of names
+        paths = [path.parent / name, path.parent / name.lower(), path.parent / name.upper()]
+        path = next((one for one in paths if one.exists()), paths[0])
+    offset = int(pointer["at"] or pointer["number"] or 1) - 1
+    if offset > 0 and not (pointer["at_bytes"] or pointer["bytes"]):
+        record = _RECORD.search(text)
+        if record is None:
+            raise source.error("RECORD_BYTES", "missing", "the bytes of a record")
+        offset *= int(record[1])
+    bits, kind = image.get("SAMPLE_BITS"), str(image.get("SAMPLE_TYPE", ""))
+    order = _ORDERS.get(kind.split("_")[0])
+    if bits not in (8, 16) or order is None or not kind.endswith("INTEGER"):
+        raise source.error("IMAGE.SAMPLE_TYPE, SAMPLE_BITS", f"{kind}, {bits}", "integers of 8 or 16 bits")
+    for field, allowed in (("BANDS", 1), ("LINE_PREFIX_BYTES", 0), ("LINE_SUFFIX_BYTES", 0)):
+        if image.get(field, allowed) != allowed:
+            raise source.error(f"IMAGE.{field}", f"{image.get(field)}", f"{allowed}")
+    signed = bits == 16 and "UNSIGNED" not in kind
+    sample = np.dtype(f"{order}{'i' if signed else 'u'}{bits // 8}")
+    columns, rows = size
+    wanted = columns * rows * sample.itemsize
+    try:
+        # at most the file's size: a label may state any size
+        available = max(min(check_regular(path).st_size - offset, wanted), 0)
+        with path.open("rb") as file:
+            file.seek(offset)
+            data = file.read(available)
+    except OSError as fault:
+        raise source.error("^IMAGE", f"{path} cannot be read ({fault.strerror})", "the picture's file") from fault
+    if len(data) < wanted:
+        raise source.error("IMAGE", f"ends after {len(data)} bytes", f"{columns} x {rows} samples of {bits} bits")
+    counts = np.frombuffer(data, dtype=sample).reshape(rows, columns)
+    if signed and counts.min() < 0:
+        raise source.error("IMAGE", f"holds counts down to {counts.min()}", "counts from 0")
+    return counts.astype(np.uint16)
+
+
+def is_xml(head: bytes) -> bool:
+    """Whether the first bytes of a file are XML."""
+    return _XML_START.match(head) is not None
+
+
+def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[CameraModel, ...]:
+    """Read every camera model of a PDS4 label (.xml or .lblx), in order.
+
+    Subframes and averaged pixels in the picture's own processing (not in the command) are refused as by `read_pds3`
+    unless `subframe_folded_in` is set: the vectors then describe the stored picture, as those of Mars 2020 do. Raises
+    CameraFileError as `read_pds3`.
+    """
+    source = Source(str(path))
+    text = source.text()
+    if "<!ENTITY" in text:  # labels need none, and nested entities fill the memory
+        raise source.error("label", "declares entities", "a PDS4 label, which has none")
+    try:
+        root = ElementTree.fromstring(text.encode("latin-1"))  # noqa: S314  (entities are refused above)
+    except (ElementTree.ParseError, ValueError, LookupError) as fault:
+        raise source.error("label", f"cannot be parsed ({fault})", "a PDS4 label, which is XML") from fault
+    models = [one for one in _named(root, _PARAMETERS) if _child(one, "model_type") is not None]
+    if not models:
+        raise source.error(_PARAMETERS, "missing", "a PDS4 label with at least one such class that states a model_type")
+    arrays = _named(root, "Array_2D_Image", "Array_3D_Image")
+    if not arrays:
+        raise source.error("Array_2D_Image", "missing", "an image array of lines and samples")
+    extents = {}
+    for axis in (one for one in arrays[0] if _local(one) == "Axis_Array"):
+        axis_name, count = _text(_child(axis, "axis_name")), _child(axis, "elements")
+        if axis_name in ("Line", "Sample") and count is not None:
+            if not (_text(count).isdecimal() and int(_text(count)) > 0):
+                raise source.error("Axis_Array.elements", f"{_text(count)!r}", "a positive integer")
+            extents[axis_name] = int(_text(count))
+    if set(extents) != {"Line", "Sample"}:
+        raise source.error("Axis_Array", f"names {sorted(extents)}", "the axes Line and Sample")
+    size = extents["Sample"], extents["Line"]
+    parts = [part for imaging in _named(root, "Imaging") for part in imaging]
+    for part in (one for one in parts if _local(one) in ("Subframe", "Downsampling") and not subframe_folded_in):
+        for field in _named(part, "first_line", "first_sample", "height_pixels", "width_pixels"):
+            if _text(field) not in ("", "1"):
+                name = f"{_local(part)}.{_local(field)}"
+                raise source.error(name, f"{_text(field)}: {_SUBFRAME}", "1, or subframe_folded_in = true")
+    return tuple(_pds4_camera(element, size, source) for element in models)
+
+
+def _local(element: ElementTree.Element) -> str:
+    """An element's name without its namespace."""
+    return element.tag.rpartition("}")[2] if isinstance(element.tag, str) else ""
+
+
+def _named(element: ElementTree.Element, *names: str) -> list[ElementTree.Element]:
+    return [one for one in element.iter() if _local(one) in names]
+
+
+def _child(element: ElementTree.Element, name: str) -> ElementTree.Element | None:
+    return next((one for one in element if _local(one) == name), None)
+
+
+def _text(element: ElementTree.Element | None) -> str:
+    return "" if element is None else (element.text or "").strip()
+
+
+def _pds4_camera(element: ElementTree.Element, size: tuple[int, int], source: Source) -> CameraModel:
+    name = _text(_child(element, "model_type"))
+    if name not in MODELS:
+        raise source.error(f"{_PARAMETERS}.model_type", f"{name!r}", ", ".join(MODELS))
+    class_name = f"{name}_Model"
+    model = _child(element, class_name)
+    if model is None:
+        raise source.error(f"{_PARAMETERS}.{class_name}", "missing", "the class that the model_type names")
+    vectors: dict[str, list[float]] = {}
+    for letter in name:
+        vector_name, parts = _VECTORS[letter]
+        vector, field = _child(model, vector_name), f"{class_name}.{vector_name} ({letter})"
+        if vector is None:
+            raise source.error(field, "missing", "every vector of the model")
+        vectors[letter] = []
+        for part in parts:
+            number = _number(vector, part, f"{field}.{part}", source)
+            if number is None:
+                raise source.error(f"{field}.{part}", "missing", "a finite number")
+            unit = getattr(_child(vector, part), "attrib", {}).get("unit")
+            if parts is _POSITION and unit not in _PDS4_METRES:
+                raise source.error(f"{field}.{part}", f"is in {unit!r}", "metres (unit m)")
+            vectors[letter].append(number)
+    if name != "CAHVORE":
+        return create_camera(name, vectors, size, None, source)
+    field = f"{class_name}.cahvore_model_type, cahvore_model_parameter"
+    kind, parameter = (_number(model, f"cahvore_model_{part}", field, source) for part in ("type", "parameter"))
+    return create_camera(name, vectors, size, linearity_of_type(kind, parameter, field, source), source)
+
+
+def _number(element: ElementTree.Element, name: str, field: str, source: Source) -> float | None:
+    """A number of an element; None if missing."""
+    child = _child(element, name)
+    if child is None:
+        return None
+    try:
+        return float(_text(child))
+    except ValueError:
+        raise source.error(field, f"{_text(child)!r} is not a number", "a finite number") from None
