@@ -15,10 +15,8 @@ TIMED_OUT = "TIMED_OUT"
 OUT_OF_MEMORY = "OUT_OF_MEMORY"
 #: The case exceeded its limit of standard output and error.
 TOO_MUCH_OUTPUT = "TOO_MUCH_OUTPUT"
-
 #: The algorithm's answer violated its interface.
 BAD_ANSWER = "BAD_ANSWER"
-
 #: All of them, by the names on the command line.
 RETRYABLE: Mapping[str, str] = {
     "crashed": CRASHED,
@@ -27,7 +25,6 @@ RETRYABLE: Mapping[str, str] = {
     "too-much-output": TOO_MUCH_OUTPUT,
     "bad-answer": BAD_ANSWER,
 }
-
 #: Cases with these outcomes fail requirements on all cases, and cause exit status 1.
 UNFINISHED = frozenset(RETRYABLE.values())
 

@@ -42,12 +42,12 @@ def read_requirements(path: Path) -> tuple[StatedRequirement, ...]:
 
     Raises ConfigurationError where it cannot be read, or is not valid; every problem with its key.
     """
-    stated = read_table(path, _File)
-    ids = [one.id for one in stated.requirements]
+    stated = read_table(path, _File).requirements
+    ids = [one.id for one in stated]
     repeated = sorted({name for name in ids if ids.count(name) > 1})
     if repeated:
         raise ConfigurationError([Problem(str(path), "requirements", f"share an id: {', '.join(repeated)}")])
-    return stated.requirements
+    return stated
 
 
 @cache
@@ -88,12 +88,11 @@ def completed(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[Key
         if not isinstance(entry, Mapping) or "metric" in entry or "id" not in entry:
             filled.append(entry)
             continue
-        named = shipped_requirements().get(str(entry["id"]))
+        shipped, unusable = _read_shipped()
+        named = shipped.get(str(entry["id"]))
         wrong = [key for key in entry if key not in ("id", *_CHANGEABLE)]
         if named is None:
-            message = "; ".join(
-                (not_allowed("requirement", str(entry["id"]), shipped_requirements()), *_read_shipped()[1])
-            )
+            message = "; ".join((not_allowed("requirement", str(entry["id"]), shipped), *unusable))
             problems.append((("requirements", index, "id"), f"{message}; or state a metric"))
         problems += [(("requirements", index, key), "is stated in requirements.toml already") for key in wrong]
         if named is not None and not wrong:

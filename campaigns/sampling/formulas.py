@@ -20,7 +20,6 @@ from marsyard.campaigns.errors import near_match
 
 #: Maximum number of characters.
 MAX_LENGTH = 300
-
 _BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -55,18 +54,21 @@ class Formula:
 
         Raises ValueError where a parameter is not a number, or the result is not finite.
         """
-        numbers = {name: _number(self.text, name, values[name]) for name in self.names}
+        numbers: dict[str, float] = {}
+        for name in self.names:
+            value = values[name]
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise ValueError(f"'{self.text}' uses {name}, which is {value!r} and not a number")
+            numbers[name] = float(value)
+        given = ", ".join(f"{name} = {value:.6g}" for name, value in numbers.items())
+        failure = f"'{self.text}' has no value{' where ' if given else ''}{given}"
         try:
             result = float(_evaluate(self._root, numbers))
         except (ArithmeticError, ValueError) as error:
-            raise ValueError(f"{self._describe_failure(numbers)}: {error}") from error
+            raise ValueError(f"{failure}: {error}") from error
         if not math.isfinite(result):
-            raise ValueError(f"{self._describe_failure(numbers)}: it comes to {result}")
+            raise ValueError(f"{failure}: it comes to {result}")
         return result
-
-    def _describe_failure(self, numbers: Mapping[str, float]) -> str:
-        given = ", ".join(f"{name} = {value:.6g}" for name, value in numbers.items())
-        return f"'{self.text}' has no value{' where ' if given else ''}{given}"
 
 
 @lru_cache(maxsize=1024)
@@ -110,7 +112,6 @@ def _names(node: ast.expr) -> list[str]:
 
 
 def _path(node: ast.expr) -> str:
-    """Dotted path of a parameter."""
     match node:
         case ast.Name(id=name):
             return name
@@ -134,9 +135,3 @@ def _evaluate(node: ast.expr, numbers: Mapping[str, float]) -> float:
             return float(_FUNCTIONS[name][0](*(_evaluate(argument, numbers) for argument in arguments)))
     path = _path(node)
     return _CONSTANTS[path] if path in _CONSTANTS else numbers[path]
-
-
-def _number(text: str, name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"'{text}' uses {name}, which is {value!r} and not a number")
-    return float(value)

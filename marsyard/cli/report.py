@@ -157,9 +157,8 @@ def _rerun_notable_cases(directory: Path) -> None:
     """
     from marsyard.campaigns.execution.workers import LocalExecutor
     from marsyard.campaigns.running.replay import load_stored_campaign, replay_with
-    from marsyard.campaigns.store.products import save_packed
+    from marsyard.campaigns.store.products import case_directory, save_packed
     from marsyard.campaigns.store.record import stored_configuration
-    from marsyard.campaigns.store.retention import case_directory
     from marsyard.campaigns.store.table import stored_row
     from marsyard.reports.cases import notable_cases
     from marsyard.reports.stored import read_run

@@ -19,9 +19,11 @@ approximately as that method.
 
 from __future__ import annotations
 
+import bisect
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float64
@@ -45,12 +47,10 @@ def planned_looks(cases: int) -> tuple[Look, ...]:
     """Looks of a campaign of at most `cases` cases: at the last case, at half of them, a quarter, and so on."""
     if cases < 1:
         raise ValueError(f"{cases} cases; a campaign has at least one")
-    places = [cases]
-    while len(places) < _MAX_LOOKS and places[-1] // 2 >= _MIN_FIRST_CASES:
-        places.append(places[-1] // 2)
-    places.reverse()
-    before = [0, *places[:-1]]
-    return tuple(Look(place, (place - last) / cases) for place, last in zip(places, before, strict=True))
+    sizes = [cases]
+    while len(sizes) < _MAX_LOOKS and sizes[0] // 2 >= _MIN_FIRST_CASES:
+        sizes.insert(0, sizes[0] // 2)
+    return tuple(Look(size, (size - before) / cases) for before, size in pairwise([0, *sizes]))
 
 
 def spent_fraction(looks: tuple[Look, ...], cases: int) -> float:
@@ -110,15 +110,14 @@ class LaterLook:
 
     def cases_needed(self, n: int, events: int) -> int:
         """Total number of cases, at least n, that shows the verdict if no further event happens."""
+
+        def is_shown(cases: int) -> bool:
+            return bool(_log_ratio(events, cases, self.rate) >= self.log_threshold)
+
         enough = max(n, 1)
-        while _log_ratio(events, enough, self.rate) < self.log_threshold:
+        while not is_shown(enough):
             enough *= 2
-        too_few = n - 1
-        while enough - too_few > 1:
-            middle = (enough + too_few) // 2
-            shown = _log_ratio(events, middle, self.rate) >= self.log_threshold
-            too_few, enough = (too_few, middle) if shown else (middle, enough)
-        return enough
+        return n + bisect.bisect_left(range(n, enough), True, key=is_shown)
 
 
 def _log_ratio(
@@ -131,7 +130,6 @@ def _log_ratio(
     """
     events = np.asarray(events, dtype=np.float64)
     likelihood = special.betaln(events + 0.5, n - events + 0.5) - special.betaln(0.5, 0.5)
-    below = special.betainc(events + 0.5, n - events + 0.5, rate) / special.betainc(0.5, 0.5, rate)
     with np.errstate(divide="ignore"):
-        weight = np.log(below)
+        weight = np.log(special.betainc(events + 0.5, n - events + 0.5, rate) / special.betainc(0.5, 0.5, rate))
     return np.asarray(likelihood + weight - events * math.log(rate) - (n - events) * math.log1p(-rate))

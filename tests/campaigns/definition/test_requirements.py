@@ -8,11 +8,7 @@ import pytest
 
 from marsyard.campaigns.definition.catalogue import catalogue
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.definition.requirements import (
-    applicable,
-    read_requirements,
-    shipped_requirements,
-)
+from marsyard.campaigns.definition.requirements import applicable, read_requirements, shipped_requirements
 from marsyard.campaigns.errors import ConfigurationError
 from tests.campaigns.fake_campaign import write_campaign
 

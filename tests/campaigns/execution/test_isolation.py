@@ -25,8 +25,7 @@ import pytest
 
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.cases import unfinished_row
-from marsyard.campaigns.execution.work import Work, WorkLimits
-from marsyard.campaigns.execution.worker_process import TaskResult, request_fresh_worker
+from marsyard.campaigns.execution.worker_process import TaskResult, Work, WorkLimits, request_fresh_worker
 from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.outcomes import CRASHED, TIMED_OUT, CaseEndedError
 

@@ -20,9 +20,8 @@ import pytest
 
 from marsyard.algorithms.processes import used_memory
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.work import MAX_BATCH, Batches, Work, WorkLimits
-from marsyard.campaigns.execution.worker_process import StatusBoard, TaskResult, WorkerStatus
-from marsyard.campaigns.execution.workers import LocalExecutor
+from marsyard.campaigns.execution.worker_process import StatusBoard, TaskResult, Work, WorkLimits
+from marsyard.campaigns.execution.workers import MAX_BATCH, Batches, LocalExecutor
 from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CaseEndedError
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
@@ -204,7 +203,7 @@ def leave(*_: object) -> None:
 
 def test_a_worker_that_cannot_begin_is_an_error_of_the_campaign(monkeypatch: pytest.MonkeyPatch) -> None:
     with LocalExecutor(1) as workers:
-        monkeypatch.setattr("marsyard.campaigns.execution.watched.run_batch", leave)
+        monkeypatch.setattr("marsyard.campaigns.execution.workers.run_batch", leave)
         with pytest.raises(CampaignError, match="worker processes die before they begin a case"):
             list(workers.run(Work(process_number, range(3))))
 
@@ -250,7 +249,7 @@ def test_batches_grow_to_a_second_and_shrink_to_the_end() -> None:
 
 def test_the_board_shows_where_a_worker_stands(tmp_path: Path) -> None:
     board = StatusBoard.create(tmp_path / "board")
-    assert board.read().item is None
-    StatusBoard(tmp_path / "board").write(WorkerStatus(2**40, 1.5))
-    assert board.read() == WorkerStatus(2**40, 1.5)
+    assert board.read()[0] is None
+    StatusBoard(tmp_path / "board").write(2**40, 1.5)
+    assert board.read() == (2**40, 1.5)
     board.close()

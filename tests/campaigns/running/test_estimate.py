@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.running.estimate import estimate
+from marsyard.campaigns.running.preparation import estimate
 
 CampaignFile = Callable[..., Path]
 

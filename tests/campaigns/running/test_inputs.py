@@ -12,8 +12,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import append_cases
-from marsyard.campaigns.running.estimate import estimate
-from marsyard.campaigns.running.inputs import plan_inputs, used_inputs
+from marsyard.campaigns.running.preparation import estimate, plan_inputs, used_inputs
 from marsyard.scenarios.interface import SelectsInputs
 from marsyard.scenarios.registry import scenario, scenario_names
 from tests.campaigns.fake_campaign import HEAD, Silence, rows_of, run

@@ -13,7 +13,7 @@ from scipy import stats
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
-from marsyard.campaigns.sampling.correlation import Correlation
+from marsyard.campaigns.sampling.design import Correlation
 
 CampaignFile = Callable[..., Path]
 CASES = 4000

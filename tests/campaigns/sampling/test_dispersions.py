@@ -15,9 +15,8 @@ from pydantic import TypeAdapter, ValidationError
 from scipy import stats
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.sampling.dispersion import TAIL, Dispersion
+from marsyard.campaigns.sampling.dispersion import TAIL, Dispersion, scipy_distributions, scipy_parameters
 from marsyard.campaigns.sampling.dispersions import AnyDispersion
-from marsyard.campaigns.sampling.shapes import scipy_distributions, scipy_parameters
 from marsyard.sim.streams import Streams
 
 CampaignFile = Callable[..., Path]

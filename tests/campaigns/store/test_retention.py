@@ -15,8 +15,7 @@ from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.products import load_products
-from marsyard.campaigns.store.retention import fails
+from marsyard.campaigns.store.products import fails, load_products
 from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import showcase_case, worst_cases, write_table
 from tests.campaigns.fake_campaign import Silence, rows_of, run
@@ -62,11 +61,11 @@ def test_which_case_is_shown(campaign_file: CampaignFile, tmp_path: Path) -> Non
         store.add(rows[2:])
         write_table(table, store)
         assert [showcase_case(asked, table, store) for asked in (worst, first, none, unasked)] == [3, 1, None, 1]
-    assert [worst_cases(asked, table) for asked in (worst, unasked)] == [[3, 2], []]
+    assert [worst_cases(asked, table, asked.retain.worst) for asked in (worst, unasked)] == [[3, 2], []]
     # a requirement on a sum of columns, which are times, makes no case the worst
     summed = 'id = "T"\nmetric = "a_time_s + b_time_s"\nbound = 2.0\nprobability = 0.9\nconfidence = 0.9\n'
     times = load_campaign(str(campaign_file(requirement=f"[[requirements]]\n{summed}"))).configuration
-    assert worst_cases(times, table) == []
+    assert worst_cases(times, table, 2) == []
 
 
 def test_products_that_cannot_be_kept_stop_nothing(campaign_file: CampaignFile, tmp_path: Path, watch: Silence) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from marsyard.reports.statistics.plane import ErrorEllipse, circular_error, error_ellipse
+from marsyard.reports.statistics.samples import ErrorEllipse, circular_error, error_ellipse
 
 
 def _turned(rng: np.random.Generator, n: int) -> np.ndarray:
