@@ -19,11 +19,8 @@ TOO_MUCH_OUTPUT = "TOO_MUCH_OUTPUT"
 BAD_ANSWER = "BAD_ANSWER"
 #: All of them, by the names on the command line.
 RETRYABLE: Mapping[str, str] = {
-    "crashed": CRASHED,
-    "timed-out": TIMED_OUT,
-    "out-of-memory": OUT_OF_MEMORY,
-    "too-much-output": TOO_MUCH_OUTPUT,
-    "bad-answer": BAD_ANSWER,
+    outcome.lower().replace("_", "-"): outcome
+    for outcome in (CRASHED, TIMED_OUT, OUT_OF_MEMORY, TOO_MUCH_OUTPUT, BAD_ANSWER)
 }
 #: Cases with these outcomes fail requirements on all cases, and cause exit status 1.
 UNFINISHED = frozenset(RETRYABLE.values())

@@ -15,8 +15,8 @@ from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.sampling.design import (
     MIN_DRAW,
     build_stratified_design,
+    compute_grid_probabilities,
     correlate_uniform,
-    grid_probabilities,
     locate_case,
 )
 from marsyard.campaigns.sampling.dispersion import Dispersion
@@ -57,7 +57,7 @@ class Campaign:
                 values[path] = value_at(parameters, path)
                 continue
             named = {name: values[name] if name in values else value_at(parameters, name) for name in dispersion.names}
-            given = dispersion.given(named)
+            given = dispersion.insert_values(named)
             if isinstance(given, InTurn):
                 values[path] = given.value(case)
             else:
@@ -85,7 +85,7 @@ class Campaign:
             design = build_stratified_design(stated.design.kind, stated.seed, stated.name, first, size, paths, groups)
             drawn = dict(zip(paths, design[index].tolist(), strict=True))
         grids = {path: len(grid.points) for path, grid in stated.grids.items()}
-        return {**drawn, **grid_probabilities(grids, grid_point)}
+        return {**drawn, **compute_grid_probabilities(grids, grid_point)}
 
     @cached_property
     def marginals(self) -> Mapping[str, Dispersion]:
@@ -130,19 +130,19 @@ class Campaign:
         """Campaign's parameters with other values at some paths."""
         tree: Any = self.configuration.parameters
         for path, value in values.items():
-            tree = replaced(tree, path.split("."), value)
+            tree = replace_value(tree, path.split("."), value)
         return self.scenario.parameters_type.model_validate(tree)
 
 
-def replaced(tree: Any, path: Sequence[str], value: Any) -> Any:
+def replace_value(tree: Any, path: Sequence[str], value: Any) -> Any:
     """Copy nested tables and lists with another value at a path."""
     if not path:
         return value
     head, *rest = path
     if isinstance(tree, list):
         index = int(head)
-        return [*tree[:index], replaced(tree[index], rest, value), *tree[index + 1 :]]
-    return {**tree, head: replaced(tree[head], rest, value)}
+        return [*tree[:index], replace_value(tree[index], rest, value), *tree[index + 1 :]]
+    return {**tree, head: replace_value(tree[head], rest, value)}
 
 
 def value_at(tree: Any, path: str) -> Any:

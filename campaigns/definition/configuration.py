@@ -89,7 +89,7 @@ class Retain(Parameters):
     products: Literal["none", "failed", "worst", "every", "all"] = Field(
         default="none",
         description="of no case except the showcase, of those that fail a requirement, of the `worst` by the metric of "
-        "the first requirement with a bound, of `every` so manieth, or of all",
+        "the first requirement with a bound, of every `every`-th case, or of all",
     )
     worst: _Count = 10
     every: _Count = 100
@@ -105,7 +105,7 @@ class Limits(Parameters):
     prepare_time_s: _Amount = Field(default=3600.0, description="wall-clock time of building a shared input")
     memory_gb: _Amount | None = Field(
         default=None,
-        description="memory that a worker has to itself; by default a share of 80 % of what is free at the start",
+        description="memory that a worker has to itself; by default an equal fraction of 80 % of the free memory",
     )
     output_mb: _Amount = Field(default=10.0, description="what a case may write to standard output and error")
 
@@ -162,16 +162,16 @@ class CampaignConfiguration(Parameters):
         """Sizes of the blocks of cases, the first before the appended ones."""
         return (self.cases, *self.appended)
 
-    def sampling_problems(self) -> list[tuple[Key, str]]:
+    def find_sampling_problems(self) -> list[tuple[Key, str]]:
         """Problems of the design, the correlated groups and their dispersions: keys and messages."""
         problems: list[tuple[Key, str]] = []
-        if (problem := self.design.problem(self.blocks, self.grid_size)) is not None:
+        if (problem := self.design.find_problem(self.blocks, self.grid_size)) is not None:
             block, message = problem
             problems.append((("appended", block - 1) if block else ("cases",), message))
         grouped: dict[str, int] = {}
         for number, group in enumerate(self.correlations):
             for index, path in enumerate(group.parameters):
-                wrong = self._member_problem(group, path)
+                wrong = self._check_member(group, path)
                 if path in grouped:
                     wrong = f"'{path}' is in correlations[{grouped[path]}] already"
                 if wrong:
@@ -186,7 +186,7 @@ class CampaignConfiguration(Parameters):
                 problems.append((("dispersions", path), f"lies within '{inside}', which is dispersed as a whole"))
         return problems
 
-    def _member_problem(self, group: Correlation, path: str) -> str:
+    def _check_member(self, group: Correlation, path: str) -> str:
         """Reason why a dispersion cannot be correlated; empty if it can."""
         dispersion = self.dispersions.get(path)
         if dispersion is None:
@@ -230,7 +230,7 @@ def problems_of(error: ValidationError, model: type[BaseModel]) -> list[tuple[Ke
     for detail in error.errors(include_url=False):
         location, given, message = detail["loc"], detail["input"], str(detail["msg"])
         if detail["type"] == "extra_forbidden":
-            below = _models(reduce(_inner, location[:-1], model))
+            below = _list_models(reduce(_find_inner_type, location[:-1], model))
             allowed = sorted({name for kind in below for name in kind.model_fields})
             message = f"unknown key{near_match(str(location[-1]), allowed)}; allowed: {', '.join(allowed)}"
         elif detail["type"] == "missing":
@@ -244,9 +244,9 @@ def problems_of(error: ValidationError, model: type[BaseModel]) -> list[tuple[Ke
         node: Any = model
         for part in location:
             # pydantic adds the names of alternative models
-            if not any(kind.__name__ == part for kind in _models(node)):
+            if not any(kind.__name__ == part for kind in _list_models(node)):
                 key = (*key, part)
-            node = _inner(node, part)
+            node = _find_inner_type(node, part)
         if model is CampaignConfiguration and len(location) > 2 and location[0] == "dispersions":
             key = (*location[:2], *location[3:])
         problems.append((key, message))
@@ -268,14 +268,14 @@ def key_text(key: Iterable[str | int]) -> str:
 def description_at(model: type[BaseModel], path: str) -> str:
     """Description of a model's field at a dotted path; empty where it has none."""
     *tables, name = path.split(".")
-    below = _models(reduce(_inner, (int(part) if part.isdigit() else part for part in tables), model))
+    below = _list_models(reduce(_find_inner_type, (int(part) if part.isdigit() else part for part in tables), model))
     return next((kind.model_fields[name].description or "" for kind in below if name in kind.model_fields), "")
 
 
-def _inner(kind: Any, part: str | int) -> Any:
+def _find_inner_type(kind: Any, part: str | int) -> Any:
     """Type below one part of a location."""
     types_below: list[Any] = []
-    for choice in _alternatives(kind):
+    for choice in _list_alternatives(kind):
         if isinstance(choice, type) and issubclass(choice, BaseModel):
             if part in choice.model_fields:
                 types_below.append(choice.model_fields[str(part)].annotation)
@@ -288,16 +288,16 @@ def _inner(kind: Any, part: str | int) -> Any:
     return Union[tuple(types_below)] if types_below else None  # noqa: UP007
 
 
-def _models(kind: Any) -> list[type[BaseModel]]:
+def _list_models(kind: Any) -> list[type[BaseModel]]:
     """Models among the alternatives of a type."""
-    return [one for one in _alternatives(kind) if isinstance(one, type) and issubclass(one, BaseModel)]
+    return [one for one in _list_alternatives(kind) if isinstance(one, type) and issubclass(one, BaseModel)]
 
 
-def _alternatives(kind: Any) -> list[Any]:
+def _list_alternatives(kind: Any) -> list[Any]:
     """Members of a union, through annotations."""
     origin = get_origin(kind)
     if origin is Annotated:
-        return _alternatives(get_args(kind)[0])
+        return _list_alternatives(get_args(kind)[0])
     if origin in (Union, types.UnionType):
-        return [inner for choice in get_args(kind) for inner in _alternatives(choice)]
+        return [inner for choice in get_args(kind) for inner in _list_alternatives(choice)]
     return [kind]

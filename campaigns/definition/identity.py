@@ -1,4 +1,4 @@
-"""Identity of a campaign: hashes and versions of everything besides the case number on which its rows depend.
+"""Identity of a campaign: hashes and versions of everything except the case number on which its rows depend.
 
 The record also describes the algorithms under test: class, version, options, and a hash of the sources.
 """
@@ -76,12 +76,12 @@ def identity_of(configuration: CampaignConfiguration) -> Identity:
 
     Raises CampaignError where a file that the parameters name cannot be used any more.
     """
-    custom = (*selected_algorithms(configuration), *selected_parts(configuration))
-    code = code_hash((scenario_source(configuration.scenario), *custom))
-    return Identity(configuration_hash(configuration), code, package_versions(), input_hashes(configuration))
+    custom = (*list_algorithms(configuration), *list_parts(configuration))
+    code = hash_code((scenario_source(configuration.scenario), *custom))
+    return Identity(configuration_hash(configuration), code, read_versions(), hash_inputs(configuration))
 
 
-def input_hashes(configuration: CampaignConfiguration) -> dict[str, str]:
+def hash_inputs(configuration: CampaignConfiguration) -> dict[str, str]:
     """SHA-256 of each file that the parameters or their dispersions name, by path.
 
     Raises CampaignError where the scenario refuses the parameters, for example because a file is missing or has
@@ -107,7 +107,7 @@ def input_hashes(configuration: CampaignConfiguration) -> dict[str, str]:
     return hashes
 
 
-def selected_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
+def list_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
     """Algorithms under test that a configuration or its dispersions name."""
     used = _scenario(configuration)
     if not isinstance(used, HasAlgorithms):
@@ -119,7 +119,7 @@ def selected_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]
     return tuple(dict.fromkeys(str(spec) for spec in stated if spec))
 
 
-def selected_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
+def list_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
     """Import paths (``module:name``) of the custom parts that a configuration or its dispersions name."""
     used = _scenario(configuration)
     if not isinstance(used, HasParts):
@@ -154,7 +154,7 @@ def configuration_hash(configuration: CampaignConfiguration) -> str:
 
 
 @cache
-def code_hash(named: tuple[str, ...]) -> str:
+def hash_code(named: tuple[str, ...]) -> str:
     """Hash of the sources on which rows depend; `named` are the scenario, algorithms and parts."""
     sources: list[tuple[str, Path]] = []
     for folder in _CODE:
@@ -189,7 +189,7 @@ def custom_sources(named: str) -> Iterator[tuple[str, Path]]:
         yield from ((path.name, path) for path in words if path.is_file())
 
 
-def package_versions() -> dict[str, str]:
+def read_versions() -> dict[str, str]:
     """Versions of Python, of Marsyard and of the packages that it requires."""
     try:
         requirements = metadata.requires("marsyard") or []
@@ -223,16 +223,14 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
     for name in tested.algorithm_table:
         parameters = getattr(parameters, name)
     described = []
-    for spec in selected_algorithms(campaign.configuration):
+    for spec in list_algorithms(campaign.configuration):
         shipped = spec in tested.task.shipped
         sources = list(source_files("algorithms:") if shipped else custom_sources(spec))
         if shipped:
             stated = (value for _, value in parameters if isinstance(value, tested.task.options))
             algorithm = tested.task.shipped[spec](next(stated, tested.task.options()))
-            path, version = (
-                f"{type(algorithm).__module__}:{type(algorithm).__qualname__}",
-                _distribution_version("marsyard"),
-            )
+            kind, version = type(algorithm), _distribution_version("marsyard")
+            path = f"{kind.__module__}:{kind.__qualname__}"
             options = _plain_options(getattr(algorithm, "options", None))
         else:
             path, version, options = _describe_custom(spec)
@@ -269,9 +267,7 @@ def _plain_options(options: object) -> dict[str, Any]:
             options = options.model_dump(mode="json")
         elif is_dataclass(options) and not isinstance(options, type):
             options = asdict(options)
-        if not isinstance(options, Mapping):
-            return {}
-        plain: dict[str, Any] = json.loads(json.dumps({str(key): value for key, value in options.items()}, default=str))
+        stated = {str(key): value for key, value in options.items()} if isinstance(options, Mapping) else {}
+        return dict(json.loads(json.dumps(stated, default=str)))
     except Exception:  # custom values may raise anything, and the record must not stop a campaign
         return {}
-    return plain

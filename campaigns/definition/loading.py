@@ -27,8 +27,8 @@ from marsyard.campaigns.definition.configuration import (
     problems_of,
     read_tables,
 )
-from marsyard.campaigns.definition.identity import selected_algorithms
-from marsyard.campaigns.definition.requirements import completed
+from marsyard.campaigns.definition.identity import list_algorithms
+from marsyard.campaigns.definition.requirements import fill_requirements
 from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
 from marsyard.campaigns.sampling.design import MATRICES
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
@@ -126,7 +126,7 @@ def _select_algorithms(
     """Tables with other algorithms; unchanged for an unknown scenario, which is reported later."""
     options = [f"--algorithm {spec}" for spec in algorithms]
     try:
-        selected = _named_scenario(tables)
+        selected = _find_scenario(tables)
     except UnknownScenarioError:
         selected = None
     if selected is None:
@@ -145,7 +145,7 @@ def _select_algorithms(
     return tables
 
 
-def _named_scenario(tables: Mapping[str, Any]) -> Scenario | None:
+def _find_scenario(tables: Mapping[str, Any]) -> Scenario | None:
     """Scenario of a campaign's tables; None where they name none. Raises UnknownScenarioError."""
     name = tables.get("scenario")
     return scenario(name) if isinstance(name, str) and name else None
@@ -156,7 +156,7 @@ def _apply_option(
 ) -> dict[str, Any]:
     """Tables merged with those of an option; parameters that it sets are no longer dispersed."""
     merged = _merge(tables, stated)
-    paths = _paths_set(stated)
+    paths = _list_paths(stated)
     overridden.update(dict.fromkeys(paths, option))
     fixed = [".".join(path[1:]) for path in paths if path[0] == "parameters"]
     dispersions = merged.get("dispersions")
@@ -168,12 +168,12 @@ def _apply_option(
         }
         merged["dispersions"] = {path: one for path, one in dispersions.items() if path not in removed}
         if removed and isinstance(merged.get("correlations"), list):
-            groups = [_without_members(group, removed) for group in merged["correlations"]]
+            groups = [_remove_members(group, removed) for group in merged["correlations"]]
             merged["correlations"] = [group for group in groups if group != {}]
     return merged
 
 
-def _without_members(group: Any, removed: set[str]) -> Any:
+def _remove_members(group: Any, removed: set[str]) -> Any:
     """Correlated group without removed dispersions; empty where none is left; unchanged where it is not valid."""
     names = group.get("parameters") if isinstance(group, Mapping) else None
     if not isinstance(names, list):
@@ -186,11 +186,11 @@ def _without_members(group: Any, removed: set[str]) -> Any:
     return {**group, "parameters": [names[index] for index in kept], **matrices} if kept else {}
 
 
-def _paths_set(tables: Mapping[str, Any]) -> list[tuple[str, ...]]:
+def _list_paths(tables: Mapping[str, Any]) -> list[tuple[str, ...]]:
     paths: list[tuple[str, ...]] = []
     for name, inner in tables.items():
         nested = isinstance(inner, Mapping) and inner
-        paths += [(name, *path) for path in _paths_set(inner)] if nested else [(name,)]
+        paths += [(name, *path) for path in _list_paths(inner)] if nested else [(name,)]
     return paths
 
 
@@ -224,13 +224,13 @@ def _validate(where: str, tables: Mapping[str, Any], overridden: Mapping[tuple[s
             note(problems_of(error, model), prefix)
             return None
 
-    tables, unresolved = completed(tables)
+    tables, unresolved = fill_requirements(tables)
     note(unresolved)
     if problems:
         raise ConfigurationError(problems)
     configuration, selected, parameters = validated(CampaignConfiguration, tables), None, None
     try:
-        selected = _named_scenario(tables)
+        selected = _find_scenario(tables)
     except UnknownScenarioError as error:
         note([(("scenario",), str(error))])
     stated = tables.get("parameters", {})
@@ -240,28 +240,28 @@ def _validate(where: str, tables: Mapping[str, Any], overridden: Mapping[tuple[s
         raise ConfigurationError(problems)
     complete = parameters.model_dump(mode="json", round_trip=True)
     campaign = Campaign(configuration.model_copy(update={"parameters": complete}), selected)
-    note([*_sampling_problems(campaign), *_metric_problems(campaign)])
+    note([*_check_sampling(campaign), *_check_metrics(campaign)])
     if problems:
         raise ConfigurationError(problems)
     return campaign
 
 
-def _sampling_problems(campaign: Campaign) -> list[tuple[Key, str]]:
+def _check_sampling(campaign: Campaign) -> list[tuple[Key, str]]:
     """Problems of the campaign's dispersions: keys, and messages with the allowed values."""
-    problems = [*campaign.configuration.sampling_problems(), *_name_problems(campaign)] or _range_problems(campaign)
+    problems = [*campaign.configuration.find_sampling_problems(), *_check_names(campaign)] or _check_ranges(campaign)
     if problems or not campaign.configuration.dispersions:
         return problems
     for case in range(min(campaign.configuration.cases, _CHECKED_CASES)):
         try:
-            refused = _refusal(campaign, campaign.draws(case))
+            refused = _find_refusal(campaign, campaign.draws(case))
         except ValueError as error:
-            refused = _plain_message(error)
+            refused = _extract_message(error)
         if refused:
             return [(("dispersions",), f"the draws of case {case} are refused together: {refused}")]
     return []
 
 
-def _name_problems(campaign: Campaign) -> list[tuple[Key, str]]:
+def _check_names(campaign: Campaign) -> list[tuple[Key, str]]:
     """Unknown parameters that dispersions or formulas name, and cycles of formulas."""
     parameters = dict(leaves(campaign.configuration.parameters))
     dispersions = campaign.configuration.dispersions
@@ -271,7 +271,7 @@ def _name_problems(campaign: Campaign) -> list[tuple[Key, str]]:
             isinstance(dispersion, Grid) and dispersion.values is not None
         )
         if path not in parameters and not any(leaf.startswith(f"{path}.") for leaf in parameters):
-            problems.append((("dispersions", path), _unknown_parameter(path, parameters)))
+            problems.append((("dispersions", path), _describe_unknown(path, parameters)))
         elif path not in parameters and not takes_tables:
             message = "is a table; disperse one of its values, or choose between tables"
             problems.append((("dispersions", path), message))
@@ -280,7 +280,7 @@ def _name_problems(campaign: Campaign) -> list[tuple[Key, str]]:
             if parent is not None:
                 message = f"'{name}' lies within '{parent}', which is dispersed as a whole"
             else:
-                message = "" if name in parameters else _unknown_parameter(name, parameters)
+                message = "" if name in parameters else _describe_unknown(name, parameters)
             problems += [(("dispersions", path, *key), message)] if message else []
     if not problems:
         try:
@@ -290,7 +290,7 @@ def _name_problems(campaign: Campaign) -> list[tuple[Key, str]]:
     return problems
 
 
-def _unknown_parameter(path: str, parameters: Iterable[str]) -> str:
+def _describe_unknown(path: str, parameters: Iterable[str]) -> str:
     """Message that lists the parameters in the innermost existing table of a path; its subtables by name only."""
     allowed = names = list(parameters)
     table = path
@@ -304,7 +304,7 @@ def _unknown_parameter(path: str, parameters: Iterable[str]) -> str:
     return not_allowed("parameter", path, names, allowed)
 
 
-def _range_problems(campaign: Campaign) -> list[tuple[Key, str]]:
+def _check_ranges(campaign: Campaign) -> list[tuple[Key, str]]:
     """Values that a parameter refuses, and formulas without a value, at the extremes of the dispersions."""
     problems: list[tuple[Key, str]] = []
     extremes: dict[str, list[Any]] = {}
@@ -314,7 +314,7 @@ def _range_problems(campaign: Campaign) -> list[tuple[Key, str]]:
         try:
             values = _check_extremes(campaign, path, extremes)
         except ValueError as error:
-            problems.append((("dispersions", path), _plain_message(error)))
+            problems.append((("dispersions", path), _extract_message(error)))
             continue
         numbers = [value for value in values if isinstance(value, int | float) and not isinstance(value, bool)]
         all_numbers = len(numbers) == len(values)
@@ -335,9 +335,9 @@ def _check_extremes(campaign: Campaign, path: str, extremes: Mapping[str, list[A
     checked: list[Any] = []
     for corner in itertools.product(*(extremes[name] for name in varying)):
         values = dict(zip(varying, corner, strict=True))
-        given = dispersion.given({**fixed, **values})
+        given = dispersion.insert_values({**fixed, **values})
         for value in given.extremes():
-            refused = _refusal(campaign, {**values, path: value})
+            refused = _find_refusal(campaign, {**values, path: value})
             if refused:
                 where = "".join(f" where {name} = {one}" for name, one in values.items())
                 text = f"{given.describe()} reaches {value!r}{where}, which the parameter does not take: {refused}"
@@ -346,7 +346,7 @@ def _check_extremes(campaign: Campaign, path: str, extremes: Mapping[str, list[A
     return checked
 
 
-def _refusal(campaign: Campaign, values: Mapping[str, Any]) -> str:
+def _find_refusal(campaign: Campaign, values: Mapping[str, Any]) -> str:
     """Reason why the scenario refuses its parameters with these values; empty where it accepts them."""
     infinite = [path for path, value in values.items() if isinstance(value, float) and not math.isfinite(value)]
     if infinite:
@@ -359,34 +359,34 @@ def _refusal(campaign: Campaign, values: Mapping[str, Any]) -> str:
     return ""
 
 
-def _plain_message(error: ValueError) -> str:
+def _extract_message(error: ValueError) -> str:
     if isinstance(error, ValidationError):
         return "; ".join(str(detail["msg"]).removeprefix("Value error, ") for detail in error.errors())
     return str(error)
 
 
-def _metric_problems(campaign: Campaign) -> list[tuple[Key, str]]:
+def _check_metrics(campaign: Campaign) -> list[tuple[Key, str]]:
     """Columns that requirements name and the scenario does not state: keys, and messages with the allowed columns.
 
     Columns of custom scores are accepted by their prefix. Columns of a custom scenario are unknown here: its first
     finished case is checked instead (`marsyard.campaigns.running.engine.check_metrics`).
     """
     try:
-        columns = _stated_columns(campaign)
+        columns = _collect_columns(campaign)
     except ValueError as error:
         return [(("scenario",), str(error))]
     if columns is None:
         return []
-    compared = labels(selected_algorithms(campaign.configuration))[1:]
+    compared = labels(list_algorithms(campaign.configuration))[1:]
 
     def is_known(name: str, kind: str) -> bool:
         unlabelled = next((name.removeprefix(f"{one}.") for one in compared if name.startswith(f"{one}.")), name)
         return columns.has_number(unlabelled) if kind == NUMBERS else columns.has_flag(unlabelled)
 
-    return unknown_columns(campaign.configuration.requirements, columns.flags, columns.numbers, is_known)
+    return find_unknown_columns(campaign.configuration.requirements, columns.flags, columns.numbers, is_known)
 
 
-def unknown_columns(
+def find_unknown_columns(
     requirements: Sequence[Requirement],
     flags: Sequence[str],
     numbers: Sequence[str],
@@ -404,7 +404,7 @@ def unknown_columns(
     return problems
 
 
-def _stated_columns(campaign: Campaign) -> RowColumns | None:
+def _collect_columns(campaign: Campaign) -> RowColumns | None:
     """Columns of the scenario and of the campaign's parameters; None where they are not known."""
     configuration = campaign.configuration
     stated = row_columns(configuration.scenario)

@@ -69,12 +69,12 @@ def _read_shipped() -> tuple[Mapping[str, StatedRequirement], tuple[str, ...]]:
     return found, tuple(problems)
 
 
-def applicable(stated: Sequence[StatedRequirement], campaign: str) -> list[dict[str, Any]]:
+def select_applicable(stated: Sequence[StatedRequirement], campaign: str) -> list[dict[str, Any]]:
     """Requirements that a campaign of that name verifies, as campaigns state them."""
     return [one.plain() for one in stated if one.applies_to(campaign)]
 
 
-def completed(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[Key, str]]]:
+def fill_requirements(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[Key, str]]]:
     """Tables of a campaign with its named requirements filled in, and the problems of the names.
 
     An entry without a metric names a requirement by its `id`, and may change the keys in `_CHANGEABLE`.

@@ -50,7 +50,7 @@ def configuration_text(configuration: CampaignConfiguration) -> str:
 
 
 @lru_cache(maxsize=1)
-def _campaign(configuration: str) -> Campaign:
+def _load_campaign(configuration: str) -> Campaign:
     """Campaign of a configuration, cached since loading takes time."""
     worker_process.start_clock(grace_s=worker_process.LOADING_S)
     stated = CampaignConfiguration.model_validate_json(configuration)
@@ -71,19 +71,19 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
     conditions: dict[str, Scalar] = {}
 
     def record(columns: Mapping[str, Scalar]) -> None:
-        conditions.update(_scenario_columns(columns))
+        conditions.update(_convert_columns(columns))
         worker_process.leave_note(json.dumps({"case": case, "conditions": conditions}))
 
     try:
-        campaign = _campaign(configuration)
+        campaign = _load_campaign(configuration)
         wall, cpu = time.perf_counter(), time.process_time()
         with conditions_recorded_by(record):
             result = campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
-        row = _finished_row(case, result, campaign.configuration.requirements)
+        row = _build_finished_row(case, result, campaign.configuration.requirements)
         products = result.products
     except BaseException as error:
         outcome = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
-        row = unfinished_row(case, outcome, describe_error(error), traceback.format_exc(), conditions)
+        row = make_unfinished_row(case, outcome, describe_error(error), traceback.format_exc(), conditions)
     row = {**row, "wall_time_s": time.perf_counter() - wall, "cpu_time_s": time.process_time() - cpu}
     if row["outcome"] in (CRASHED, OUT_OF_MEMORY):
         worker_process.request_fresh_worker()
@@ -97,7 +97,7 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
 
 def prepare_input(configuration: str, shared_input: int) -> str:
     """Build or verify one input that cases share; return the warnings of the cache, empty if there are none."""
-    campaign = _campaign(configuration)
+    campaign = _load_campaign(configuration)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CacheWarning)
         campaign.scenario.prepare(campaign.base_parameters(), shared_input)
@@ -120,7 +120,7 @@ def run_cases(
         completed = []
         for done in ended:
             times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}
-            one = done.result or CompletedCase({**_lost_row(done.item, done.error), **times})
+            one = done.result or CompletedCase({**_build_lost_row(done.item, done.error), **times})
             note = "; ".join(filter(None, (one.note, *_describe_changes(done, noted))))
             completed.append(replace(one, note=note))
         yield completed
@@ -132,10 +132,10 @@ def work_limits(limits: Limits, time_s: float) -> WorkLimits:
     return WorkLimits(time_s, memory, limits.output_mb * 1e6)
 
 
-def _lost_row(case: int, error: Exception | None) -> Row:
+def _build_lost_row(case: int, error: Exception | None) -> Row:
     """Row of a case that did not return, with the conditions that it recorded before its process ended."""
     if not isinstance(error, CaseEndedError):
-        return unfinished_row(case, CRASHED, describe_error(error), "")
+        return make_unfinished_row(case, CRASHED, describe_error(error), "")
     trace, conditions = error.trace, {}
     lines = trace.splitlines()
     call = next((index for index, line in enumerate(lines) if line.endswith(" in run_case")), None)
@@ -146,11 +146,11 @@ def _lost_row(case: int, error: Exception | None) -> Row:
     # the process may have ended while writing, and other code may have written there
     with suppress(ValueError, TypeError, LookupError, AttributeError, RecursionError):
         left = json.loads(error.note)
-        conditions = _scenario_columns(left["conditions"]) if left["case"] == case else {}
-    return unfinished_row(case, error.outcome, str(error), trace, conditions)
+        conditions = _convert_columns(left["conditions"]) if left["case"] == case else {}
+    return make_unfinished_row(case, error.outcome, str(error), trace, conditions)
 
 
-def unfinished_row(
+def make_unfinished_row(
     case: int, outcome: str, error: str, trace: str, conditions: Mapping[str, Scalar] | None = None
 ) -> Row:
     """Row of an unfinished case, with the conditions that it had recorded."""
@@ -159,21 +159,21 @@ def unfinished_row(
         "outcome": outcome,
         "answered": False,
         **(conditions or {}),
-        "error": _plain_text(error),
-        "traceback": _plain_text(trace),
+        "error": _clean_text(error),
+        "traceback": _clean_text(trace),
     }
 
 
-def _plain_text(text: str) -> str:
+def _clean_text(text: str) -> str:
     """Text in UTF-8, shortened, without object addresses, which change from run to run."""
     if len(text) > _MAX_TEXT:
         half = _MAX_TEXT // 2
         text = f"{text[:half]}\n... {len(text) - 2 * half} characters left out ...\n{text[-half:]}"
     text = re.sub(r"\b0x[0-9a-fA-F]{4,}\b", "0x...", text)
-    return _utf8(text)
+    return _replace_surrogates(text)
 
 
-def _finished_row(case: int, result: CaseResult, requirements: Sequence[Requirement]) -> Row:
+def _build_finished_row(case: int, result: CaseResult, requirements: Sequence[Requirement]) -> Row:
     """Row of a finished case, in plain Python values.
 
     Raises TypeError or ValueError where a column cannot be stored, or a metric or population column has another type in
@@ -182,7 +182,7 @@ def _finished_row(case: int, result: CaseResult, requirements: Sequence[Requirem
     failure = result.failure
     if (result.outcome in UNFINISHED) != (failure is not None):
         raise ValueError(f"the outcome {result.outcome} is kept for cases that do not come to an end")
-    columns = _scenario_columns(result.row)
+    columns = _convert_columns(result.row)
     for asked in requirements:
         for name in (*asked.population_columns, *(asked.metric_columns if asked.bound is None else ())):
             if type(columns.get(name, True)) is not bool:
@@ -190,12 +190,12 @@ def _finished_row(case: int, result: CaseResult, requirements: Sequence[Requirem
         for name in () if asked.bound is None else asked.metric_columns:
             if type(columns.get(name, 0.0)) is str:
                 raise TypeError(f"column {name} holds {columns[name]!r:.100}; {asked.id} needs a number")
-    error, trace = ("", "") if failure is None else (_plain_text(failure.error), _plain_text(failure.trace))
-    head: Row = {"case": case, "outcome": _utf8(str(result.outcome)), "answered": bool(result.answered)}
+    error, trace = ("", "") if failure is None else (_clean_text(failure.error), _clean_text(failure.trace))
+    head: Row = {"case": case, "outcome": _replace_surrogates(str(result.outcome)), "answered": bool(result.answered)}
     return {**head, **columns, "error": error, "traceback": trace}
 
 
-def _scenario_columns(row: Mapping[str, Any]) -> dict[str, Scalar]:
+def _convert_columns(row: Mapping[str, Any]) -> dict[str, Scalar]:
     """Columns of a scenario in plain Python values; NumPy scalars are unwrapped.
 
     Raises ValueError or TypeError where they cannot be stored.
@@ -211,11 +211,11 @@ def _scenario_columns(row: Mapping[str, Any]) -> dict[str, Scalar]:
         if type(plain) is int and plain.bit_length() > _MAX_INT_BITS:
             bits = plain.bit_length()
             raise ValueError(f"column {name} holds an integer of {bits} bits, beyond what a float can hold")
-        columns[_utf8(str(name))] = _utf8(plain) if isinstance(plain, str) else plain
+        columns[_replace_surrogates(str(name))] = _replace_surrogates(plain) if isinstance(plain, str) else plain
     return columns
 
 
-def _utf8(text: str) -> str:
+def _replace_surrogates(text: str) -> str:
     """Text without lone surrogates."""
     return text.encode("utf-8", errors="replace").decode("utf-8")
 

@@ -19,7 +19,7 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from typing import Any, TypeVar
 
-from marsyard.campaigns.definition.identity import code_hash, package_versions
+from marsyard.campaigns.definition.identity import hash_code, read_versions
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.worker_process import TaskResult, Work
 from marsyard.campaigns.execution.workers import Batches, LocalExecutor
@@ -63,10 +63,10 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
                 raise CampaignError(f"--cluster {address}: no scheduler answers: {error}") from error
             try:
                 self._client.wait_for_workers(1, timeout=_REACH_S)
-                found = self._client.run(_code_and_versions)
+                found = self._client.run(_identify_code)
             except TimeoutError as error:
                 raise CampaignError(f"--cluster {address}: the scheduler has no workers") from error
-            own_code, own = _code_and_versions()
+            own_code, own = _identify_code()
             for worker, (code, versions) in found.items():
                 if code != own_code:
                     raise CampaignError(f"worker {worker} has other code of Marsyard than this program")
@@ -85,7 +85,7 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
         for worker in self._client.scheduler_info(n_workers=-1)["workers"].values():
             machines[worker["host"]] += worker["nthreads"]
         # largest number of threads that share the memory of one machine
-        sharers = max(machines.values(), default=1)
+        executors = max(machines.values(), default=1)
         threads = sum(self._client.nthreads().values())
         batches = Batches(work.items, work.total, threads)
         pending = self._distributed.as_completed(loop=self._client.loop)
@@ -94,7 +94,7 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
         def send(batch: Sequence[int]) -> None:
             if batch:
                 part = replace(work, items=tuple(batch), total=len(batch))
-                future = self._client.submit(_run_batch_isolated, part, sharers, pure=False)
+                future = self._client.submit(_run_batch_isolated, part, executors, pure=False)
                 sent[future] = batch
                 pending.add(future)
 
@@ -142,11 +142,11 @@ def _local_cluster(address: str, number: str) -> Any:
     return LocalCluster(**processes, dashboard_address=None, memory_limit=0, silence_logs="ERROR")
 
 
-def _code_and_versions() -> tuple[str, dict[str, str]]:
-    return code_hash(()), package_versions()
+def _identify_code() -> tuple[str, dict[str, str]]:
+    return hash_code(()), read_versions()
 
 
-def _run_batch_isolated(work: Work[Result], sharers: int) -> tuple[float, list[TaskResult[Result]]]:
+def _run_batch_isolated(work: Work[Result], executors: int) -> tuple[float, list[TaskResult[Result]]]:
     """Run a batch in the worker process of this Dask thread; return the seconds and the results."""
     began = time.perf_counter()
     workers: LocalExecutor | None = getattr(_thread_state, "workers", None)
@@ -154,6 +154,6 @@ def _run_batch_isolated(work: Work[Result], sharers: int) -> tuple[float, list[T
         # Dask's workers are daemons of `multiprocessing`, which may not have children. The kernel ends ours with the
         # thread that started them.
         multiprocessing.process.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
-        workers = _thread_state.workers = LocalExecutor(1, sharers)
+        workers = _thread_state.workers = LocalExecutor(1, executors)
     done = [one for ended in workers.run(work) for one in ended]
     return time.perf_counter() - began, done

@@ -43,7 +43,7 @@ class _Part(NamedTuple):
     set: Callable[[Any], object]
 
 
-def _folder() -> str:
+def _read_folder() -> str:
     try:
         return str(Path.cwd())
     except FileNotFoundError:
@@ -54,7 +54,7 @@ def _folder() -> str:
 _OPENGL = b"PYOPENGL_PLATFORM"
 
 
-def _environment() -> dict[bytes, bytes]:
+def _read_environment() -> dict[bytes, bytes]:
     # the mapping behind `os.environ`: ten times as fast, since nothing is decoded
     variables: dict[bytes, bytes] = dict(os.environ._data)  # type: ignore[attr-defined]
     variables.pop(_OPENGL, None)
@@ -73,19 +73,19 @@ def _set_filters(saved: list[Any]) -> None:
     warnings.filters[:] = saved  # type: ignore[index]
 
 
-def _umask() -> int:
+def _read_umask() -> int:
     mask = os.umask(0o077)
     os.umask(mask)
     return mask
 
 
-def _decimals() -> tuple[Any, ...]:
+def _read_decimals() -> tuple[Any, ...]:
     context = decimal.getcontext()
     traps = [kind for kind, wanted in context.traps.items() if wanted]
     return context.prec, context.rounding, context.Emin, context.Emax, context.capitals, context.clamp, [], traps
 
 
-def _opencv() -> tuple[bool, int]:
+def _read_opencv() -> tuple[bool, int]:
     """OpenCV's optimisation flag and threads; those of a fresh worker where it is not loaded."""
     cv2: Any = sys.modules.get("cv2")
     return (True, 1) if cv2 is None else (cv2.useOptimized(), cv2.getNumThreads())
@@ -97,13 +97,10 @@ def _set_opencv(saved: tuple[bool, int]) -> None:
     cv2.setNumThreads(saved[1])
 
 
-#: Less than half a unit in the last place of 1: sums with it show how the processor rounds.
-_BELOW_HALF_ULP, _SMALLEST_NORMAL = 2.0**-60, sys.float_info.min
-
-
-def _arithmetic() -> tuple[bool, ...]:
+def _read_arithmetic() -> tuple[bool, ...]:
     """How floating-point numbers are rounded, and whether subnormal ones are flushed to zero."""
-    one, little, small = float("1"), _BELOW_HALF_ULP, _SMALLEST_NORMAL
+    # sums with less than half the distance from 1 to the next number show how the processor rounds
+    one, little, small = float("1"), 2.0**-60, sys.float_info.min
     return one + little == one, -one - little == -one, one - little == one, small * 0.5 > 0.0
 
 
@@ -116,30 +113,30 @@ def _set_arithmetic(_: object) -> None:
 
 
 _PARTS = (
-    _Part("the working folder", _folder, os.chdir),
-    _Part("environment variables", _environment, _set_environment),
+    _Part("the working folder", _read_folder, os.chdir),
+    _Part("environment variables", _read_environment, _set_environment),
     _Part("sys.path", lambda: list(sys.path), lambda saved: sys.path.__setitem__(slice(None), saved)),
     _Part("the filters of warnings", lambda: list(warnings.filters), _set_filters),
     _Part("NumPy's handling of errors (numpy.seterr)", np.geterr, lambda saved: np.seterr(**saved)),
     _Part("the locale", partial(locale.setlocale, locale.LC_ALL), partial(locale.setlocale, locale.LC_ALL)),
-    _Part("the mask of new files (umask)", _umask, os.umask),
+    _Part("the mask of new files (umask)", _read_umask, os.umask),
     _Part("the limit of recursion", sys.getrecursionlimit, sys.setrecursionlimit),
-    _Part("the context of decimal numbers", _decimals, lambda saved: decimal.setcontext(decimal.Context(*saved))),
-    _Part("OpenCV's settings (optimised code, threads)", _opencv, _set_opencv),
-    _Part("the arithmetic of floating-point numbers (rounding)", _arithmetic, _set_arithmetic),
+    _Part("the context of decimal numbers", _read_decimals, lambda saved: decimal.setcontext(decimal.Context(*saved))),
+    _Part("OpenCV's settings (optimised code, threads)", _read_opencv, _set_opencv),
+    _Part("the arithmetic of floating-point numbers (rounding)", _read_arithmetic, _set_arithmetic),
     _Part("the collection of garbage", gc.isenabled, lambda enabled: (gc.enable if enabled else gc.disable)()),
 )
 #: Indices of the parts that imports of modules change: environment, `sys.path` and warning filters.
 _CHANGED_BY_IMPORTS = (1, 2, 3)
 
 
-def _signals() -> tuple[Any, ...]:
+def _read_signals() -> tuple[Any, ...]:
     """Handlers, blocked signals and timers; `_signal` avoids building enumerations, which takes most of the time."""
     handlers = tuple(_signal.getsignal(number) for number in _SIGNALS)
     return handlers, _signal.pthread_sigmask(_signal.SIG_BLOCK, ()), _signal.getitimer(_signal.ITIMER_REAL)
 
 
-def _streams() -> tuple[Any, ...]:
+def _read_streams() -> tuple[Any, ...]:
     """Standard output and error, whether they are closed, and the files behind them."""
     objects = [(stream, getattr(stream, "closed", True)) for stream in (sys.stdout, sys.stderr)]
     return (*objects, file_identity(1), file_identity(2))
@@ -150,7 +147,7 @@ class ProcessState:
 
     def __init__(self) -> None:
         self._parts = [part.read() for part in _PARTS]
-        self._lasting = (_signals(), _streams())
+        self._lasting = (_read_signals(), _read_streams())
         self._threads = set(threading.enumerate())
         self._importing = False
         sys.meta_path[:] = [self, *(finder for finder in sys.meta_path if not isinstance(finder, ProcessState))]
@@ -191,7 +188,7 @@ class ProcessState:
     def restore(self) -> tuple[list[str], list[str]]:
         """Restore what has changed since then; return the names of the restored parts, and of the lasting changes."""
         restored: list[str] = []
-        lasting = self._leftovers()
+        lasting = self._find_leftovers()
         for part, before in zip(_PARTS, self._parts, strict=True):
             if part.read() == before:
                 continue
@@ -200,16 +197,16 @@ class ProcessState:
             (restored if part.read() == before else lasting).append(part.name)
         return restored, lasting
 
-    def _leftovers(self) -> list[str]:
+    def _find_leftovers(self) -> list[str]:
         """Lasting changes: signals, streams, threads that keep a process from ending, and child processes."""
         signals, streams = self._lasting
-        names = ["handlers of signals, or timers"] if _signals() != signals else []
-        if _streams() != streams:
+        names = ["handlers of signals, or timers"] if _read_signals() != signals else []
+        if _read_streams() != streams:
             names.append("standard output or error")
         end = time.monotonic() + _ENDING_S
         while True:
             threads = [one.name for one in threading.enumerate() if one not in self._threads and not one.daemon]
-            running = {"threads": threads, "child processes": _other_children()}
+            running = {"threads": threads, "child processes": _name_other_children()}
             if not any(running.values()) or time.monotonic() >= end:
                 left = {kind: ", ".join(sorted(set(found))) for kind, found in running.items() if found}
                 return [*names, *(f"{kind} that it left running ({found})" for kind, found in left.items())]
@@ -218,7 +215,7 @@ class ProcessState:
             time.sleep(0.01)
 
 
-def _other_children() -> list[str]:
+def _name_other_children() -> list[str]:
     """Names of the child processes, except idle programs under test; ended ones are reaped."""
     try:
         # a microsecond where there are none

@@ -16,7 +16,7 @@ import shutil
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
@@ -41,11 +41,7 @@ _THREAD_VARIABLES = (
 )
 #: Set before a worker loads any library: one thread each, reproducible order of sets, and assertions enabled (pyrender
 #: calls GL inside assertions, which `python -O` removes).
-WORKER_ENVIRONMENT: Mapping[str, str] = {
-    **dict.fromkeys(_THREAD_VARIABLES, "1"),
-    "PYTHONHASHSEED": "0",
-    "PYTHONOPTIMIZE": "",
-}
+_WORKER_ENVIRONMENT = dict.fromkeys(_THREAD_VARIABLES, "1") | {"PYTHONHASHSEED": "0", "PYTHONOPTIMIZE": ""}
 #: Seconds between two checks of a worker.
 _POLL_INTERVAL_S = 0.05
 #: Bytes kept of the last output of a dead process, and bytes read of a task's note.
@@ -137,7 +133,7 @@ class WatchedWorker:
             max_workers=1,
             initializer=worker_process.start_worker,
             initargs=(os.getpid(), str(self._folder)),
-            env={**WORKER_ENVIRONMENT, _MARK: str(self._folder), "TMPDIR": str(self._folder / "tmp")},
+            env={**_WORKER_ENVIRONMENT, _MARK: str(self._folder), "TMPDIR": str(self._folder / "tmp")},
         )
 
     def submit(self, task: Callable[[int], Result], batch: Sequence[int]) -> Future[BatchResult[Result]]:
@@ -267,11 +263,11 @@ class LocalExecutor(AbstractContextManager["LocalExecutor"]):
     """Worker processes on this machine, as a context: they end at its exit, and are killed at an exit by an exception.
 
     jobs: number of workers.
-    sharers: number of such executors, this one included, that share the memory of the machine.
+    executors: number of such executors, this one included, that use the memory of the machine.
     """
 
-    def __init__(self, jobs: int, sharers: int = 1) -> None:
-        self._default_memory_bytes = _MEMORY_FRACTION * free_memory() / (jobs * sharers)
+    def __init__(self, jobs: int, executors: int = 1) -> None:
+        self._default_memory_bytes = _MEMORY_FRACTION * free_memory() / (jobs * executors)
         try:
             _remove_abandoned_folders()
             self._folder = Path(tempfile.mkdtemp(prefix=_PREFIX))

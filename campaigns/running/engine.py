@@ -15,19 +15,19 @@ from pydantic import ValidationError
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, key_text
 from marsyard.campaigns.definition.identity import Identity, describe_algorithms, identity_of
-from marsyard.campaigns.definition.loading import NUMBERS, unknown_columns
+from marsyard.campaigns.definition.loading import NUMBERS, find_unknown_columns
 from marsyard.campaigns.errors import CampaignError, ConfigurationError, Problem, StoreError
 from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
 from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
 from marsyard.campaigns.outcomes import RETRYABLE, UNFINISHED
-from marsyard.campaigns.running.preparation import compilation_reported, plan_inputs
+from marsyard.campaigns.running.preparation import plan_inputs, report_compilation
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_with
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.products import ProductStore, keep_while_running
+from marsyard.campaigns.store.products import ProductStore, select_kept_cases
 from marsyard.campaigns.store.record import folder_lock
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
-from marsyard.campaigns.store.table import TABLE_FILE, showcase_case, worst_cases, write_table
+from marsyard.campaigns.store.table import TABLE_FILE, find_showcase, find_worst_cases, write_table
 from marsyard.scenarios.systems import RowColumns, row_columns
 from marsyard.sim.kernel_cache import mark_ready
 
@@ -122,7 +122,7 @@ def campaign_with_block(directory: Path, cases: int) -> Campaign:
     """Stored campaign with another block of cases, which is not run. Raises CampaignError as `append_cases` does."""
     configuration = record.stored_configuration(directory)
     appended = configuration.model_copy(update={"appended": (*configuration.appended, cases)})
-    problems = [message for _, message in appended.sampling_problems()]
+    problems = [message for _, message in appended.find_sampling_problems()]
     if cases < 1 or problems:
         raise CampaignError(f"{cases} cases cannot be added to {directory}: {'; '.join(problems) or 'at least 1'}")
     return load_stored_campaign(directory, appended)
@@ -164,7 +164,7 @@ def _continue_campaign(
         if not again and ended and not store.missing(configuration.total_cases):
             watch.note(f"the campaign is finished: all {count} cases have rows; nothing is run")
             return
-        session = record.session(command, executor.describe(), count)
+        session = record.describe_session(command, executor.describe(), count)
         updates: dict[str, Any] = {"state": "running", "exit_code": None, "finished_utc": None}
         updates["sessions"] = [*stored["sessions"], session]
         if changes:
@@ -193,7 +193,7 @@ def _execute(run: _Run, again: Sequence[int]) -> None:
         with create_executor(run.executor) as executor:
             missing = run.store.missing(configuration.total_cases)
             if missing or again:
-                with compilation_reported(configuration.scenario, run.watch.note) as first_case_ended:
+                with report_compilation(configuration.scenario, run.watch.note) as first_case_ended:
                     _prepare_inputs(run, executor, itertools.chain(*missing, again))
                     _run_cases(run, executor, [*missing, again], first_case_ended)
             write_table(table, run.store, [one.metric for one in configuration.requirements if one.bound is not None])
@@ -240,7 +240,7 @@ def _run_cases(
     cases = itertools.chain.from_iterable(parts)
     watch.begin("cases", total)
     checked = False
-    for ended in run_cases(executor, configuration, cases, keep=keep_while_running(configuration), total=total):
+    for ended in run_cases(executor, configuration, cases, keep=select_kept_cases(configuration), total=total):
         for completed in ended:
             _keep_products(products, completed, watch)
         run.store.add(completed.row for completed in ended)
@@ -280,7 +280,7 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
         absent = name not in row and (stated.has_flag(name) or stated.has_number(name))
         return absent or name in (numbers if kind == NUMBERS else flags)
 
-    found = unknown_columns(configuration.requirements, flags, numbers, is_known)
+    found = find_unknown_columns(configuration.requirements, flags, numbers, is_known)
     problems = [Problem(configuration.name, key_text(key), message) for key, message in found]
     if problems:
         stopped = Problem(str(directory), "", "the campaign was stopped; the rows so far are kept")
@@ -290,10 +290,10 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
 def _keep_worst(run: _Run, executor: Executor) -> None:
     """Run the showcase, and the worst cases where they are kept, again for their products."""
     configuration, table = run.campaign.configuration, run.directory / TABLE_FILE
-    showcase = showcase_case(configuration, table, run.store)
+    showcase = find_showcase(configuration, table, run.store)
     cases = [] if showcase is None else [showcase]
     if configuration.retain.products == "worst":
-        cases += worst_cases(configuration, table, configuration.retain.worst)
+        cases += find_worst_cases(configuration, table, configuration.retain.worst)
     if not cases:
         return
     cases = list(dict.fromkeys(cases))

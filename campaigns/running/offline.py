@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.campaign import Campaign, replaced
+from marsyard.campaigns.definition.campaign import Campaign, replace_value
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
 from marsyard.campaigns.definition.identity import configuration_hash
 from marsyard.campaigns.errors import CampaignError, StoreError, writing
@@ -65,7 +65,7 @@ def export_campaign(campaign: Campaign, exported: Exported, executor: ExecutorCo
 
 
 def _write_manifest(campaign: Campaign, directory: Path) -> None:
-    task, name, cases = _task(campaign), campaign.configuration.name, campaign.configuration.total_cases
+    task, name, cases = _find_task(campaign), campaign.configuration.name, campaign.configuration.total_cases
     form = task.offline
     columns = () if form is None else form.columns
     manifest = {"schema": SCHEMA, "campaign": name, "task": task.name, "cases": cases, "columns": list(columns)}
@@ -110,9 +110,9 @@ def scored_campaign(exported: Exported, answers: Path) -> Campaign:
     if stated != (stored.name, stored.total_cases):
         raise CampaignError(f"{exported.directory} and {exported.truth} belong to different exports")
     exporting = Campaign(stored, scenario(stored.scenario))
-    _check_answers(_task(exporting), stored, answers)
+    _check_answers(_find_task(exporting), stored, answers)
     table = exporting.scenario.algorithm_table if isinstance(exporting.scenario, HasAlgorithms) else ()
-    parameters = replaced(stored.parameters, [*table, "algorithm"], f"{ANSWERS}{answers.resolve()}")
+    parameters = replace_value(stored.parameters, [*table, "algorithm"], f"{ANSWERS}{answers.resolve()}")
     changed = stored.model_copy(update={"parameters": parameters, "retain": Retain()})
     return Campaign(CampaignConfiguration.model_validate(changed.model_dump()), exporting.scenario)
 
@@ -128,21 +128,21 @@ def _check_answers(task: Task[Any, Any], configuration: CampaignConfiguration, a
     total = configuration.total_cases
     unknown = sorted(case for case in found if case >= total)
     if unknown:
-        raise CampaignError(f"{answers}: there is no case {_first_eight(unknown)}; allowed: 0 to {total - 1}")
+        raise CampaignError(f"{answers}: there is no case {_list_first(unknown)}; allowed: 0 to {total - 1}")
     missing = [case for case in range(total) if case not in found]
     if missing:
         failures = list(task.offline.outcomes.__members__)[1:]
         raise CampaignError(
-            f"{answers}: no answer to {len(missing)} of {total} cases: {_first_eight(missing)}; "
+            f"{answers}: no answer to {len(missing)} of {total} cases: {_list_first(missing)}; "
             f"a case without one is stated with its outcome, such as {failures[0]}"
         )
 
 
-def _first_eight(cases: Sequence[int]) -> str:
+def _list_first(cases: Sequence[int]) -> str:
     return ", ".join(str(case) for case in cases[:8]) + (", ..." if len(cases) > 8 else "")
 
 
-def _task(campaign: Campaign) -> Task[Any, Any]:
+def _find_task(campaign: Campaign) -> Task[Any, Any]:
     if not isinstance(campaign.scenario, HasAlgorithms):
         raise CampaignError(f"the scenario of {campaign.configuration.name} has no choice of algorithms")
     return campaign.scenario.task

@@ -71,7 +71,7 @@ def plan_inputs(campaign: Campaign, cases: Iterable[int]) -> InputPlan:
 
     Raises CampaignError where the cache's limit is not a number, or its folder cannot be created.
     """
-    numbers = used_inputs(campaign, cases)
+    numbers = find_used_inputs(campaign, cases)
     if not numbers:
         return InputPlan((), {}, 0)
     scenario, base = campaign.scenario, campaign.base_parameters()
@@ -88,7 +88,7 @@ def plan_inputs(campaign: Campaign, cases: Iterable[int]) -> InputPlan:
     return InputPlan(present, {n: size for n, size in sizes.items() if n not in present}, limit)
 
 
-def used_inputs(campaign: Campaign, cases: Iterable[int]) -> tuple[int, ...]:
+def find_used_inputs(campaign: Campaign, cases: Iterable[int]) -> tuple[int, ...]:
     """Numbers of the shared inputs that cases use, ascending; all where the scenario does not state those of a case.
 
     Draws are a function of the case's number. The search ends when all inputs occur: for 250 terrains after about 1,500
@@ -109,7 +109,7 @@ def used_inputs(campaign: Campaign, cases: Iterable[int]) -> tuple[int, ...]:
 
 
 @contextmanager
-def compilation_reported(scenario: str, note: Callable[[str], None]) -> Iterator[Callable[[], None]]:
+def report_compilation(scenario: str, note: Callable[[str], None]) -> Iterator[Callable[[], None]]:
     """Report the compilation of kernels until the context ends; nothing where they are compiled already.
 
     Yields a function to be called when the first case has ended and compilation is complete.

@@ -60,7 +60,7 @@ class Design(Parameters):
     kind: Kind = "random"
     nominal: Annotated[bool, Field(strict=True)] = False
 
-    def problem(self, blocks: Sequence[int], grid_size: int) -> tuple[int, str] | None:
+    def find_problem(self, blocks: Sequence[int], grid_size: int) -> tuple[int, str] | None:
         """First block of cases that has no such design, and the reason; None where all have one."""
         for number, block in enumerate(blocks):
             nominal = int(self.nominal and number == 0)
@@ -148,11 +148,10 @@ def correlate_uniform(
     uniform: Float64[np.ndarray, "*cases members"], factor: Float64[np.ndarray, "members members"]
 ) -> Float64[np.ndarray, "*cases members"]:
     """Correlated uniform numbers of a group from independent ones: Phi(L Phi^-1(u))."""
-    mixed: Float64[np.ndarray, "*cases members"] = np.clip(ndtr(ndtri(uniform) @ factor.T), MIN_DRAW, MAX_DRAW)
-    return mixed
+    return np.asarray(np.clip(ndtr(ndtri(uniform) @ factor.T), MIN_DRAW, MAX_DRAW))
 
 
-def grid_probabilities(sizes: Mapping[str, int], point: int) -> dict[str, float]:
+def compute_grid_probabilities(sizes: Mapping[str, int], point: int) -> dict[str, float]:
     """Probabilities of the grids' levels at one point of the full factorial; the last grid varies fastest."""
     levels = np.unravel_index(point, tuple(sizes.values())) if sizes else ()
     return {path: (int(level) + 0.5) / size for (path, size), level in zip(sizes.items(), levels, strict=True)}
@@ -212,8 +211,8 @@ class Correlation(Parameters):
         smallest = float(np.linalg.eigvalsh(normals)[0]) if np.isfinite(normals).all() else float("nan")
         if not smallest > _MIN_EIGENVALUE:
             raise ValueError(
-                f"{self.kind} is not valid for a group: the normals' correlation, of least eigenvalue {smallest:.3g}, "
-                "is not positive definite"
+                f"{self.kind} is not valid for a group: the normals' correlation is not positive definite, "
+                f"with the smallest eigenvalue {smallest:.3g}"
             )
         return self
 
@@ -238,5 +237,4 @@ class Correlation(Parameters):
     @cached_property
     def factor(self) -> Float64[np.ndarray, "n n"]:
         """Lower triangular L with L L^T = R."""
-        lower: Float64[np.ndarray, "n n"] = np.linalg.cholesky(self.normal_correlation)
-        return lower
+        return np.asarray(np.linalg.cholesky(self.normal_correlation))

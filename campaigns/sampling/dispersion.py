@@ -3,7 +3,7 @@
 A dispersion is a parameter's distribution over the cases, as an inverse distribution function. It maps one uniform
 number to a value. The values of a case therefore depend on one number per dispersion, whether these numbers are
 independent, correlated or stratified. Numbers of a distribution may be formulas
-(`marsyard.campaigns.sampling.formulas`) of other parameters; `Dispersion.given` inserts the values of a case.
+(`marsyard.campaigns.sampling.formulas`) of other parameters; `Dispersion.insert_values` inserts the values of a case.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ class Dispersion(Parameters, ABC):
         """Paths of the parameters on which the distribution depends, each once."""
         return tuple(dict.fromkeys(name for one in self.formulas.values() for name in one.names))
 
-    def given(self, values: Mapping[str, Any]) -> Self:
-        """Return the distribution for given values of the parameters that its formulas name.
+    def insert_values(self, values: Mapping[str, Any]) -> Self:
+        """Return the distribution for values of the parameters that its formulas name.
 
         Raises ValueError where a formula has no value, limits are in the wrong order, or a width is not positive.
         """
@@ -106,7 +106,7 @@ def _find_formulas(stated: Any, key: tuple[str | int, ...] = ()) -> Iterator[tup
         yield from _find_formulas(value, (*key, part))
 
 
-def _number_or_formula(stated: Any) -> float | str:
+def _check_number(stated: Any) -> float | str:
     if isinstance(stated, str):
         return formula(stated).text
     if isinstance(stated, bool) or not isinstance(stated, int | float):
@@ -119,14 +119,14 @@ def _number_or_formula(stated: Any) -> float | str:
         raise PydanticKnownError("finite_number") from None
 
 
-def _positive_number_or_formula(stated: Any) -> float | str:
-    number = _number_or_formula(stated)
+def _check_positive_number(stated: Any) -> float | str:
+    number = _check_number(stated)
     if isinstance(number, float) and not number > 0.0:
         raise PydanticKnownError("greater_than", {"gt": 0})
     return number
 
 
-def _whole_number_or_formula(stated: Any) -> int | str:
+def _check_whole_number(stated: Any) -> int | str:
     """Whole number that a float represents exactly, or the text of a formula."""
     if isinstance(stated, str):
         return formula(stated).text
@@ -137,25 +137,25 @@ def _whole_number_or_formula(stated: Any) -> int | str:
     return stated
 
 
-def _literal(stated: Any) -> Any:
+def _check_literal(stated: Any) -> Any:
     """Value without formulas; numbers in it must be finite, since result files cannot hold others."""
     tables = stated.values() if isinstance(stated, Mapping) else stated if isinstance(stated, list | tuple) else ()
     for inner in tables:
-        _literal(inner)
+        _check_literal(inner)
     if isinstance(stated, float) and not math.isfinite(stated):
         raise PydanticKnownError("finite_number")
     return stated
 
 
-Number = Annotated[float | str, PlainValidator(_number_or_formula)]
-PositiveNumber = Annotated[float | str, PlainValidator(_positive_number_or_formula)]
+Number = Annotated[float | str, PlainValidator(_check_number)]
+PositiveNumber = Annotated[float | str, PlainValidator(_check_positive_number)]
 Limits = tuple[Number, Number]
-WholeNumber = Annotated[int | str, PlainValidator(_whole_number_or_formula)]
-Literally = Annotated[Any, PlainValidator(_literal)]
+WholeNumber = Annotated[int | str, PlainValidator(_check_whole_number)]
+Literally = Annotated[Any, PlainValidator(_check_literal)]
 Weight = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
 
 
-def interval_of(low: float | str, high: float | str) -> tuple[float, float] | None:
+def read_interval(low: float | str, high: float | str) -> tuple[float, float] | None:
     """Limits as numbers; None where one of them is a formula."""
     return None if isinstance(low, str) or isinstance(high, str) else (float(low), float(high))
 
@@ -249,7 +249,7 @@ def truncated_quantile(shape: Shape, limits: tuple[float, float] | None, probabi
     if limits is None:
         value = shape.evaluate("ppf", probability)
     else:
-        inverse, at_low, at_high = _truncated_inverse(shape, low, high)
+        inverse, at_low, at_high = _find_truncated_inverse(shape, low, high)
         value = shape.evaluate(inverse, at_low + probability * (at_high - at_low))
     value = min(max(value, low), high)
     if shape.is_discrete and not math.isfinite(value):
@@ -258,7 +258,7 @@ def truncated_quantile(shape: Shape, limits: tuple[float, float] | None, probabi
 
 
 @lru_cache(maxsize=1024)
-def _truncated_inverse(shape: Shape, low: float, high: float) -> tuple[str, float, float]:
+def _find_truncated_inverse(shape: Shape, low: float, high: float) -> tuple[str, float, float]:
     """Name of the inverse function that keeps its digits between two limits, and its arguments at them."""
     if not (low <= high if shape.is_discrete else low < high):
         raise ValueError(f"truncate = [{low}, {high}]: the first limit must be below the second")

@@ -23,7 +23,7 @@ from marsyard.campaigns.sampling.dispersion import (
     Shape,
     Weight,
     WholeNumber,
-    interval_of,
+    read_interval,
     scipy_distributions,
     scipy_parameters,
     scipy_shape,
@@ -117,7 +117,7 @@ class Derived(Dispersion):
         return float(self.formula)
 
     def bounds(self) -> tuple[float, float] | None:
-        return interval_of(self.formula, self.formula)
+        return read_interval(self.formula, self.formula)
 
 
 class Grid(_Levels):
@@ -183,7 +183,7 @@ class Uniform(Dispersion):
         return min(low + (high - low) * probability, high)
 
     def bounds(self) -> tuple[float, float] | None:
-        return interval_of(self.low, self.high)
+        return read_interval(self.low, self.high)
 
 
 class Normal(Dispersion):
@@ -226,7 +226,7 @@ class Normal(Dispersion):
         return min(max(value, float(self.truncate[0])), float(self.truncate[1]))
 
     def bounds(self) -> tuple[float, float] | None:
-        return (-math.inf, math.inf) if self.truncate is None else interval_of(*self.truncate)
+        return (-math.inf, math.inf) if self.truncate is None else read_interval(*self.truncate)
 
 
 class _WholeNumbers(Dispersion):
@@ -254,7 +254,7 @@ class _WholeNumbers(Dispersion):
         return min(low + int((high - low + 1) * probability), high)
 
     def bounds(self) -> tuple[float, float] | None:
-        return interval_of(self.low, self.high)
+        return read_interval(self.low, self.high)
 
 
 class Integer(_WholeNumbers):
@@ -353,9 +353,9 @@ BUILT_IN: Mapping[str, type[Dispersion]] = {
 }
 
 
-def _model_tag(stated: Any) -> str:
+def _select_tag(stated: Any) -> str:
     name = stated.get("distribution") if isinstance(stated, Mapping) else getattr(stated, "distribution", None)
     return name if isinstance(name, str) and name in BUILT_IN else "scipy"
 
 
-AnyDispersion = Annotated[_Dispersion, Discriminator(_model_tag)]
+AnyDispersion = Annotated[_Dispersion, Discriminator(_select_tag)]

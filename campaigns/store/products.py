@@ -159,7 +159,7 @@ class Keep:
 KEEP_ALL = Keep(every=1)
 
 
-def keep_while_running(configuration: CampaignConfiguration) -> Keep:
+def select_kept_cases(configuration: CampaignConfiguration) -> Keep:
     """Selection while a campaign runs; the worst cases are run again at its end."""
     retain = configuration.retain
     if retain.products == "all":

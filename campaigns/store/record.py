@@ -46,17 +46,14 @@ def claim(directory: Path) -> None:
 
     Raises StoreError where it holds a campaign, or cannot be written.
     """
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
+    with writing(directory):
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except FileExistsError as error:
+            raise StoreError(f"{directory} is taken; choose another folder with --out") from error
         held = [name for name in _CAMPAIGN_FILES if (directory / name).exists()]
-        if held == [ROWS_FILE] and is_empty_store(directory / ROWS_FILE):
-            held = []
-    except FileExistsError as error:
-        raise StoreError(f"{directory} is taken; choose another folder with --out") from error
-    except OSError as error:
-        raise StoreError(f"{directory} cannot be written: {error.strerror or error}") from error
-    if held:
-        raise StoreError(f"{directory} already holds a campaign ({held[0]}); choose another folder with --out")
+        if held and (held != [ROWS_FILE] or not is_empty_store(directory / ROWS_FILE)):
+            raise StoreError(f"{directory} already holds a campaign ({held[0]}); choose another folder with --out")
 
 
 def begin(
@@ -93,24 +90,24 @@ def begin(
             "identity": asdict(identity),
             "command": {"words": list(command), "folder": str(Path.cwd())} if command else None,
             "algorithms": list(algorithms),
-            "sessions": [session("run", executor, 0)],
+            "sessions": [describe_session("run", executor, 0)],
             "changes": [],
             "showcase": None,
             "versions": dict(identity.versions),
             "git_commit": git_commit(),
-            "environment": machine(),
+            "environment": describe_machine(),
         },
     )
 
 
-def session(command: str, executor: str, cases_before: int) -> dict[str, Any]:
+def describe_session(command: str, executor: str, cases_before: int) -> dict[str, Any]:
     """Record entry of one session of work on a campaign."""
     return {
         "command": command,
         "started_utc": utc_now(),
         "workers": executor,
         "cases_before": cases_before,
-        "environment": machine(),
+        "environment": describe_machine(),
     }
 
 
@@ -200,7 +197,7 @@ def git_commit() -> str | None:
     return f"{commit}+changes" if edited else commit
 
 
-def machine() -> dict[str, Any]:
+def describe_machine() -> dict[str, Any]:
     """Python, platform and processor with a hash of its features: rows are equal bit for bit where these are equal."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")

@@ -140,7 +140,7 @@ class RowStore(AbstractContextManager["RowStore"]):
                     if names not in self._layouts:
                         execute("INSERT INTO layouts VALUES (?, ?)", (len(self._layouts), json.dumps(names)))
                         self._layouts[names] = len(self._layouts)
-                    for kind in ((name, kind_of(value)) for name, value in row.items()):
+                    for kind in ((name, classify_value(value)) for name, value in row.items()):
                         if kind not in self._kinds:
                             execute("INSERT INTO kinds VALUES (?, ?)", kind)
                             self._kinds.add(kind)
@@ -159,13 +159,9 @@ class RowStore(AbstractContextManager["RowStore"]):
         (number,) = self._ask("SELECT count(*) FROM cases").fetchone()
         return int(number)
 
-    def outcomes(self) -> dict[str, int]:
-        """Number of cases of each outcome."""
-        return dict(self._ask("SELECT outcome, count(*) FROM cases GROUP BY outcome"))
-
     def unfinished(self) -> int:
         """Number of unfinished cases."""
-        return sum(number for outcome, number in self.outcomes().items() if outcome in UNFINISHED)
+        return len(self.with_outcomes(UNFINISHED))
 
     def missing(self, total: int) -> list[range]:
         """Cases below `total` that have no row."""
@@ -244,22 +240,20 @@ def readable_store(path: Path) -> Iterator[RowStore]:
     SQLite needs files of its own next to the log even for reading. Raises StoreError as `RowStore` does, and where the
     copy cannot be made.
     """
-    if all(os.access(one, os.W_OK, effective_ids=True) for one in (path, path.parent)):
-        with RowStore(path) as store:
-            yield store
-        return
     with ExitStack() as stack:
-        try:
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="marsyard-"))
-            for file in (path, path.with_name(f"{path.name}-wal")):
-                if file.exists():
-                    shutil.copyfile(file, Path(folder, file.name))
-        except OSError as error:
-            raise StoreError(f"{path} cannot be copied to be read: {error.strerror or error}") from error
-        yield stack.enter_context(RowStore(Path(folder, path.name)))
+        if not all(os.access(one, os.W_OK, effective_ids=True) for one in (path, path.parent)):
+            try:
+                folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="marsyard-"))
+                for file in (path, path.with_name(f"{path.name}-wal")):
+                    if file.exists():
+                        shutil.copyfile(file, Path(folder, file.name))
+            except OSError as error:
+                raise StoreError(f"{path} cannot be copied to be read: {error.strerror or error}") from error
+            path = Path(folder, path.name)
+        yield stack.enter_context(RowStore(path))
 
 
-def kind_of(value: Any) -> str:
+def classify_value(value: Any) -> str:
     """Type of a value, in the words of `RowStore.kinds`."""
     kind = type(value)
     if kind is int and not -(2**63) <= value < 2**63:

@@ -7,7 +7,7 @@ import itertools
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +36,15 @@ def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> No
     layouts, kinds = store.names(), store.kinds()
     found = dict.fromkeys((*itertools.chain.from_iterable(layouts.values()), *measures))
     own = [name for name in found if name not in LEADING_COLUMNS and name not in TRAILING_COLUMNS]
-    forms = {name: _form(kinds.get(name, set())) for name in (*LEADING_COLUMNS, *own, *TRAILING_COLUMNS)}
+    forms = {name: _choose_type(kinds.get(name, set())) for name in (*LEADING_COLUMNS, *own, *TRAILING_COLUMNS)}
     schema = pa.schema([(name, kind) for name, (kind, _) in forms.items()])
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
-        with pq.ParquetWriter(partial, schema) as writer, _garbage_collection_paused():
+        with pq.ParquetWriter(partial, schema) as writer, ExitStack() as stack:
+            if gc.isenabled():
+                # it takes as long as reading millions of rows, and none has cyclic references
+                gc.disable()
+                stack.callback(gc.enable)
             for chunk in store.chunks(_GROUP):
                 arrays = []
                 for values, (kind, convert) in zip(_columns(chunk, layouts, list(forms)), forms.values(), strict=True):
@@ -83,7 +87,7 @@ def _columns(
         yield values
 
 
-def _form(kinds: set[str]) -> tuple[Any, Callable[[Any], Any] | None]:
+def _choose_type(kinds: set[str]) -> tuple[Any, Callable[[Any], Any] | None]:
     """Narrowest Arrow type that holds all values of a column, and the conversion to it."""
     import pyarrow as pa
 
@@ -94,18 +98,6 @@ def _form(kinds: set[str]) -> tuple[Any, Callable[[Any], Any] | None]:
     if kinds <= {"int", "big", "float"}:
         return pa.float64(), None if kinds <= {"float"} else float
     return pa.string(), None if kinds == {"str"} else str
-
-
-@contextmanager
-def _garbage_collection_paused() -> Iterator[None]:
-    """Pause garbage collection, which takes as long as reading millions of rows, none with cyclic references."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 def read_rows(path: Path, case: int | None = None) -> list[dict[str, Any]]:
@@ -145,15 +137,15 @@ def stored_row(directory: Path, case: int) -> Row | None:
     return next(iter(read_rows(table, case)), None) if table.exists() else None
 
 
-def showcase_case(configuration: CampaignConfiguration, table: Path, store: RowStore) -> int | None:
+def find_showcase(configuration: CampaignConfiguration, table: Path, store: RowStore) -> int | None:
     """Case whose products are kept for the report; None where none is requested or finished."""
     if configuration.retain.showcase == "none":
         return None
-    worst = worst_cases(configuration, table, 1) if configuration.retain.showcase == "worst" else []
+    worst = find_worst_cases(configuration, table, 1) if configuration.retain.showcase == "worst" else []
     return worst[0] if worst else store.first_completed()
 
 
-def worst_cases(configuration: CampaignConfiguration, table: Path, number: int) -> list[int]:
+def find_worst_cases(configuration: CampaignConfiguration, table: Path, number: int) -> list[int]:
     """Answered cases with the largest metrics, the worst first: of the first requirement with a single column."""
     # a sum of columns is a sum of times, which does not rank cases
     single = (one for one in configuration.requirements if one.bound is not None and len(one.metric_columns) == 1)

@@ -101,12 +101,12 @@ def compare(
 
 def _file_requirements(directory: Path, path: Path) -> Sequence[dict[str, Any]]:
     """The requirements of a file that name the campaign."""
-    from marsyard.campaigns.definition.requirements import applicable, read_requirements
+    from marsyard.campaigns.definition.requirements import read_requirements, select_applicable
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.store import record
 
     name = str(record.read(directory)["name"])
-    found = applicable(read_requirements(path), name)
+    found = select_applicable(read_requirements(path), name)
     if not found:
         raise CampaignError(f"{path}: no requirement names the campaign '{name}' in its campaigns")
     return found

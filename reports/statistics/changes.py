@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
-from marsyard.reports.statistics.clusters import terrain_index
+from marsyard.reports.statistics.clusters import number_terrains
 from marsyard.reports.statistics.samples import Groups, is_shared, mean_interval
 
 #: Minimum fraction of the cases of either set on common terrains for a comparison within terrains.
@@ -38,7 +38,7 @@ _FULL = 0.8
 #: p-value of the normal approximation below which permutations are used.
 _PERMUTED_BELOW = 0.05
 #: Permutations per batch; sufficient number of exceedances; maximum number of permuted values.
-_BATCH, _ENOUGH, _MAX_PERMUTED = 500, 50, 2_000_000_000
+_BATCH, _MAX_EXCEEDANCES, _MAX_PERMUTED = 500, 50, 2_000_000_000
 #: Fixed seed: the same rows give the same p-value.
 _SEED = 19370101
 
@@ -79,19 +79,20 @@ def difference_p(now: Sample, before: Sample, permutations: int = 10_000) -> flo
     common = np.intersect1d(now.terrains, before.terrains)
     if min(float(np.isin(one.terrains, common).mean()) for one in (now, before)) < _COMMON:
         # equally many cases on each terrain, since the variance of a mean depends on their number
-        enough = [np.quantile(one.cases_on_terrains(), 1.0 - _FULL, method="lower") for one in (now, before)]
-        pairs = [(now.terrain_means(int(min(enough))), before.terrain_means(int(min(enough))))]
+        counts = (np.quantile(one.cases_on_terrains(), 1.0 - _FULL, method="lower") for one in (now, before))
+        cases = int(min(counts))
+        pairs = [(now.terrain_means(cases), before.terrain_means(cases))]
     else:
         pairs = [(now.values[now.terrains == one], before.values[before.terrains == one]) for one in common]
     rates = all(np.isin(values, (0.0, 1.0)).all() for pair in pairs for values in pair)
-    return _rates_p(pairs) if rates else _ranks_p(pairs, permutations)
+    return _test_rates(pairs) if rates else _test_ranks(pairs, permutations)
 
 
 #: Values of both sets, terrain by terrain.
 Pairs = Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]
 
 
-def _rates_p(pairs: Pairs) -> float:
+def _test_rates(pairs: Pairs) -> float:
     """Exact two-sided p-value of the ones in the first sets, given the ones in each pair: twice the smaller tail."""
     tables = [(int(a.sum()), a.size, int(a.sum() + b.sum()), a.size + b.size) for a, b in pairs]
     tables = [one for one in tables if 0 < one[2] < one[3]]
@@ -112,7 +113,7 @@ def _rates_p(pairs: Pairs) -> float:
     return float(min(1.0, 2.0 * min(law[: index + 1].sum(), law[index:].sum())))
 
 
-def _ranks_p(pairs: Pairs, permutations: int) -> float:
+def _test_ranks(pairs: Pairs, permutations: int) -> float:
     """Van Elteren's test with ties; NaN for fewer than eight values of either set.
 
     Small p-values are the fraction of the permutations within strata with at least the same excess; fewer are drawn
@@ -133,16 +134,16 @@ def _ranks_p(pairs: Pairs, permutations: int) -> float:
     if p >= _PERMUTED_BELOW or permutations * sum(scores.size for scores, _ in strata) > _MAX_PERMUTED:
         return p
     rng = np.random.default_rng(_SEED)
-    beyond = drawn = 0
-    while drawn < permutations and beyond < _ENOUGH:
+    exceedances = drawn = 0
+    while drawn < permutations and exceedances < _MAX_EXCEEDANCES:
         sums = np.zeros(_BATCH)
         for scores, n in strata:
             shuffled = rng.permuted(np.broadcast_to(scores, (_BATCH, scores.size)), axis=1)
             sums += shuffled[:, :n].sum(axis=1)
         # sums of the same scores in another order are the same
-        beyond += int((np.abs(sums) >= excess - 1e-9).sum())
+        exceedances += int((np.abs(sums) >= excess - 1e-9).sum())
         drawn += _BATCH
-    return (beyond + 1.0) / (drawn + 1.0)
+    return (exceedances + 1.0) / (drawn + 1.0)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -161,7 +162,7 @@ def compare_successes(
     """Numbers of cases in which only the first and only the other succeeds, and the two-sided p-value."""
     only_first, only_other = int((first & ~other).sum()), int((other & ~first).sum())
     if groups is not None and is_shared(groups):
-        return only_first, only_other, _signed_ranks_p(_sums(other.astype(np.float64) - first, groups))
+        return only_first, only_other, _test_signed_ranks(_sums(other.astype(np.float64) - first, groups))
     total = only_first + only_other
     p = 1.0 if total == 0 else float(stats.binomtest(only_first, total, 0.5).pvalue)
     return only_first, only_other, p
@@ -178,13 +179,13 @@ def compare_errors(
         return math.nan, math.nan, math.nan, math.nan
     mean, interval = float(differences.mean()), mean_interval(differences, confidence, groups)
     sums = _sums(differences, groups) if groups is not None and is_shared(groups) else differences
-    return mean, *interval, _signed_ranks_p(sums)
+    return mean, *interval, _test_signed_ranks(sums)
 
 
 def _sums(differences: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"]) -> Float[np.ndarray, " terrains"]:
-    return np.bincount(terrain_index(groups), weights=differences)
+    return np.bincount(number_terrains(groups), weights=differences)
 
 
-def _signed_ranks_p(differences: Float[np.ndarray, " n"]) -> float:
+def _test_signed_ranks(differences: Float[np.ndarray, " n"]) -> float:
     changed = differences[differences != 0.0]
     return 1.0 if changed.size == 0 else float(stats.wilcoxon(changed).pvalue)

@@ -65,29 +65,30 @@ def clustered_evidence(
     Few terrains with failures or successes are counted whole. Otherwise the bounds are those of Clopper and Pearson
     with the effective sample size of Korn & Graubard 1998, never larger than n.
     """
-    index = terrain_index(terrain)
+    index = number_terrains(terrain)
     sizes = np.bincount(index).astype(np.float64)
     successes = np.bincount(index, weights=success.astype(np.float64))
     failed, succeeded = int((successes < sizes).sum()), int((successes > 0).sum())
     n, terrains = float(sizes.sum()), sizes.size
     if terrains >= _MIN_TERRAINS and min(failed, succeeded) >= _MIN_MIXED_TERRAINS:
-        method, design_effect = ClusterMethod.KORN_GRAUBARD, _design_effect(successes, sizes)
+        method, design_effect = ClusterMethod.KORN_GRAUBARD, _estimate_design_effect(successes, sizes)
         # The second factor pays for estimating the variance from so many terrains only.
         freedom = (stats.t.ppf(confidence, n - 1) / stats.t.ppf(confidence, terrains - 1)) ** 2
         effective_n = min(n, n / max(design_effect, 1e-9) * float(freedom))
-        fewest = most = float(successes.sum() / n * effective_n)
+        min_successes = max_successes = float(successes.sum() / n * effective_n)
     else:
         # With equally many cases on each, a terrain has a failure at least as often as a case fails, and a success at
         # least as often as a case succeeds: both bounds are safe. Where bad terrains have fewer cases (they answer less
         # often) or more, the rate of the cases is on the safe side of the terrains' rate for one of the two bounds.
         method, design_effect, effective_n = ClusterMethod.TERRAIN_COUNT, float("nan"), float(terrains)
         of_cases = terrains * float(successes.sum() / n)
-        fewest, most = min(float(terrains - failed), of_cases), max(float(succeeded), of_cases)
-    lower, upper = proportion_lower(fewest, effective_n, confidence), proportion_upper(most, effective_n, confidence)
-    return ClusteredEvidence(terrains, failed, method, design_effect, effective_n, fewest, lower, upper)
+        min_successes, max_successes = min(float(terrains - failed), of_cases), max(float(succeeded), of_cases)
+    lower = proportion_lower(min_successes, effective_n, confidence)
+    upper = proportion_upper(max_successes, effective_n, confidence)
+    return ClusteredEvidence(terrains, failed, method, design_effect, effective_n, min_successes, lower, upper)
 
 
-def _design_effect(successes: Float[np.ndarray, " terrains"], sizes: Float[np.ndarray, " terrains"]) -> float:
+def _estimate_design_effect(successes: Float[np.ndarray, " terrains"], sizes: Float[np.ndarray, " terrains"]) -> float:
     """Variance of the rate over terrains (Taylor linearisation) over the binomial one."""
     terrains, n = sizes.size, sizes.sum()
     rate = successes.sum() / n
@@ -96,7 +97,7 @@ def _design_effect(successes: Float[np.ndarray, " terrains"], sizes: Float[np.nd
     return float(variance / (rate * (1.0 - rate) / n))
 
 
-def terrain_index(terrain: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+def number_terrains(terrain: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     """Consecutive terrain numbers from 0, in the order of the given ones."""
     first, last = int(terrain.min()), int(terrain.max())
     if last - first > 4 * terrain.size:

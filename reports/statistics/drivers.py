@@ -70,16 +70,22 @@ def driver(
         index = np.unique(groups[known], return_inverse=True)[1]
         sizes = np.bincount(index).astype(np.float64)
         size = float((sizes**2).sum() / sizes.sum())
-        effective = n / max(1.0, 1.0 + (size - 1.0) * _intraclass(x, index, sizes) * _intraclass(y, index, sizes))
+        effective = n / max(
+            1.0,
+            1.0
+            + (size - 1.0)
+            * _estimate_intraclass_correlation(x, index, sizes)
+            * _estimate_intraclass_correlation(y, index, sizes),
+        )
     correlation = float(np.corrcoef(x, y)[0, 1])
     half = float(stats.norm.ppf(0.5 * (1.0 + confidence)))
     half *= math.sqrt((1.0 + 0.5 * correlation**2) / max(effective - 3.0, 1.0))
     middle = math.atanh(float(np.clip(correlation, -1.0 + 1e-12, 1.0 - 1e-12)))
     lower, upper = math.tanh(middle - half), math.tanh(middle + half)
-    return Driver(n, effective, correlation, lower, upper, *_explained_fraction(x, y, effective, confidence))
+    return Driver(n, effective, correlation, lower, upper, *_estimate_explained_fraction(x, y, effective, confidence))
 
 
-def _explained_fraction(
+def _estimate_explained_fraction(
     x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], effective: float, confidence: float
 ) -> tuple[float, float, float, float]:
     """Fraction of variance between bins, its interval, and the p-value of the F-test."""
@@ -119,7 +125,7 @@ def _explained_fraction(
     return fraction, bounds[0], bounds[1], float(stats.f.sf(ratio, bins - 1.0, freedom))
 
 
-def _intraclass(
+def _estimate_intraclass_correlation(
     values: Float[np.ndarray, " n"], index: Int[np.ndarray, " n"], sizes: Float[np.ndarray, " groups"]
 ) -> float:
     """Intraclass correlation by analysis of variance, 0 to 1; 0 where no group has two."""

@@ -69,12 +69,12 @@ def minimum_sample_size(reliability: float, confidence: float, failures: int = 0
     def is_shown(cases: int) -> bool:
         return proportion_lower(cases - failures, cases, confidence) >= reliability
 
-    enough = failures + 1
-    while not is_shown(enough):
-        enough *= 2
-        if enough > _LARGEST_SAMPLE_SIZE:
+    upper = failures + 1
+    while not is_shown(upper):
+        upper *= 2
+        if upper > _LARGEST_SAMPLE_SIZE:
             raise ValueError(f"no sample of practical size shows a reliability of {reliability}")
-    cases = range(failures + 1, enough)
+    cases = range(failures + 1, upper)
     return cases.start + bisect.bisect_left(cases, True, key=is_shown)
 
 

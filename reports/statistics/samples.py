@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
 
-from marsyard.reports.statistics.clusters import ClusterMethod, clustered_evidence, terrain_index
+from marsyard.reports.statistics.clusters import ClusterMethod, clustered_evidence, number_terrains
 from marsyard.reports.statistics.proportions import Interval, check_confidence, proportion_lower
 
 #: Number of values (or terrains) above which the bootstrap's interval equals the large-sample one as printed.
@@ -50,14 +50,14 @@ Groups = Int[np.ndarray, " n"] | None
 
 def is_shared(groups: Groups) -> bool:
     """Whether any two values are from one terrain."""
-    return groups is not None and groups.size > 0 and int(terrain_index(groups).max()) + 1 < groups.size
+    return groups is not None and groups.size > 0 and int(number_terrains(groups).max()) + 1 < groups.size
 
 
 def _bootstrap(data: Sequence[Float[np.ndarray, " n"]], statistic: Callable[..., Any], confidence: float) -> Interval:
     """Two-sided BCa interval of a statistic of one or more columns, resampled together; NaN where there is none."""
     n = data[0].size
     # the level at which the normal quantile equals Student's times sqrt(n / (n - 1)): Hesterberg 2015, section 5
-    quantile = _student(confidence, n) * math.sqrt(n / (n - 1.0))
+    quantile = _student_quantile(confidence, n) * math.sqrt(n / (n - 1.0))
     with warnings.catch_warnings():
         # a degenerate bootstrap distribution (of two values, for example) gives NaN bounds
         warnings.simplefilter("ignore")
@@ -76,7 +76,7 @@ def _bootstrap(data: Sequence[Float[np.ndarray, " n"]], statistic: Callable[...,
     return float(result.confidence_interval.low), float(result.confidence_interval.high)
 
 
-def _student(confidence: float, n: int) -> float:
+def _student_quantile(confidence: float, n: int) -> float:
     """Student's two-sided quantile for a mean of n values."""
     return float(stats.t.ppf(0.5 * (1.0 + confidence), n - 1))
 
@@ -86,7 +86,7 @@ def _deviation_of_mean(residuals: Float[np.ndarray, " terrains"], n: int) -> flo
     return math.sqrt(terrains / (terrains - 1.0) * float((residuals**2).sum())) / n
 
 
-def _union(first: Interval, second: Interval) -> Interval:
+def _unite(first: Interval, second: Interval) -> Interval:
     return float(np.fmin(first[0], second[0])), float(np.fmax(first[1], second[1]))
 
 
@@ -108,18 +108,18 @@ def mean_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Gr
         quantile, spread = float(stats.norm.ppf(0.5 * (1.0 + confidence))), float(values.std(ddof=1))
         half = quantile * spread / math.sqrt(values.size)
         return mean - half, mean + half
-    index = terrain_index(groups)
+    index = number_terrains(groups)
     sizes, sums = np.bincount(index).astype(np.float64), np.bincount(index, weights=values)
     if sizes.size < FEWEST_TERRAINS:
         return math.nan, math.nan
-    half = _student(confidence, sizes.size) * _deviation_of_mean(sums - mean * sizes, values.size)
+    half = _student_quantile(confidence, sizes.size) * _deviation_of_mean(sums - mean * sizes, values.size)
     if sizes.size > _MAX_BOOTSTRAP:
         return mean - half, mean + half
 
     def ratio(sums: Float[np.ndarray, "*n"], sizes: Float[np.ndarray, "*n"], axis: int = -1) -> np.ndarray:
         return np.asarray(sums.sum(axis=axis) / sizes.sum(axis=axis))
 
-    return _union((mean - half, mean + half), _bootstrap((sums, sizes), ratio, confidence))
+    return _unite((mean - half, mean + half), _bootstrap((sums, sizes), ratio, confidence))
 
 
 def spread_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Groups = None) -> Interval:
@@ -136,15 +136,15 @@ def spread_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: 
         return 0.0, 0.0
     if groups is not None and is_shared(groups):
         return _shared_spread(values, groups, confidence)
-    interval = _bonett(values, confidence)
+    interval = _bonett_interval(values, confidence)
     if values.size > _MAX_BOOTSTRAP:
         return interval
-    return _union(interval, _bootstrap((values,), partial(np.std, ddof=1), confidence))
+    return _unite(interval, _bootstrap((values,), partial(np.std, ddof=1), confidence))
 
 
 def _shared_spread(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], confidence: float) -> Interval:
     """Two-sided interval of the standard deviation of values on shared terrains; NaN for fewer than five terrains."""
-    index = terrain_index(groups)
+    index = number_terrains(groups)
     sizes = np.bincount(index).astype(np.float64)
     terrains = sizes.size
     if terrains < FEWEST_TERRAINS:
@@ -153,7 +153,7 @@ def _shared_spread(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"
     sums, squares = (np.bincount(index, weights=centred**power) for power in (1, 2))
     variance = float((centred**2).mean())
     # of the logarithm, which is less skewed, corrected for few terrains as Bonett's interval is for few values
-    quantile = _student(confidence, terrains)
+    quantile = _student_quantile(confidence, terrains)
     correction = terrains / max(terrains - quantile, 1.0)
     half = quantile * correction * _deviation_of_mean(squares - variance * sizes, values.size) / variance
     middle = math.log(correction * variance)
@@ -165,13 +165,13 @@ def _shared_spread(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"
         squares, sums, n = (column.sum(axis=axis) for column in columns)
         return np.asarray(np.sqrt(np.maximum(squares - sums**2 / n, 0.0) / (n - 1.0)))
 
-    return _union(plain, _bootstrap((squares, sums, sizes), spread, confidence))
+    return _unite(plain, _bootstrap((squares, sums, sizes), spread, confidence))
 
 
-def _bonett(values: Float[np.ndarray, " n"], confidence: float) -> Interval:
+def _bonett_interval(values: Float[np.ndarray, " n"], confidence: float) -> Interval:
     """Bonett 2006, equation 8, with Student's t for the normal quantile."""
     n = values.size
-    quantile = _student(confidence, n)
+    quantile = _student_quantile(confidence, n)
     trimmed = float(stats.trim_mean(values, min(0.49, 0.5 / math.sqrt(n - 4.0))))
     squares = float(((values - values.mean()) ** 2).sum())
     kurtosis = n * float(((values - trimmed) ** 4).sum()) / squares**2
@@ -193,11 +193,11 @@ def quantile_bounds(
     values = np.asarray(sample, dtype=np.float64)
     if values.size == 0:
         return -math.inf, math.inf
-    lower = -_upper_bound(-values, groups, 1.0 - quantile, confidence)
-    return lower, _upper_bound(values, groups, quantile, confidence)
+    lower = -_bound_quantile(-values, groups, 1.0 - quantile, confidence)
+    return lower, _bound_quantile(values, groups, quantile, confidence)
 
 
-def _upper_bound(values: Float[np.ndarray, " n"], groups: Groups, quantile: float, confidence: float) -> float:
+def _bound_quantile(values: Float[np.ndarray, " n"], groups: Groups, quantile: float, confidence: float) -> float:
     """Smallest value of the sample below which at least a fraction `quantile` of the population lies, at the
     confidence.
 
@@ -215,7 +215,7 @@ def _upper_bound(values: Float[np.ndarray, " n"], groups: Groups, quantile: floa
     worth = shown.effective_n / n
     if shown.method is ClusterMethod.TERRAIN_COUNT:
         # a bound for the maximum of a terrain also holds for its values
-        index = terrain_index(groups)
+        index = number_terrains(groups)
         ordered = np.full(int(index.max()) + 1, -math.inf)
         np.maximum.at(ordered, index, values)
         ordered, worth = np.sort(ordered), 1.0

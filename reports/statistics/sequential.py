@@ -71,10 +71,10 @@ class LaterLook:
     """Test at a look at a campaign that was judged before: one verdict, PASS or FAIL, of a requirement.
 
     Events are failures for PASS, successes for FAIL: few of them show it. Under `rate`, the rate at the requirement's
-    limit, the likelihood ratio of `_log_ratio` is a martingale, and under any higher rate a supermartingale. By Ville's
-    inequality it ever reaches c with probability at most its value at the first look over c, for any stopping rule. The
-    threshold c is chosen so that the probabilities of a verdict at the first look, by the ordinary bound, and at any
-    later look add up to `risk`.
+    limit, the likelihood ratio (`_log_likelihood_ratio`) is a martingale, and under any higher rate a supermartingale.
+    By Ville's inequality it ever reaches c with probability at most its value at the first look over c, for any
+    stopping rule. The threshold c is chosen so that the probabilities of a verdict at the first look, by the ordinary
+    bound, and at any later look add up to `risk`.
 
     rate: probability of an event in a case at the limit: 1 - probability for PASS, probability for FAIL.
     risk: probability of a false verdict of all looks together: 1 - confidence.
@@ -93,34 +93,36 @@ class LaterLook:
         chance = stats.binom.logpmf(decided, self.first, self.rate)
         spent = float(np.exp(chance).sum())
         # rest of the martingale's mean of 1 where the first look does not decide
-        remaining = 1.0 - float(np.exp(chance + _log_ratio(decided, self.first, self.rate)).sum())
+        remaining = 1.0 - float(np.exp(chance + _log_likelihood_ratio(decided, self.first, self.rate)).sum())
         return math.log(max(_MIN_RISK, remaining) / max(_MIN_RISK, self.risk - spent))
 
     def risk_of_bound(self, n: float | int) -> float:
         """Risk at which the one-sided Clopper-Pearson bound of n cases shows the verdict at this look."""
-        log_ratio = float(_log_ratio(0.0, n, self.rate))
+        log_ratio = float(_log_likelihood_ratio(0.0, n, self.rate))
         if log_ratio < self.log_threshold:
             level = n * math.log1p(-self.rate) + log_ratio - self.log_threshold
             return max(_MIN_RISK, min(self.risk, math.exp(level)))
         few, many = 0.0, float(n)
         while many - few > 1e-9 * max(1.0, n):
             middle = 0.5 * (few + many)
-            few, many = (middle, many) if _log_ratio(middle, n, self.rate) >= self.log_threshold else (few, middle)
+            few, many = (
+                (middle, many) if _log_likelihood_ratio(middle, n, self.rate) >= self.log_threshold else (few, middle)
+            )
         return max(_MIN_RISK, min(self.risk, float(stats.beta.cdf(1.0 - self.rate, n - few, few + 1.0))))
 
     def cases_needed(self, n: int, events: int) -> int:
         """Total number of cases, at least n, that shows the verdict if no further event happens."""
 
         def is_shown(cases: int) -> bool:
-            return bool(_log_ratio(events, cases, self.rate) >= self.log_threshold)
+            return bool(_log_likelihood_ratio(events, cases, self.rate) >= self.log_threshold)
 
-        enough = max(n, 1)
-        while not is_shown(enough):
-            enough *= 2
-        return n + bisect.bisect_left(range(n, enough), True, key=is_shown)
+        upper = max(n, 1)
+        while not is_shown(upper):
+            upper *= 2
+        return n + bisect.bisect_left(range(n, upper), True, key=is_shown)
 
 
-def _log_ratio(
+def _log_likelihood_ratio(
     events: Float64[np.ndarray, "*n"] | float | int, n: float | int, rate: float
 ) -> Float64[np.ndarray, "*n"]:
     """Logarithm of the likelihood ratio of a lower rate to `rate`, for a number of events in n cases.
