@@ -394,10 +394,10 @@ def find_unknown_columns(
 ) -> list[tuple[Key, str]]:
     """Columns of requirements that are not known by their name and kind: keys, and messages with the allowed ones."""
     problems: list[tuple[Key, str]] = []
-    for index, asked in enumerate(requirements):
-        kind, allowed = (FLAGS, flags) if asked.bound is None else (NUMBERS, numbers)
-        named = [("metric", name, kind, allowed) for name in asked.metric_columns]
-        named += [("population", name, FLAGS, (*POPULATIONS, *flags)) for name in asked.population_columns]
+    for index, requirement in enumerate(requirements):
+        kind, allowed = (FLAGS, flags) if requirement.bound is None else (NUMBERS, numbers)
+        named = [("metric", name, kind, allowed) for name in requirement.metric_columns]
+        named += [("population", name, FLAGS, (*POPULATIONS, *flags)) for name in requirement.population_columns]
         for key, name, wanted, listed in named:
             if not is_known(name, wanted):
                 problems.append((("requirements", index, key), not_allowed(wanted, name, listed)))

@@ -183,13 +183,14 @@ def _build_finished_row(case: int, result: CaseResult, requirements: Sequence[Re
     if (result.outcome in UNFINISHED) != (failure is not None):
         raise ValueError(f"the outcome {result.outcome} is kept for cases that do not come to an end")
     columns = _convert_columns(result.row)
-    for asked in requirements:
-        for name in (*asked.population_columns, *(asked.metric_columns if asked.bound is None else ())):
+    for requirement in requirements:
+        metrics, has_bound = requirement.metric_columns, requirement.bound is not None
+        for name in (*requirement.population_columns, *(() if has_bound else metrics)):
             if type(columns.get(name, True)) is not bool:
-                raise TypeError(f"column {name} holds {columns[name]!r:.100}; {asked.id} needs true or false")
-        for name in () if asked.bound is None else asked.metric_columns:
+                raise TypeError(f"column {name} holds {columns[name]!r:.100}; {requirement.id} needs true or false")
+        for name in metrics if has_bound else ():
             if type(columns.get(name, 0.0)) is str:
-                raise TypeError(f"column {name} holds {columns[name]!r:.100}; {asked.id} needs a number")
+                raise TypeError(f"column {name} holds {columns[name]!r:.100}; {requirement.id} needs a number")
     error, trace = ("", "") if failure is None else (_clean_text(failure.error), _clean_text(failure.trace))
     head: Row = {"case": case, "outcome": _replace_surrogates(str(result.outcome)), "answered": bool(result.answered)}
     return {**head, **columns, "error": error, "traceback": trace}

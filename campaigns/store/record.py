@@ -183,9 +183,9 @@ def git_commit() -> str | None:
     """Commit of the checked-out program, with ``+changes`` if files were edited; None where unknown."""
     git, source = shutil.which("git"), Path(__file__).resolve()
     answers = []
-    asked = (["rev-parse", "HEAD"], ["ls-files", source.name], ["status", "--porcelain", "--untracked-files=no"])
+    commands = (["rev-parse", "HEAD"], ["ls-files", source.name], ["status", "--porcelain", "--untracked-files=no"])
     try:
-        for words in asked if git is not None else ():
+        for words in commands if git is not None else ():
             command = [str(git), "-C", str(source.parent), *words]
             done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603
             answers.append(done.stdout.strip())

@@ -170,10 +170,10 @@ class RowStore(AbstractContextManager["RowStore"]):
 
     def with_outcomes(self, outcomes: Iterable[str]) -> list[int]:
         """Cases with any of some outcomes."""
-        asked = sorted(outcomes)
-        marks = ", ".join("?" * len(asked))
+        named = sorted(outcomes)
+        marks = ", ".join("?" * len(named))
         query = f"SELECT case_number FROM cases WHERE outcome IN ({marks}) ORDER BY 1"  # noqa: S608 (marks only)
-        return [number for (number,) in self._ask(query, asked)]
+        return [number for (number,) in self._ask(query, named)]
 
     def first_completed(self) -> int | None:
         """First finished case; None where there is none."""

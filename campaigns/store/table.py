@@ -125,7 +125,7 @@ def refresh_table(directory: Path) -> None:
         return  # of an earlier version, which wrote the table when it was interrupted
     requirements = stored_configuration(directory).requirements
     with RowStore(directory / ROWS_FILE) as store:
-        write_table(directory / TABLE_FILE, store, [asked.metric for asked in requirements if asked.bound is not None])
+        write_table(directory / TABLE_FILE, store, [one.metric for one in requirements if one.bound is not None])
 
 
 def stored_row(directory: Path, case: int) -> Row | None:
@@ -149,7 +149,7 @@ def find_worst_cases(configuration: CampaignConfiguration, table: Path, number: 
     """Answered cases with the largest metrics, the worst first: of the first requirement with a single column."""
     # a sum of columns is a sum of times, which does not rank cases
     single = (one for one in configuration.requirements if one.bound is not None and len(one.metric_columns) == 1)
-    metric = next((asked.metric for asked in single), None)
+    metric = next((one.metric for one in single), None)
     if metric is None:
         return []
     import pyarrow.parquet as pq

@@ -212,18 +212,18 @@ def _bound_quantile(values: Float[np.ndarray, " n"], groups: Groups, quantile: f
         return float(ordered[rank]) if rank < n else math.inf
     below = values <= ordered[min(n - 1, max(0, math.ceil(quantile * n) - 1))]
     shown = clustered_evidence(below, groups, confidence)
-    worth = shown.effective_n / n
+    weight = shown.effective_n / n
     if shown.method is ClusterMethod.TERRAIN_COUNT:
         # a bound for the maximum of a terrain also holds for its values
         index = number_terrains(groups)
         ordered = np.full(int(index.max()) + 1, -math.inf)
         np.maximum.at(ordered, index, values)
-        ordered, worth = np.sort(ordered), 1.0
-    # first rank that shows the quantile, each value counting as `worth` independent ones
+        ordered, weight = np.sort(ordered), 1.0
+    # first rank that shows the quantile, each value counting as `weight` independent ones
     ranks = range(1, ordered.size + 1)
-    total = ordered.size * worth
+    total = ordered.size * weight
     rank = bisect.bisect_left(
-        ranks, True, key=lambda rank: proportion_lower(rank * worth, total, confidence) >= quantile
+        ranks, True, key=lambda rank: proportion_lower(rank * weight, total, confidence) >= quantile
     )
     return float(ordered[rank]) if rank < ordered.size else math.inf
 
