@@ -15,19 +15,13 @@ TIMED_OUT = "TIMED_OUT"
 OUT_OF_MEMORY = "OUT_OF_MEMORY"
 #: The case exceeded its limit of standard output and error.
 TOO_MUCH_OUTPUT = "TOO_MUCH_OUTPUT"
-
 #: The algorithm's answer violated its interface.
 BAD_ANSWER = "BAD_ANSWER"
-
 #: All of them, by the names on the command line.
 RETRYABLE: Mapping[str, str] = {
-    "crashed": CRASHED,
-    "timed-out": TIMED_OUT,
-    "out-of-memory": OUT_OF_MEMORY,
-    "too-much-output": TOO_MUCH_OUTPUT,
-    "bad-answer": BAD_ANSWER,
+    outcome.lower().replace("_", "-"): outcome
+    for outcome in (CRASHED, TIMED_OUT, OUT_OF_MEMORY, TOO_MUCH_OUTPUT, BAD_ANSWER)
 }
-
 #: Cases with these outcomes fail requirements on all cases, and cause exit status 1.
 UNFINISHED = frozenset(RETRYABLE.values())
 

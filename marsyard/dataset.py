@@ -22,7 +22,7 @@ import numpy as np
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.identity import configuration_hash
 from marsyard.campaigns.errors import CampaignError, StoreError
-from marsyard.campaigns.running.inputs import plan_inputs
+from marsyard.campaigns.running.preparation import plan_inputs
 from marsyard.scenarios.exposure import ProvidesSamples, Sample
 from marsyard.scenarios.registry import scenario, scenario_names
 

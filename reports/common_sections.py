@@ -24,9 +24,8 @@ from marsyard.reports.sampling_design import sampled
 from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
 from marsyard.reports.statistics.changes import holm
 from marsyard.reports.statistics.drivers import Driver, driver
-from marsyard.reports.statistics.plane import circular_error, error_ellipse
 from marsyard.reports.statistics.proportions import proportion_interval
-from marsyard.reports.statistics.samples import mean_interval, quantile_bounds
+from marsyard.reports.statistics.samples import circular_error, error_ellipse, mean_interval, quantile_bounds
 from marsyard.reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.verdicts import judge_campaign
 from marsyard.reports.wording import NOTHING, coefficient, interval, note_text, number, p_text, percent, stated

@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 
 from marsyard.reports.columns import axis_columns, category_column, label, magnitude_label, numbers, split_unit
 from marsyard.reports.rates import ENGINE_FAILURES
-from marsyard.reports.statistics.plane import error_ellipse
+from marsyard.reports.statistics.samples import error_ellipse
 from marsyard.reports.svg import (
     BARS,
     INK,

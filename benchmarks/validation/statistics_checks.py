@@ -12,9 +12,8 @@ from benchmarks.validation.nights import BEFORE, CASES, KINDS, WORSE, planted_fo
 from benchmarks.validation.records import Check, Measure
 from marsyard.reports.history import WINDOW
 from marsyard.reports.statistics.clusters import clustered_evidence
-from marsyard.reports.statistics.plane import error_ellipse
 from marsyard.reports.statistics.proportions import Interval, proportion_lower, proportion_upper
-from marsyard.reports.statistics.samples import mean_interval, quantile_bounds, spread_interval
+from marsyard.reports.statistics.samples import error_ellipse, mean_interval, quantile_bounds, spread_interval
 from marsyard.reports.statistics.sequential import confidence_at, planned_looks
 
 CONFIDENCE = 0.9

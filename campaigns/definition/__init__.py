@@ -1,1 +1,1 @@
-"""What a campaign is: its file as read and checked, each case's parameters, and the identity of it all."""
+"""Definition of a campaign: its checked file, the parameters of each case, and its identity."""

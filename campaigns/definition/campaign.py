@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,11 +14,9 @@ from pydantic import BaseModel
 from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.sampling.design import (
     MIN_DRAW,
-    CasePosition,
-    Layout,
     build_stratified_design,
+    compute_grid_probabilities,
     correlate_uniform,
-    grid_probabilities,
     locate_case,
 )
 from marsyard.campaigns.sampling.dispersion import Dispersion
@@ -58,7 +57,7 @@ class Campaign:
                 values[path] = value_at(parameters, path)
                 continue
             named = {name: values[name] if name in values else value_at(parameters, name) for name in dispersion.names}
-            given = dispersion.given(named)
+            given = dispersion.insert_values(named)
             if isinstance(given, InTurn):
                 values[path] = given.value(case)
             else:
@@ -67,55 +66,36 @@ class Campaign:
 
     def probabilities(self, case: int) -> dict[str, float] | None:
         """Uniform number of each dispersion that is drawn or swept in a case; None for the nominal case."""
-        configuration = self.configuration
-        grids = {path: len(grid.points) for path, grid in configuration.grids.items()}
-        position = locate_case(configuration.design, configuration.blocks, configuration.grid_size, case)
+        stated, paths = self.configuration, self.drawn_paths
+        position = locate_case(stated.design, stated.blocks, stated.grid_size, case)
         if position is None:
             return None
-        is_random = configuration.design.kind == "random"
-        drawn = self._draw_independent(case) if is_random else self._draw_stratified(position)
-        return {**drawn, **grid_probabilities(grids, position.grid_point)}
-
-    def _draw_independent(self, case: int) -> dict[str, float]:
-        """Numbers from each dispersion's own stream, correlated within the groups."""
-        streams = self.streams(case)
-        numbers = {
-            path: max(float(streams.generator(f"dispersion:{path}").random()), MIN_DRAW) for path in self.drawn_paths
-        }
-        for group in self.configuration.correlations:
-            mixed = correlate_uniform(np.array([numbers[path] for path in group.parameters]), group.factor)
-            numbers.update(zip(group.parameters, mixed.tolist(), strict=True))
-        return numbers
-
-    def _draw_stratified(self, position: CasePosition) -> dict[str, float]:
-        """Row of the stratified design that contains the case."""
-        configuration, paths = self.configuration, self.drawn_paths
-        groups = tuple(
-            (tuple(map(paths.index, group.parameters)), tuple(map(tuple, group.factor.tolist())))
-            for group in configuration.correlations
-        )
-        layout = Layout(
-            kind=configuration.design.kind,
-            seed=configuration.seed,
-            campaign=configuration.name,
-            first=position.first,
-            size=position.size,
-            paths=paths,
-            groups=groups,
-        )
-        return dict(zip(paths, build_stratified_design(layout)[position.index].tolist(), strict=True))
+        grid_point, first, size, index = position
+        if stated.design.kind == "random":
+            streams = self.streams(case)
+            drawn = {path: max(float(streams.generator(f"dispersion:{path}").random()), MIN_DRAW) for path in paths}
+            for group in stated.correlations:
+                mixed = correlate_uniform(np.array([drawn[path] for path in group.parameters]), group.factor)
+                drawn.update(zip(group.parameters, mixed.tolist(), strict=True))
+        else:
+            groups = tuple(
+                (tuple(map(paths.index, group.parameters)), tuple(map(tuple, group.factor.tolist())))
+                for group in stated.correlations
+            )
+            design = build_stratified_design(stated.design.kind, stated.seed, stated.name, first, size, paths, groups)
+            drawn = dict(zip(paths, design[index].tolist(), strict=True))
+        grids = {path: len(grid.points) for path, grid in stated.grids.items()}
+        return {**drawn, **compute_grid_probabilities(grids, grid_point)}
 
     @cached_property
     def marginals(self) -> Mapping[str, Dispersion]:
         """Dispersions by path; those in a covariance with the standard deviations that it states."""
-        return {path: self._marginal(path, one) for path, one in self.configuration.dispersions.items()}
-
-    def _marginal(self, path: str, dispersion: Dispersion) -> Dispersion:
-        stated = (group.standard_deviation(path) for group in self.configuration.correlations)
-        sd = next((one for one in stated if one is not None), None)
-        if sd is None or not isinstance(dispersion, Normal):
-            return dispersion
-        return Normal.model_validate({**dispersion.model_dump(), "sd": sd})
+        marginals: dict[str, Dispersion] = dict(self.configuration.dispersions)
+        for group in self.configuration.correlations:
+            for index, row in enumerate(group.covariance or ()):
+                path, sd = group.parameters[index], math.sqrt(row[index])
+                marginals[path] = Normal.model_validate({**marginals[path].model_dump(), "sd": sd})
+        return marginals
 
     @cached_property
     def drawn_paths(self) -> tuple[str, ...]:
@@ -150,19 +130,19 @@ class Campaign:
         """Campaign's parameters with other values at some paths."""
         tree: Any = self.configuration.parameters
         for path, value in values.items():
-            tree = replaced(tree, path.split("."), value)
+            tree = replace_value(tree, path.split("."), value)
         return self.scenario.parameters_type.model_validate(tree)
 
 
-def replaced(tree: Any, path: Sequence[str], value: Any) -> Any:
+def replace_value(tree: Any, path: Sequence[str], value: Any) -> Any:
     """Copy nested tables and lists with another value at a path."""
     if not path:
         return value
     head, *rest = path
     if isinstance(tree, list):
         index = int(head)
-        return [*tree[:index], replaced(tree[index], rest, value), *tree[index + 1 :]]
-    return {**tree, head: replaced(tree[head], rest, value)}
+        return [*tree[:index], replace_value(tree[index], rest, value), *tree[index + 1 :]]
+    return {**tree, head: replace_value(tree[head], rest, value)}
 
 
 def value_at(tree: Any, path: str) -> Any:
@@ -174,6 +154,14 @@ def value_at(tree: Any, path: str) -> Any:
         except (KeyError, IndexError, TypeError, ValueError):
             raise ValueError(f"there is no parameter '{path}'") from None
     return node
+
+
+def find_value(tree: Any, path: str) -> Any:
+    """Value at a dotted path in nested tables and lists; an empty tuple where there is none."""
+    try:
+        return value_at(tree, path)
+    except ValueError:
+        return ()
 
 
 def leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:

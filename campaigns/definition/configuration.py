@@ -5,28 +5,29 @@ from __future__ import annotations
 import math
 import tomllib
 import types
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from marsyard.campaigns.errors import ConfigurationError, Problem, near_match
-from marsyard.campaigns.sampling.correlation import Correlation
-from marsyard.campaigns.sampling.design import Design
+from marsyard.campaigns.sampling.design import Correlation, Design
 from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, Grid, Normal
 from marsyard.sim.files import check_regular
 from marsyard.sim.parameters import Parameters
 
 Model = TypeVar("Model", bound=BaseModel)
-
 #: A key in nested tables and lists, part by part.
 Key = tuple[str | int, ...]
-
 #: Maximum number of cases of a campaign.
 MAX_CASES = 1_000_000_000
-
-
+_Cases = Annotated[int, Field(strict=True, ge=1, le=MAX_CASES)]
+_Count = Annotated[int, Field(strict=True, ge=1)]
+_Amount = Annotated[float, Field(strict=True, gt=0.0, allow_inf_nan=False)]
+_Fraction = Annotated[float, Field(strict=True, gt=0.0, lt=1.0)]
+_Text = Annotated[str, Field(min_length=1)]
 #: Populations of every campaign; any other name in a population is a column of true and false.
 POPULATIONS = ("all", "completed", "valid")
 
@@ -43,12 +44,12 @@ class Requirement(Parameters):
     for requirements without a confidence. Its best verdict is MET BY RATE, with exit status 3, or 0 with `accept_rate`.
     """
 
-    id: Annotated[str, Field(min_length=1)]
+    id: _Text
     statement: str = ""
-    metric: Annotated[str, Field(min_length=1)]
+    metric: _Text
     bound: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)] | None = None
-    probability: Annotated[float, Field(strict=True, gt=0.0, lt=1.0)]
-    confidence: Annotated[float, Field(strict=True, gt=0.0, lt=1.0)]
+    probability: _Fraction
+    confidence: _Fraction
     population: Annotated[str, Field(pattern=r"^[A-Za-z]\w*( and [A-Za-z]\w*)*$")] = "all"
     decide_by: Literal["confidence", "estimate"] = "confidence"
     accept_rate: Annotated[bool, Field(strict=True)] = Field(
@@ -58,7 +59,7 @@ class Requirement(Parameters):
     kind: Literal["requirement", "observation", "ours"] | None = Field(
         default=None, description="of a paper: its requirement, or what it observed; or ours"
     )
-    scale: Annotated[float, Field(strict=True, gt=0.0, allow_inf_nan=False)] = 1.0
+    scale: _Amount = 1.0
 
     @model_validator(mode="after")
     def _check_accept_rate(self) -> Requirement:
@@ -88,16 +89,13 @@ class Retain(Parameters):
     products: Literal["none", "failed", "worst", "every", "all"] = Field(
         default="none",
         description="of no case except the showcase, of those that fail a requirement, of the `worst` by the metric of "
-        "the first requirement with a bound, of `every` so manieth, or of all",
+        "the first requirement with a bound, of every `every`-th case, or of all",
     )
-    worst: Annotated[int, Field(strict=True, ge=1)] = 10
-    every: Annotated[int, Field(strict=True, ge=1)] = 100
+    worst: _Count = 10
+    every: _Count = 100
     budget_gb: Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False)] = Field(
         default=10.0, description="disk that kept products may take; when it is used up no more are kept"
     )
-
-
-_Amount = Annotated[float, Field(strict=True, gt=0.0, allow_inf_nan=False)]
 
 
 class Limits(Parameters):
@@ -107,7 +105,7 @@ class Limits(Parameters):
     prepare_time_s: _Amount = Field(default=3600.0, description="wall-clock time of building a shared input")
     memory_gb: _Amount | None = Field(
         default=None,
-        description="memory that a worker has to itself; by default a share of 80 % of what is free at the start",
+        description="memory that a worker has to itself; by default an equal fraction of 80 % of the free memory",
     )
     output_mb: _Amount = Field(default=10.0, description="what a case may write to standard output and error")
 
@@ -116,9 +114,9 @@ class CampaignConfiguration(Parameters):
     """Everything on which a campaign's rows depend, apart from the program and the machine."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
-    scenario: Annotated[str, Field(min_length=1)]
+    scenario: _Text
     description: str = ""
-    cases: Annotated[int, Field(strict=True, ge=1, le=MAX_CASES)]
+    cases: _Cases
     seed: Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)] = 0
     design: Design = Design()
     parameters: dict[str, Any] = Field(default_factory=dict)
@@ -127,12 +125,12 @@ class CampaignConfiguration(Parameters):
     requirements: tuple[Requirement, ...] = ()
     retain: Retain = Retain()
     limits: Limits = Limits()
-    most_cases: Annotated[int, Field(strict=True, ge=1, le=MAX_CASES)] | None = Field(
+    most_cases: _Cases | None = Field(
         default=None,
         description="cases of the last look at a campaign that stops itself when its verdicts are decided; set by "
         "--until-decided",
     )
-    appended: tuple[Annotated[int, Field(strict=True, ge=1, le=MAX_CASES)], ...] = Field(
+    appended: tuple[_Cases, ...] = Field(
         default=(), strict=False, description="sizes of the blocks of cases that were added behind the first"
     )
 
@@ -164,17 +162,16 @@ class CampaignConfiguration(Parameters):
         """Sizes of the blocks of cases, the first before the appended ones."""
         return (self.cases, *self.appended)
 
-    def sampling_problems(self) -> list[tuple[Key, str]]:
+    def find_sampling_problems(self) -> list[tuple[Key, str]]:
         """Problems of the design, the correlated groups and their dispersions: keys and messages."""
         problems: list[tuple[Key, str]] = []
-        design_problem = self.design.problem(self.blocks, self.grid_size)
-        if design_problem is not None:
-            block, message = design_problem
+        if (problem := self.design.find_problem(self.blocks, self.grid_size)) is not None:
+            block, message = problem
             problems.append((("appended", block - 1) if block else ("cases",), message))
         grouped: dict[str, int] = {}
         for number, group in enumerate(self.correlations):
             for index, path in enumerate(group.parameters):
-                wrong = self._member_problem(group, path)
+                wrong = self._check_member(group, path)
                 if path in grouped:
                     wrong = f"'{path}' is in correlations[{grouped[path]}] already"
                 if wrong:
@@ -189,7 +186,7 @@ class CampaignConfiguration(Parameters):
                 problems.append((("dispersions", path), f"lies within '{inside}', which is dispersed as a whole"))
         return problems
 
-    def _member_problem(self, group: Correlation, path: str) -> str:
+    def _check_member(self, group: Correlation, path: str) -> str:
         """Reason why a dispersion cannot be correlated; empty if it can."""
         dispersion = self.dispersions.get(path)
         if dispersion is None:
@@ -229,8 +226,31 @@ def read_table(path: Path, model: type[Model]) -> Model:
 
 def problems_of(error: ValidationError, model: type[BaseModel]) -> list[tuple[Key, str]]:
     """Problems of a validation: keys as written in the file, and messages with the allowed values."""
-    details = error.errors(include_url=False)
-    return [(_written_key(model, detail["loc"]), _message(dict(detail), model)) for detail in details]
+    problems: list[tuple[Key, str]] = []
+    for detail in error.errors(include_url=False):
+        location, given, message = detail["loc"], detail["input"], str(detail["msg"])
+        if detail["type"] == "extra_forbidden":
+            below = _list_models(reduce(_find_inner_type, location[:-1], model))
+            allowed = sorted({name for kind in below for name in kind.model_fields})
+            message = f"unknown key{near_match(str(location[-1]), allowed)}; allowed: {', '.join(allowed)}"
+        elif detail["type"] == "missing":
+            message = "required, but missing"
+        elif detail["type"] == "value_error":
+            message = message.removeprefix("Value error, ")
+        else:
+            shown = repr(given) if isinstance(given, str | int | float | bool) else type(given).__name__
+            message = f"{message[:1].lower()}{message[1:]}, got {shown}"
+        key: Key = ()
+        node: Any = model
+        for part in location:
+            # pydantic adds the names of alternative models
+            if not any(kind.__name__ == part for kind in _list_models(node)):
+                key = (*key, part)
+            node = _find_inner_type(node, part)
+        if model is CampaignConfiguration and len(location) > 2 and location[0] == "dispersions":
+            key = (*location[:2], *location[3:])
+        problems.append((key, message))
+    return problems
 
 
 def key_text(key: Iterable[str | int]) -> str:
@@ -245,56 +265,17 @@ def key_text(key: Iterable[str | int]) -> str:
     return text
 
 
-def _written_key(model: type[BaseModel], location: Sequence[str | int]) -> Key:
-    """Key as written in the file, without the names that pydantic adds for alternative models."""
-    if model is CampaignConfiguration and len(location) > 2 and location[0] == "dispersions":
-        return (*location[:2], *location[3:])
-    node: Any = model
-    written: list[str | int] = []
-    for part in location:
-        if not any(kind.__name__ == part for kind in _models(node)):
-            written.append(part)
-        node = _inner(node, part)
-    return tuple(written)
-
-
-def _message(detail: Mapping[str, Any], model: type[BaseModel]) -> str:
-    """Problem at one key, with the allowed values."""
-    location, given = detail["loc"], detail["input"]
-    if detail["type"] == "extra_forbidden":
-        allowed = _field_names(model, location[:-1])
-        return f"unknown key{near_match(str(location[-1]), allowed)}; allowed: {', '.join(allowed)}"
-    if detail["type"] == "missing":
-        return "required, but missing"
-    if detail["type"] == "value_error":
-        return str(detail["msg"]).removeprefix("Value error, ")
-    message = str(detail["msg"])
-    message = message[:1].lower() + message[1:]
-    shown = isinstance(given, str | int | float | bool)
-    return f"{message}, got {given!r}" if shown else f"{message}, got {type(given).__name__}"
-
-
-def _field_names(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:
-    """Names of the fields of the model at a location inside a model; empty where there is none."""
-    node: Any = model
-    for part in location:
-        node = _inner(node, part)
-    return sorted({name for kind in _models(node) for name in kind.model_fields})
-
-
 def description_at(model: type[BaseModel], path: str) -> str:
     """Description of a model's field at a dotted path; empty where it has none."""
     *tables, name = path.split(".")
-    node: Any = model
-    for part in tables:
-        node = _inner(node, int(part) if part.isdigit() else part)
-    return next((kind.model_fields[name].description or "" for kind in _models(node) if name in kind.model_fields), "")
+    below = _list_models(reduce(_find_inner_type, (int(part) if part.isdigit() else part for part in tables), model))
+    return next((kind.model_fields[name].description or "" for kind in below if name in kind.model_fields), "")
 
 
-def _inner(kind: Any, part: str | int) -> Any:
+def _find_inner_type(kind: Any, part: str | int) -> Any:
     """Type below one part of a location."""
     types_below: list[Any] = []
-    for choice in _alternatives(kind):
+    for choice in _list_alternatives(kind):
         if isinstance(choice, type) and issubclass(choice, BaseModel):
             if part in choice.model_fields:
                 types_below.append(choice.model_fields[str(part)].annotation)
@@ -307,15 +288,16 @@ def _inner(kind: Any, part: str | int) -> Any:
     return Union[tuple(types_below)] if types_below else None  # noqa: UP007
 
 
-def _models(kind: Any) -> list[type[BaseModel]]:
-    return [one for one in _alternatives(kind) if isinstance(one, type) and issubclass(one, BaseModel)]
+def _list_models(kind: Any) -> list[type[BaseModel]]:
+    """Models among the alternatives of a type."""
+    return [one for one in _list_alternatives(kind) if isinstance(one, type) and issubclass(one, BaseModel)]
 
 
-def _alternatives(kind: Any) -> list[Any]:
+def _list_alternatives(kind: Any) -> list[Any]:
     """Members of a union, through annotations."""
     origin = get_origin(kind)
     if origin is Annotated:
-        return _alternatives(get_args(kind)[0])
+        return _list_alternatives(get_args(kind)[0])
     if origin in (Union, types.UnionType):
-        return [inner for choice in get_args(kind) for inner in _alternatives(choice)]
+        return [inner for choice in get_args(kind) for inner in _list_alternatives(choice)]
     return [kind]

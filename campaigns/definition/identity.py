@@ -1,4 +1,7 @@
-"""Identity of a campaign: hashes and versions of everything besides the case number on which its rows depend."""
+"""Identity of a campaign: hashes and versions of everything except the case number on which its rows depend.
+
+The record also describes the algorithms under test: class, version, options, and a hash of the sources.
+"""
 
 from __future__ import annotations
 
@@ -8,32 +11,30 @@ import platform
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from marsyard.algorithms.exchange import parse_command
-from marsyard.campaigns.definition.campaign import leaves, value_at
+from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves
 from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
-from marsyard.scenarios.estimators import algorithm_sources
-from marsyard.scenarios.import_path import relative_to
+from marsyard.scenarios.estimators import algorithm_sources, installed
+from marsyard.scenarios.import_path import import_object, relative_to, source_files
 from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
-from marsyard.scenarios.offline import answers_file
+from marsyard.scenarios.offline import answers_file, is_offline
 from marsyard.scenarios.registry import UnknownScenarioError, scenario, scenario_source
 from marsyard.scenarios.user_files import input_files
 
 #: Packages on whose code rows depend; reports and commands change no row.
 _CODE = ("sim", "algorithms", "scenarios", "campaigns")
-
 #: Keys of a configuration that change no row of a finished case.
 _KEYS_WITHOUT_EFFECT = frozenset({"appended", "description", "limits", "most_cases", "requirements", "retain"})
-
 _HOME = Path(__file__).resolve().parents[2]
 
 
@@ -54,20 +55,11 @@ class Identity:
     versions: Mapping[str, str]
     inputs: Mapping[str, str] | None = None
 
-    def plain(self) -> dict[str, Any]:
-        """As stored in the record."""
-        return asdict(self)
-
     @classmethod
     def read(cls, stored: Mapping[str, Any]) -> Self:
         """Identity stored in a record."""
-        inputs = stored.get("inputs")
-        return cls(
-            str(stored["configuration"]),
-            str(stored["code"]),
-            dict(stored["versions"]),
-            None if inputs is None else dict(inputs),
-        )
+        inputs = None if stored.get("inputs") is None else dict(stored["inputs"])
+        return cls(str(stored["configuration"]), str(stored["code"]), dict(stored["versions"]), inputs)
 
     def differences(self, other: Identity) -> list[str]:
         """Differences from another identity, each in a few words."""
@@ -84,14 +76,12 @@ def identity_of(configuration: CampaignConfiguration) -> Identity:
 
     Raises CampaignError where a file that the parameters name cannot be used any more.
     """
-    named = (scenario_source(configuration.scenario), *selected_algorithms(configuration))
-    named = (*named, *selected_parts(configuration))
-    return Identity(
-        configuration_hash(configuration), code_hash(named), package_versions(), input_hashes(configuration)
-    )
+    custom = (*list_algorithms(configuration), *list_parts(configuration))
+    code = hash_code((scenario_source(configuration.scenario), *custom))
+    return Identity(configuration_hash(configuration), code, read_versions(), hash_inputs(configuration))
 
 
-def input_hashes(configuration: CampaignConfiguration) -> dict[str, str]:
+def hash_inputs(configuration: CampaignConfiguration) -> dict[str, str]:
     """SHA-256 of each file that the parameters or their dispersions name, by path.
 
     Raises CampaignError where the scenario refuses the parameters, for example because a file is missing or has
@@ -106,44 +96,48 @@ def input_hashes(configuration: CampaignConfiguration) -> dict[str, str]:
         raise CampaignError(f"the campaign's parameters cannot be used any more: {reasons}") from error
     dispersed = [one for one in configuration.dispersions.values() if isinstance(one, Choice | Fixed | Grid)]
     stated = [value for one in dispersed for extreme in one.extremes() for _, value in leaves(extreme)]
-    names = [*input_files(parameters), *(value for value in stated if isinstance(value, str) and Path(value).is_file())]
-    return {name: _file_hash(Path(name)) for name in dict.fromkeys(names) if Path(name).is_file()}
+    hashes: dict[str, str] = {}
+    for name in dict.fromkeys((*input_files(parameters), *(value for value in stated if isinstance(value, str)))):
+        if Path(name).is_file():
+            try:
+                with Path(name).open("rb") as file:
+                    hashes[name] = hashlib.file_digest(file, "sha256").hexdigest()
+            except OSError as error:
+                raise CampaignError(f"{name}: cannot be read: {error.strerror or error}") from error
+    return hashes
 
 
-def _file_hash(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise CampaignError(f"{path}: cannot be read: {error.strerror or error}") from error
-
-
-def selected_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
+def list_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
     """Algorithms under test that a configuration or its dispersions name."""
     used = _scenario(configuration)
     if not isinstance(used, HasAlgorithms):
         return ()
-    table: Any = configuration.parameters
-    for part in used.algorithm_table:
-        table = table.get(part, {})
-    path = ".".join((*used.algorithm_table, "algorithm"))
-    dispersed = configuration.dispersions.get(path)
-    varied = [] if dispersed is None else [str(value) for value in dispersed.extremes()]
-    stated = [table.get("algorithm", ""), *table.get("compared", ()), *varied]
-    return tuple(str(spec) for spec in dict.fromkeys(stated) if spec)
+    judged, compared = (".".join((*used.algorithm_table, name)) for name in ("algorithm", "compared"))
+    stated = [find_value(configuration.parameters, judged), *find_value(configuration.parameters, compared)]
+    if judged in configuration.dispersions:
+        stated += configuration.dispersions[judged].extremes()
+    return tuple(dict.fromkeys(str(spec) for spec in stated if spec))
 
 
-def selected_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
+def list_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
     """Import paths (``module:name``) of the custom parts that a configuration or its dispersions name."""
     used = _scenario(configuration)
     if not isinstance(used, HasParts):
         return ()
     trees = [configuration.parameters]
     for path, dispersion in configuration.dispersions.items():
-        values = dispersion.extremes() if any(f"{key}.".startswith(f"{path}.") for key in used.part_keys) else ()
-        trees += [_nested(path, value) for value in values]
-    paths = [kind.path(spec) for tree in trees for key, kind in used.part_keys.items() for spec in _names_at(tree, key)]
-    return tuple(dict.fromkeys(paths))
+        if any(f"{key}.".startswith(f"{path}.") for key in used.part_keys):
+            for tree in dispersion.extremes():
+                for name in reversed(path.split(".")):
+                    tree = {name: tree}
+                trees.append(tree)
+    paths: dict[str, None] = {}
+    for tree in trees:
+        for key, kind in used.part_keys.items():
+            named = find_value(tree, key)
+            specs = [named] if isinstance(named, str) else [str(one) for one in named or ()]
+            paths.update(dict.fromkeys(map(kind.path, specs)))
+    return tuple(paths)
 
 
 def _scenario(configuration: CampaignConfiguration) -> Scenario | None:
@@ -153,21 +147,6 @@ def _scenario(configuration: CampaignConfiguration) -> Scenario | None:
         return None
 
 
-def _nested(path: str, value: Any) -> dict[str, Any]:
-    for part in reversed(path.split(".")):
-        value = {part: value}
-    return dict(value)
-
-
-def _names_at(tree: Any, path: str) -> list[str]:
-    """Name, or names, at a path of a tree; empty where there is none."""
-    try:
-        value = value_at(tree, path)
-    except ValueError:
-        return []
-    return [value] if isinstance(value, str) else [str(one) for one in value or ()]
-
-
 def configuration_hash(configuration: CampaignConfiguration) -> str:
     """Hash of a configuration's statements about cases."""
     stated = configuration.model_dump(mode="json", exclude=set(_KEYS_WITHOUT_EFFECT))
@@ -175,10 +154,13 @@ def configuration_hash(configuration: CampaignConfiguration) -> str:
 
 
 @cache
-def code_hash(named: tuple[str, ...]) -> str:
+def hash_code(named: tuple[str, ...]) -> str:
     """Hash of the sources on which rows depend; `named` are the scenario, algorithms and parts."""
-    custom = [source for one in named for source in custom_sources(one)]
-    return hash_sources((*_package_sources(), *custom))
+    sources: list[tuple[str, Path]] = []
+    for folder in _CODE:
+        for pattern in ("*.py", "*.json"):
+            sources += relative_to(_HOME, sorted((_HOME / folder).rglob(pattern)))
+    return hash_sources((*sources, *(source for one in named for source in custom_sources(one))))
 
 
 def hash_sources(sources: Iterable[tuple[str, Path]]) -> str:
@@ -191,42 +173,101 @@ def hash_sources(sources: Iterable[tuple[str, Path]]) -> str:
     return digest.hexdigest()
 
 
-def _package_sources() -> Iterator[tuple[str, Path]]:
-    for folder in _CODE:
-        for pattern in ("*.py", "*.json"):
-            yield from relative_to(_HOME, sorted((_HOME / folder).rglob(pattern)))
-
-
 def custom_sources(named: str) -> Iterator[tuple[str, Path]]:
     """Source files of a custom scenario, algorithm or part: package or module, program, or table of answers."""
     table = answers_file(named)
-    if table is not None:
-        yield table.name, table
-        return
     try:
-        command = parse_command(named)
+        command = None if table is not None else parse_command(named)
     except ValueError:
         return
-    if command is not None:
-        program = shutil.which(command.words[0])
-        words = [Path(word) for word in (program, *command.words[1:]) if word is not None]
+    if table is not None:
+        yield table.name, table
+    elif command is None:
+        yield from algorithm_sources(named)
+    else:
+        words = [Path(word) for word in (shutil.which(command.words[0]), *command.words[1:]) if word is not None]
         yield from ((path.name, path) for path in words if path.is_file())
-        return
-
-    yield from algorithm_sources(named)
 
 
-def package_versions() -> dict[str, str]:
+def read_versions() -> dict[str, str]:
     """Versions of Python, of Marsyard and of the packages that it requires."""
     try:
         requirements = metadata.requires("marsyard") or []
     except metadata.PackageNotFoundError:
         requirements = []
     names = {re.split(r"[^A-Za-z0-9._-]", text)[0] for text in requirements if "extra ==" not in text}
-    versions = {"python": platform.python_version()}
-    for name in sorted({"marsyard", *names}):
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions
+    versions = {name: _distribution_version(name) or "not installed" for name in sorted({"marsyard", *names})}
+    return {"python": platform.python_version(), **versions}
+
+
+def _distribution_version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
+    """Describe the algorithms that a campaign runs, the judged one first; empty where the scenario takes none.
+
+    Keys of each entry: `spec` (the campaign's name for it), `role` (`judged` or `compared`), `path` (class as
+    ``module:name``, or the file of the program or table), `version` (of the installed distribution, or the class's
+    `version` attribute; None where there is neither), `options` and `source_hash` (SHA-256, 16 digits; None where no
+    source can be read).
+    """
+    tested = campaign.scenario
+    if not isinstance(tested, HasAlgorithms):
+        return []
+    compared = find_value(campaign.configuration.parameters, ".".join((*tested.algorithm_table, "compared")))
+    parameters: Any = campaign.base_parameters()
+    for name in tested.algorithm_table:
+        parameters = getattr(parameters, name)
+    described = []
+    for spec in list_algorithms(campaign.configuration):
+        shipped = spec in tested.task.shipped
+        sources = list(source_files("algorithms:") if shipped else custom_sources(spec))
+        if shipped:
+            stated = (value for _, value in parameters if isinstance(value, tested.task.options))
+            algorithm = tested.task.shipped[spec](next(stated, tested.task.options()))
+            kind, version = type(algorithm), _distribution_version("marsyard")
+            path = f"{kind.__module__}:{kind.__qualname__}"
+            options = _plain_options(getattr(algorithm, "options", None))
+        else:
+            path, version, options = _describe_custom(spec)
+        described.append(
+            {
+                "spec": spec,
+                "role": "compared" if spec in compared else "judged",
+                "path": path,
+                "version": version,
+                "options": options,
+                "source_hash": hash_sources(sources)[:16] if sources else None,
+            }
+        )
+    return described
+
+
+def _describe_custom(spec: str) -> tuple[str, str | None, dict[str, Any]]:
+    """Class or file, version and options of a custom algorithm."""
+    command = parse_command(spec)
+    if command is not None or is_offline(spec):
+        return (spec.partition(":")[2] if command is None else command.words[0]), None, {}
+    point = installed().get(spec)
+    path, target = (spec, import_object(spec)) if point is None else (point.value, point.load())
+    top = path.partition(":")[0].partition(".")[0]
+    versions = map(_distribution_version, metadata.packages_distributions().get(top, []))
+    version = next((one for one in versions if one is not None), None) or getattr(target, "version", None)
+    return path, version if isinstance(version, str) else None, _plain_options(getattr(target, "options", None))
+
+
+def _plain_options(options: object) -> dict[str, Any]:
+    """Options as JSON values; empty where there are none, or JSON cannot hold them."""
+    try:
+        if isinstance(options, BaseModel):
+            options = options.model_dump(mode="json")
+        elif is_dataclass(options) and not isinstance(options, type):
+            options = asdict(options)
+        stated = {str(key): value for key, value in options.items()} if isinstance(options, Mapping) else {}
+        return dict(json.loads(json.dumps(stated, default=str)))
+    except Exception:  # custom values may raise anything, and the record must not stop a campaign
+        return {}

@@ -1,50 +1,57 @@
-"""Loading of a campaign: read its file, apply the options of the command line, and report all problems at once."""
+"""Loading of a campaign: read its file, apply the options of the command line, and report all problems at once.
+
+Dispersions, and the columns that requirements name, are checked against the scenario before any case runs.
+"""
 
 from __future__ import annotations
 
+import itertools
 import json
+import math
 import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves, value_at
 from marsyard.campaigns.definition.catalogue import catalogue
-from marsyard.campaigns.definition.checking import metric_problems, sampling_problems
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, Key, key_text, problems_of, read_tables
-from marsyard.campaigns.definition.requirements import completed
+from marsyard.campaigns.definition.configuration import (
+    POPULATIONS,
+    CampaignConfiguration,
+    Key,
+    Requirement,
+    key_text,
+    problems_of,
+    read_tables,
+)
+from marsyard.campaigns.definition.identity import list_algorithms
+from marsyard.campaigns.definition.requirements import fill_requirements
 from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
-from marsyard.campaigns.sampling.correlation import KINDS
-from marsyard.scenarios.interface import HasAlgorithms, Scenario
+from marsyard.campaigns.sampling.design import MATRICES
+from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
+from marsyard.scenarios.estimators import labels
+from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
+from marsyard.scenarios.parts.named import SCORE
 from marsyard.scenarios.registry import UnknownScenarioError, scenario
+from marsyard.scenarios.systems import RowColumns, row_columns
 
 #: Keys of the file that `--set` may name; any other key is one of the parameters.
 _FILE_KEYS = (
     *("parameters", "dispersions", "design", "retain", "limits"),
     *("cases", "seed", "name", "description", "scenario", "correlations"),
 )
-
+#: Cases whose draws are validated before a campaign starts; the range of each dispersion is checked in full.
+_CHECKED_CASES = 32
+#: Maximum number of dispersed parameters in the formulas of one dispersion: all combinations of extremes are checked.
+_MAX_VARYING = 8
+#: Kinds of columns that requirements name.
+FLAGS, NUMBERS = "column of true and false", "column of numbers"
+#: Columns that the engine writes.
+_ENGINE_FLAGS, _ENGINE_NUMBERS = ("answered",), ("wall_time_s", "cpu_time_s")
 Model = TypeVar("Model", bound=BaseModel)
-
-
-@dataclass(frozen=True)
-class _Document:
-    """Tables of a campaign file, and the command-line option behind each overridden key."""
-
-    where: str
-    tables: Mapping[str, Any]
-    overridden: Mapping[tuple[str, ...], str]
-
-    def problem(self, key: Key, message: str) -> Problem:
-        """Problem at a key, located in the file or in an option of the command line."""
-        for path, option in self.overridden.items():
-            shared = min(len(key), len(path))
-            if shared and key[:shared] == path[:shared]:
-                return Problem(option, key_text(key), message)
-        return Problem(self.where, key_text(key), message)
 
 
 def find_campaign(name_or_path: str) -> Path:
@@ -83,56 +90,49 @@ def load_campaign(
     path = find_campaign(name_or_path)
     tables = read_tables(path)
     overridden: dict[tuple[str, ...], str] = {}
+    words = ["marsyard", "run", name_or_path]
     for override in overrides:
-        tables = _apply_override(tables, override, overridden)
+        option = f"--set {override}"
+        tables = _apply_option(tables, _parse_override(override, option), option, overridden)
     if algorithms:
         tables = _select_algorithms(tables, algorithms, str(path), overridden)
     for key, option, value in (("cases", "-n", cases), ("seed", "--seed", seed)):
         if value is not None:
             tables[key] = value
             overridden[(key,)] = f"{option} {value}"
-    words = ["marsyard", "run", name_or_path]
-    words += [] if cases is None else ["-n", str(cases)]
-    words += [] if seed is None else ["--seed", str(seed)]
+            words += [option, str(value)]
     for option, values in (("--algorithm", algorithms), ("--set", overrides)):
         words += [word for value in values for word in (option, value)]
-    return replace(_validate(_Document(str(path), tables, overridden)), command=tuple(words))
+    return replace(_validate(str(path), tables, overridden), command=tuple(words))
 
 
-def _apply_override(tables: Mapping[str, Any], override: str, overridden: dict[tuple[str, ...], str]) -> dict[str, Any]:
-    """Tables with one ``KEY=VALUE`` applied; notes its keys in `overridden`."""
-    option = f"--set {override}"
+def _parse_override(override: str, option: str) -> dict[str, Any]:
     key, separator, value = override.partition("=")
     if not separator or not key.strip() or "\n" in override:
         raise ConfigurationError([Problem(option, "", "expected KEY=VALUE, such as --set render.backend=egl")])
-    value = value.strip()
     try:
         try:
-            stated = tomllib.loads(f"{key} = {value}")
+            stated = tomllib.loads(f"{key} = {value.strip()}")
         except ValueError:
-            stated = tomllib.loads(f"{key} = {json.dumps(value)}")
+            stated = tomllib.loads(f"{key} = {json.dumps(value.strip())}")
     except (ValueError, RecursionError) as error:
         raise ConfigurationError([Problem(option, "", f"'{key}' is not a dotted key: {error}")]) from error
-    if next(iter(stated)) not in _FILE_KEYS:
-        stated = {"parameters": stated}
-    return _apply_option(tables, stated, option, overridden)
+    return stated if next(iter(stated)) in _FILE_KEYS else {"parameters": stated}
 
 
 def _select_algorithms(
-    tables: Mapping[str, Any], algorithms: Sequence[str], where: str, overridden: dict[tuple[str, ...], str]
+    tables: dict[str, Any], algorithms: Sequence[str], where: str, overridden: dict[tuple[str, ...], str]
 ) -> dict[str, Any]:
     """Tables with other algorithms; unchanged for an unknown scenario, which is reported later."""
     options = [f"--algorithm {spec}" for spec in algorithms]
-    name = tables.get("scenario")
     try:
-        selected = scenario(name) if isinstance(name, str) and name else None
+        selected = _find_scenario(tables)
     except UnknownScenarioError:
         selected = None
     if selected is None:
-        return dict(tables)
+        return tables
     if not isinstance(selected, HasAlgorithms):
         raise ConfigurationError([Problem(options[0], "", f"the scenario of {where} has no choice of algorithms")])
-    changed = dict(tables)
     stated: tuple[tuple[str, Any, str], ...] = (
         ("algorithm", algorithms[0], options[0]),
         ("compared", list(algorithms[1:]), " ".join(options[1:]) or options[0]),
@@ -141,8 +141,14 @@ def _select_algorithms(
         inner: dict[str, Any] = {key: value}
         for part in reversed(("parameters", *selected.algorithm_table)):
             inner = {part: inner}
-        changed = _apply_option(changed, inner, option, overridden)
-    return changed
+        tables = _apply_option(tables, inner, option, overridden)
+    return tables
+
+
+def _find_scenario(tables: Mapping[str, Any]) -> Scenario | None:
+    """Scenario of a campaign's tables; None where they name none. Raises UnknownScenarioError."""
+    name = tables.get("scenario")
+    return scenario(name) if isinstance(name, str) and name else None
 
 
 def _apply_option(
@@ -150,44 +156,41 @@ def _apply_option(
 ) -> dict[str, Any]:
     """Tables merged with those of an option; parameters that it sets are no longer dispersed."""
     merged = _merge(tables, stated)
-    paths = _paths_set(stated)
+    paths = _list_paths(stated)
     overridden.update(dict.fromkeys(paths, option))
-    fixed = {".".join(path[1:]) for path in paths if path[0] == "parameters"}
+    fixed = [".".join(path[1:]) for path in paths if path[0] == "parameters"]
     dispersions = merged.get("dispersions")
-    if fixed and isinstance(dispersions, dict):
-        kept = {path: one for path, one in dispersions.items() if not any(_overlap(path, other) for other in fixed)}
-        removed = set(dispersions).difference(kept)
-        merged["dispersions"] = kept
+    if isinstance(dispersions, dict):
+        removed = {
+            path
+            for path in dispersions
+            if any(f"{path}.".startswith(f"{other}.") or other.startswith(f"{path}.") for other in fixed)
+        }
+        merged["dispersions"] = {path: one for path, one in dispersions.items() if path not in removed}
         if removed and isinstance(merged.get("correlations"), list):
-            groups = [_without_members(group, removed) for group in merged["correlations"]]
+            groups = [_remove_members(group, removed) for group in merged["correlations"]]
             merged["correlations"] = [group for group in groups if group != {}]
     return merged
 
 
-def _without_members(group: Any, removed: set[str]) -> Any:
+def _remove_members(group: Any, removed: set[str]) -> Any:
     """Correlated group without removed dispersions; empty where none is left; unchanged where it is not valid."""
     names = group.get("parameters") if isinstance(group, Mapping) else None
     if not isinstance(names, list):
         return group
     kept = [index for index, name in enumerate(names) if name not in removed]
     try:
-        matrices = {kind: [[rows[i][j] for j in kept] for i in kept] for kind in KINDS if (rows := group.get(kind))}
+        matrices = {kind: [[rows[i][j] for j in kept] for i in kept] for kind in MATRICES if (rows := group.get(kind))}
     except (IndexError, KeyError, TypeError):
         return group
     return {**group, "parameters": [names[index] for index in kept], **matrices} if kept else {}
 
 
-def _overlap(path: str, other: str) -> bool:
-    """Whether two paths are equal, or one contains the other."""
-    return f"{path}.".startswith(f"{other}.") or other.startswith(f"{path}.")
-
-
-def _paths_set(tables: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Keys at which nested tables hold a value."""
+def _list_paths(tables: Mapping[str, Any]) -> list[tuple[str, ...]]:
     paths: list[tuple[str, ...]] = []
     for name, inner in tables.items():
         nested = isinstance(inner, Mapping) and inner
-        paths += [(name, *path) for path in _paths_set(inner)] if nested else [(name,)]
+        paths += [(name, *path) for path in _list_paths(inner)] if nested else [(name,)]
     return paths
 
 
@@ -199,47 +202,223 @@ def _merge(tables: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any
     return merged
 
 
-def _validate(document: _Document) -> Campaign:
-    """Campaign of a document, its parameters completed with their defaults."""
-    tables, unresolved = completed(document.tables)
-    problems = [document.problem(key, message) for key, message in unresolved]
+def _validate(where: str, tables: Mapping[str, Any], overridden: Mapping[tuple[str, ...], str]) -> Campaign:
+    """Campaign of the tables of a file, its parameters completed with their defaults."""
+    problems: list[Problem] = []
+
+    def note(found: Iterable[tuple[Key, str]], prefix: Key = ()) -> None:
+        """Note problems at keys, located in the file or in the option of the command line that sets the key."""
+        for key, message in found:
+            key, location = (*prefix, *key), where
+            for path, option in overridden.items():
+                shared = min(len(key), len(path))
+                if shared and key[:shared] == path[:shared]:
+                    location = option
+                    break
+            problems.append(Problem(location, key_text(key), message))
+
+    def validated(model: type[Model], tables: Mapping[str, Any], prefix: Key = ()) -> Model | None:
+        try:
+            return model.model_validate(tables)
+        except ValidationError as error:
+            note(problems_of(error, model), prefix)
+            return None
+
+    tables, unresolved = fill_requirements(tables)
+    note(unresolved)
     if problems:
         raise ConfigurationError(problems)
-    configuration = _validate_model(CampaignConfiguration, document, tables, (), problems)
-    selected = _find_scenario(document, problems)
-    parameters = None
-    stated = document.tables.get("parameters", {})
+    configuration, selected, parameters = validated(CampaignConfiguration, tables), None, None
+    try:
+        selected = _find_scenario(tables)
+    except UnknownScenarioError as error:
+        note([(("scenario",), str(error))])
+    stated = tables.get("parameters", {})
     if selected is not None and isinstance(stated, Mapping):
-        parameters = _validate_model(selected.parameters_type, document, stated, ("parameters",), problems)
+        parameters = validated(selected.parameters_type, stated, ("parameters",))
     if configuration is None or selected is None or parameters is None:
         raise ConfigurationError(problems)
     complete = parameters.model_dump(mode="json", round_trip=True)
     campaign = Campaign(configuration.model_copy(update={"parameters": complete}), selected)
-    invalid = [*sampling_problems(campaign), *metric_problems(campaign)]
-    problems += [document.problem(key, message) for key, message in invalid]
+    note([*_check_sampling(campaign), *_check_metrics(campaign)])
     if problems:
         raise ConfigurationError(problems)
     return campaign
 
 
-def _validate_model(
-    model: type[Model], document: _Document, tables: Mapping[str, Any], prefix: Key, problems: list[Problem]
-) -> Model | None:
-    """Model of some tables, or None with its problems appended."""
+def _check_sampling(campaign: Campaign) -> list[tuple[Key, str]]:
+    """Problems of the campaign's dispersions: keys, and messages with the allowed values."""
+    problems = [*campaign.configuration.find_sampling_problems(), *_check_names(campaign)] or _check_ranges(campaign)
+    if problems or not campaign.configuration.dispersions:
+        return problems
+    for case in range(min(campaign.configuration.cases, _CHECKED_CASES)):
+        try:
+            refused = _find_refusal(campaign, campaign.draws(case))
+        except ValueError as error:
+            refused = _extract_message(error)
+        if refused:
+            return [(("dispersions",), f"the draws of case {case} are refused together: {refused}")]
+    return []
+
+
+def _check_names(campaign: Campaign) -> list[tuple[Key, str]]:
+    """Unknown parameters that dispersions or formulas name, and cycles of formulas."""
+    parameters = dict(leaves(campaign.configuration.parameters))
+    dispersions = campaign.configuration.dispersions
+    problems: list[tuple[Key, str]] = []
+    for path, dispersion in dispersions.items():
+        takes_tables = isinstance(dispersion, Choice | Fixed) or (
+            isinstance(dispersion, Grid) and dispersion.values is not None
+        )
+        if path not in parameters and not any(leaf.startswith(f"{path}.") for leaf in parameters):
+            problems.append((("dispersions", path), _describe_unknown(path, parameters)))
+        elif path not in parameters and not takes_tables:
+            message = "is a table; disperse one of its values, or choose between tables"
+            problems.append((("dispersions", path), message))
+        for key, name in ((key, name) for key, formula in dispersion.formulas.items() for name in formula.names):
+            parent = next((other for other in dispersions if name.startswith(f"{other}.")), None)
+            if parent is not None:
+                message = f"'{name}' lies within '{parent}', which is dispersed as a whole"
+            else:
+                message = "" if name in parameters else _describe_unknown(name, parameters)
+            problems += [(("dispersions", path, *key), message)] if message else []
+    if not problems:
+        try:
+            campaign.order  # noqa: B018  (evaluates the property)
+        except ValueError as error:
+            problems.append((("dispersions",), str(error)))
+    return problems
+
+
+def _describe_unknown(path: str, parameters: Iterable[str]) -> str:
+    """Message that lists the parameters in the innermost existing table of a path; its subtables by name only."""
+    allowed = names = list(parameters)
+    table = path
+    while table:
+        table = table.rpartition(".")[0]
+        prefix = f"{table}." if table else ""
+        inside = [name.removeprefix(prefix).partition(".") for name in names if name.startswith(prefix)]
+        if inside:
+            allowed = list(dict.fromkeys(f"{prefix}{head}{'.*' if rest else ''}" for head, rest, _ in inside))
+            break
+    return not_allowed("parameter", path, names, allowed)
+
+
+def _check_ranges(campaign: Campaign) -> list[tuple[Key, str]]:
+    """Values that a parameter refuses, and formulas without a value, at the extremes of the dispersions."""
+    problems: list[tuple[Key, str]] = []
+    extremes: dict[str, list[Any]] = {}
+    for path in campaign.order:
+        if any(name in campaign.marginals and name not in extremes for name in campaign.marginals[path].names):
+            continue  # a dispersion that it depends on has a problem already
+        try:
+            values = _check_extremes(campaign, path, extremes)
+        except ValueError as error:
+            problems.append((("dispersions", path), _extract_message(error)))
+            continue
+        numbers = [value for value in values if isinstance(value, int | float) and not isinstance(value, bool)]
+        all_numbers = len(numbers) == len(values)
+        extremes[path] = list(dict.fromkeys((min(numbers), max(numbers)))) if all_numbers else values
+    return problems
+
+
+def _check_extremes(campaign: Campaign, path: str, extremes: Mapping[str, list[Any]]) -> list[Any]:
+    """Extreme values of a dispersion at all combinations of the extremes that its formulas name.
+
+    Raises ValueError for the first that is not valid.
+    """
+    dispersion, parameters = campaign.marginals[path], campaign.configuration.parameters
+    varying = [name for name in dispersion.names if name in extremes]
+    if len(varying) > _MAX_VARYING:
+        raise ValueError(f"its formulas name {len(varying)} parameters that vary; allowed: up to {_MAX_VARYING}")
+    fixed = {name: value_at(parameters, name) for name in dispersion.names if name not in varying}
+    checked: list[Any] = []
+    for corner in itertools.product(*(extremes[name] for name in varying)):
+        values = dict(zip(varying, corner, strict=True))
+        given = dispersion.insert_values({**fixed, **values})
+        for value in given.extremes():
+            refused = _find_refusal(campaign, {**values, path: value})
+            if refused:
+                where = "".join(f" where {name} = {one}" for name, one in values.items())
+                text = f"{given.describe()} reaches {value!r}{where}, which the parameter does not take: {refused}"
+                raise ValueError(text)
+            checked.append(value)
+    return checked
+
+
+def _find_refusal(campaign: Campaign, values: Mapping[str, Any]) -> str:
+    """Reason why the scenario refuses its parameters with these values; empty where it accepts them."""
+    infinite = [path for path, value in values.items() if isinstance(value, float) and not math.isfinite(value)]
+    if infinite:
+        return f"{infinite[0]} must be finite"
     try:
-        return model.model_validate(tables)
+        campaign.with_values(values)
     except ValidationError as error:
-        problems += [document.problem((*prefix, *key), message) for key, message in problems_of(error, model)]
-        return None
+        problems = problems_of(error, campaign.scenario.parameters_type)
+        return "; ".join(f"{key_text(key)}: {message}" if key else message for key, message in problems)
+    return ""
 
 
-def _find_scenario(document: _Document, problems: list[Problem]) -> Scenario | None:
-    """Scenario of a document, or None with its problem appended."""
-    name = document.tables.get("scenario")
-    if not isinstance(name, str) or not name:
-        return None
+def _extract_message(error: ValueError) -> str:
+    if isinstance(error, ValidationError):
+        return "; ".join(str(detail["msg"]).removeprefix("Value error, ") for detail in error.errors())
+    return str(error)
+
+
+def _check_metrics(campaign: Campaign) -> list[tuple[Key, str]]:
+    """Columns that requirements name and the scenario does not state: keys, and messages with the allowed columns.
+
+    Columns of custom scores are accepted by their prefix. Columns of a custom scenario are unknown here: its first
+    finished case is checked instead (`marsyard.campaigns.running.engine.check_metrics`).
+    """
     try:
-        return scenario(name)
-    except UnknownScenarioError as error:
-        problems.append(document.problem(("scenario",), str(error)))
+        columns = _collect_columns(campaign)
+    except ValueError as error:
+        return [(("scenario",), str(error))]
+    if columns is None:
+        return []
+    compared = labels(list_algorithms(campaign.configuration))[1:]
+
+    def is_known(name: str, kind: str) -> bool:
+        unlabelled = next((name.removeprefix(f"{one}.") for one in compared if name.startswith(f"{one}.")), name)
+        return columns.has_number(unlabelled) if kind == NUMBERS else columns.has_flag(unlabelled)
+
+    return find_unknown_columns(campaign.configuration.requirements, columns.flags, columns.numbers, is_known)
+
+
+def find_unknown_columns(
+    requirements: Sequence[Requirement],
+    flags: Sequence[str],
+    numbers: Sequence[str],
+    is_known: Callable[[str, str], bool],
+) -> list[tuple[Key, str]]:
+    """Columns of requirements that are not known by their name and kind: keys, and messages with the allowed ones."""
+    problems: list[tuple[Key, str]] = []
+    for index, requirement in enumerate(requirements):
+        kind, allowed = (FLAGS, flags) if requirement.bound is None else (NUMBERS, numbers)
+        named = [("metric", name, kind, allowed) for name in requirement.metric_columns]
+        named += [("population", name, FLAGS, (*POPULATIONS, *flags)) for name in requirement.population_columns]
+        for key, name, wanted, listed in named:
+            if not is_known(name, wanted):
+                problems.append((("requirements", index, key), not_allowed(wanted, name, listed)))
+    return problems
+
+
+def _collect_columns(campaign: Campaign) -> RowColumns | None:
+    """Columns of the scenario and of the campaign's parameters; None where they are not known."""
+    configuration = campaign.configuration
+    stated = row_columns(configuration.scenario)
+    if stated is None:
         return None
+    scores: list[str] = []
+    keys = campaign.scenario.part_keys if isinstance(campaign.scenario, HasParts) else {}
+    for path in (path for path, kind in keys.items() if kind is SCORE):
+        if path in configuration.dispersions:
+            return None
+        scores += [f"{label}_*" for label in labels(find_value(configuration.parameters, path))]
+    flags = find_value(configuration.parameters, stated.named_flags) if stated.named_flags else ()
+    return replace(
+        stated,
+        flags=(*stated.flags, *_ENGINE_FLAGS, *(str(one["name"]) for one in flags), *scores),
+        numbers=(*stated.numbers, *_ENGINE_NUMBERS, *scores),
+    )

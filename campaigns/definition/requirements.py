@@ -42,12 +42,12 @@ def read_requirements(path: Path) -> tuple[StatedRequirement, ...]:
 
     Raises ConfigurationError where it cannot be read, or is not valid; every problem with its key.
     """
-    stated = read_table(path, _File)
-    ids = [one.id for one in stated.requirements]
+    stated = read_table(path, _File).requirements
+    ids = [one.id for one in stated]
     repeated = sorted({name for name in ids if ids.count(name) > 1})
     if repeated:
         raise ConfigurationError([Problem(str(path), "requirements", f"share an id: {', '.join(repeated)}")])
-    return stated.requirements
+    return stated
 
 
 @cache
@@ -69,12 +69,12 @@ def _read_shipped() -> tuple[Mapping[str, StatedRequirement], tuple[str, ...]]:
     return found, tuple(problems)
 
 
-def applicable(stated: Sequence[StatedRequirement], campaign: str) -> list[dict[str, Any]]:
+def select_applicable(stated: Sequence[StatedRequirement], campaign: str) -> list[dict[str, Any]]:
     """Requirements that a campaign of that name verifies, as campaigns state them."""
     return [one.plain() for one in stated if one.applies_to(campaign)]
 
 
-def completed(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[Key, str]]]:
+def fill_requirements(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[Key, str]]]:
     """Tables of a campaign with its named requirements filled in, and the problems of the names.
 
     An entry without a metric names a requirement by its `id`, and may change the keys in `_CHANGEABLE`.
@@ -88,12 +88,11 @@ def completed(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[Key
         if not isinstance(entry, Mapping) or "metric" in entry or "id" not in entry:
             filled.append(entry)
             continue
-        named = shipped_requirements().get(str(entry["id"]))
+        shipped, unusable = _read_shipped()
+        named = shipped.get(str(entry["id"]))
         wrong = [key for key in entry if key not in ("id", *_CHANGEABLE)]
         if named is None:
-            message = "; ".join(
-                (not_allowed("requirement", str(entry["id"]), shipped_requirements()), *_read_shipped()[1])
-            )
+            message = "; ".join((not_allowed("requirement", str(entry["id"]), shipped), *unusable))
             problems.append((("requirements", index, "id"), f"{message}; or state a metric"))
         problems += [(("requirements", index, key), "is stated in requirements.toml already") for key in wrong]
         if named is not None and not wrong:

@@ -1,1 +1,1 @@
-"""Who runs cases, and how one runs: worker processes that are watched, here or on a cluster."""
+"""Execution of cases in monitored worker processes, on this machine or on a cluster."""

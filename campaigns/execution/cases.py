@@ -9,6 +9,7 @@ import traceback
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
@@ -16,19 +17,10 @@ from typing import Any
 from marsyard.algorithms.faults import describe_error
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, Requirement
-from marsyard.campaigns.execution.work import Executor, Work, WorkLimits
-from marsyard.campaigns.execution.worker_process import (
-    LOADING_S,
-    TaskResult,
-    accept_process_state,
-    leave_note,
-    limit_threads,
-    request_fresh_worker,
-    start_clock,
-)
+from marsyard.campaigns.execution import worker_process
+from marsyard.campaigns.execution.worker_process import Executor, TaskResult, Work, WorkLimits
 from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, UNFINISHED, CaseEndedError
-from marsyard.campaigns.store.products import PackedProducts, pack_products
-from marsyard.campaigns.store.retention import Keep
+from marsyard.campaigns.store.products import Keep, PackedProducts, pack_products
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by
 from marsyard.scenarios.registry import scenario
@@ -36,7 +28,6 @@ from marsyard.sim.cache import CacheWarning
 
 #: Maximum bit length of stored integers: a float64 is below 2 ** 1024.
 _MAX_INT_BITS = 1023
-
 #: Maximum length of an error's text, or of a traceback, in a row: beginning and end.
 _MAX_TEXT = 8000
 
@@ -59,14 +50,14 @@ def configuration_text(configuration: CampaignConfiguration) -> str:
 
 
 @lru_cache(maxsize=1)
-def _campaign(configuration: str) -> Campaign:
+def _load_campaign(configuration: str) -> Campaign:
     """Campaign of a configuration, cached since loading takes time."""
-    start_clock(grace_s=LOADING_S)
+    worker_process.start_clock(grace_s=worker_process.LOADING_S)
     stated = CampaignConfiguration.model_validate_json(configuration)
     found = scenario(stated.scenario)
-    limit_threads()
-    accept_process_state()
-    start_clock()
+    worker_process.limit_threads()
+    worker_process.accept_process_state()
+    worker_process.start_clock()
     return Campaign(stated, found)
 
 
@@ -80,22 +71,22 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
     conditions: dict[str, Scalar] = {}
 
     def record(columns: Mapping[str, Scalar]) -> None:
-        conditions.update(_scenario_columns(columns))
-        leave_note(json.dumps({"case": case, "conditions": conditions}))
+        conditions.update(_convert_columns(columns))
+        worker_process.leave_note(json.dumps({"case": case, "conditions": conditions}))
 
     try:
-        campaign = _campaign(configuration)
+        campaign = _load_campaign(configuration)
         wall, cpu = time.perf_counter(), time.process_time()
         with conditions_recorded_by(record):
             result = campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
-        row = _finished_row(case, result, campaign.configuration.requirements)
+        row = _build_finished_row(case, result, campaign.configuration.requirements)
         products = result.products
     except BaseException as error:
         outcome = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
-        row = unfinished_row(case, outcome, describe_error(error), traceback.format_exc(), conditions)
+        row = make_unfinished_row(case, outcome, describe_error(error), traceback.format_exc(), conditions)
     row = {**row, "wall_time_s": time.perf_counter() - wall, "cpu_time_s": time.process_time() - cpu}
     if row["outcome"] in (CRASHED, OUT_OF_MEMORY):
-        request_fresh_worker()
+        worker_process.request_fresh_worker()
     if not products or not keep.wants(row):
         return CompletedCase(row)
     try:
@@ -106,7 +97,7 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
 
 def prepare_input(configuration: str, shared_input: int) -> str:
     """Build or verify one input that cases share; return the warnings of the cache, empty if there are none."""
-    campaign = _campaign(configuration)
+    campaign = _load_campaign(configuration)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CacheWarning)
         campaign.scenario.prepare(campaign.base_parameters(), shared_input)
@@ -123,51 +114,43 @@ def run_cases(
 ) -> Iterator[list[CompletedCase]]:
     """Run cases, and yield them as they end; a case whose worker died or was ended has a row as well."""
     task: Callable[[int], CompletedCase] = partial(run_case, configuration_text(configuration), keep)
-    state_notes = StateNotes()
-    for ended in executor.run(Work(task, cases, case_limits(configuration.limits), total)):
+    noted: Counter[str] = Counter()
+    limits = work_limits(configuration.limits, configuration.limits.case_time_s)
+    for ended in executor.run(Work(task, cases, limits, total)):
         completed = []
         for done in ended:
-            one = _completed_case(done)
-            note = "; ".join(filter(None, (one.note, state_notes.describe(done))))
+            times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}
+            one = done.result or CompletedCase({**_build_lost_row(done.item, done.error), **times})
+            note = "; ".join(filter(None, (one.note, *_describe_changes(done, noted))))
             completed.append(replace(one, note=note))
         yield completed
 
 
-def case_limits(limits: Limits) -> WorkLimits:
-    """Limits of one case."""
+def work_limits(limits: Limits, time_s: float) -> WorkLimits:
+    """Limits of one case, or of building one shared input, with its limit of time."""
     memory = None if limits.memory_gb is None else limits.memory_gb * 1e9
-    return WorkLimits(limits.case_time_s, memory, limits.output_mb * 1e6)
+    return WorkLimits(time_s, memory, limits.output_mb * 1e6)
 
 
-def prepare_limits(limits: Limits) -> WorkLimits:
-    """Limits of building one shared input."""
-    return WorkLimits(limits.prepare_time_s, case_limits(limits).memory_bytes, limits.output_mb * 1e6)
+def _build_lost_row(case: int, error: Exception | None) -> Row:
+    """Row of a case that did not return, with the conditions that it recorded before its process ended."""
+    if not isinstance(error, CaseEndedError):
+        return make_unfinished_row(case, CRASHED, describe_error(error), "")
+    trace, conditions = error.trace, {}
+    lines = trace.splitlines()
+    call = next((index for index, line in enumerate(lines) if line.endswith(" in run_case")), None)
+    if call is not None:
+        # without the frames above the engine's call of the scenario
+        after = next((k for k in range(call + 1, len(lines)) if not lines[k].startswith("  File ")), len(lines))
+        trace = "\n".join([*lines[: call + 1], *lines[after:]])
+    # the process may have ended while writing, and other code may have written there
+    with suppress(ValueError, TypeError, LookupError, AttributeError, RecursionError):
+        left = json.loads(error.note)
+        conditions = _convert_columns(left["conditions"]) if left["case"] == case else {}
+    return make_unfinished_row(case, error.outcome, str(error), trace, conditions)
 
 
-def _completed_case(done: TaskResult[CompletedCase]) -> CompletedCase:
-    """Row of a case, also of one that did not return."""
-    if done.result is not None:
-        return done.result
-    error = done.error
-    if isinstance(error, CaseEndedError):
-        conditions = _recorded_conditions(done.item, error.note)
-        row = unfinished_row(done.item, error.outcome, str(error), _crop_trace(error.trace), conditions)
-    else:
-        row = unfinished_row(done.item, CRASHED, describe_error(error), "")
-    return CompletedCase({**row, "wall_time_s": float("nan"), "cpu_time_s": float("nan")})
-
-
-def _recorded_conditions(case: int, note: str) -> Mapping[str, Scalar]:
-    """Columns that a case recorded before its process ended."""
-    try:
-        left = json.loads(note)
-        return _scenario_columns(left["conditions"]) if left["case"] == case else {}
-    except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
-        # the process ended while writing, or other code wrote there
-        return {}
-
-
-def unfinished_row(
+def make_unfinished_row(
     case: int, outcome: str, error: str, trace: str, conditions: Mapping[str, Scalar] | None = None
 ) -> Row:
     """Row of an unfinished case, with the conditions that it had recorded."""
@@ -176,109 +159,79 @@ def unfinished_row(
         "outcome": outcome,
         "answered": False,
         **(conditions or {}),
-        "error": _plain_text(error),
-        "traceback": _plain_text(trace),
+        "error": _clean_text(error),
+        "traceback": _clean_text(trace),
     }
 
 
-def _crop_trace(trace: str) -> str:
-    """Stack trace without the frames above the engine's call of the scenario."""
-    lines = trace.splitlines()
-    call = next((index for index, line in enumerate(lines) if line.endswith(" in run_case")), None)
-    if call is None:
-        return trace
-    after = next((k for k in range(call + 1, len(lines)) if not lines[k].startswith("  File ")), len(lines))
-    return "\n".join([*lines[: call + 1], *lines[after:]])
-
-
-def _plain_text(text: str) -> str:
+def _clean_text(text: str) -> str:
     """Text in UTF-8, shortened, without object addresses, which change from run to run."""
     if len(text) > _MAX_TEXT:
         half = _MAX_TEXT // 2
         text = f"{text[:half]}\n... {len(text) - 2 * half} characters left out ...\n{text[-half:]}"
     text = re.sub(r"\b0x[0-9a-fA-F]{4,}\b", "0x...", text)
-    return _utf8(text)
+    return _replace_surrogates(text)
 
 
-def _finished_row(case: int, result: CaseResult, requirements: Sequence[Requirement]) -> Row:
+def _build_finished_row(case: int, result: CaseResult, requirements: Sequence[Requirement]) -> Row:
     """Row of a finished case, in plain Python values.
 
-    Raises TypeError or ValueError where a column cannot be stored, or cannot be judged by a requirement.
+    Raises TypeError or ValueError where a column cannot be stored, or a metric or population column has another type in
+    this case: one such value would make the whole stored column text, and the requirement undecidable.
     """
     failure = result.failure
     if (result.outcome in UNFINISHED) != (failure is not None):
         raise ValueError(f"the outcome {result.outcome} is kept for cases that do not come to an end")
-    columns = _scenario_columns(result.row)
-    _check_requirements(columns, requirements)
-    head: Row = {"case": case, "outcome": _utf8(str(result.outcome)), "answered": bool(result.answered)}
-    if failure is None:
-        return {**head, **columns, "error": "", "traceback": ""}
-    return {**head, **columns, "error": _plain_text(failure.error), "traceback": _plain_text(failure.trace)}
+    columns = _convert_columns(result.row)
+    for requirement in requirements:
+        metrics, has_bound = requirement.metric_columns, requirement.bound is not None
+        for name in (*requirement.population_columns, *(() if has_bound else metrics)):
+            if type(columns.get(name, True)) is not bool:
+                raise TypeError(f"column {name} holds {columns[name]!r:.100}; {requirement.id} needs true or false")
+        for name in metrics if has_bound else ():
+            if type(columns.get(name, 0.0)) is str:
+                raise TypeError(f"column {name} holds {columns[name]!r:.100}; {requirement.id} needs a number")
+    error, trace = ("", "") if failure is None else (_clean_text(failure.error), _clean_text(failure.trace))
+    head: Row = {"case": case, "outcome": _replace_surrogates(str(result.outcome)), "answered": bool(result.answered)}
+    return {**head, **columns, "error": error, "traceback": trace}
 
 
-def _scenario_columns(row: Mapping[str, Any]) -> dict[str, Scalar]:
-    """Columns of a scenario in plain Python values. Raises ValueError or TypeError where they cannot be stored."""
+def _convert_columns(row: Mapping[str, Any]) -> dict[str, Scalar]:
+    """Columns of a scenario in plain Python values; NumPy scalars are unwrapped.
+
+    Raises ValueError or TypeError where they cannot be stored.
+    """
     clashes = sorted({*LEADING_COLUMNS, *TRAILING_COLUMNS}.intersection(row))
     if clashes:
         raise ValueError(f"the scenario's row has columns that the engine writes: {', '.join(clashes)}")
-    return {_utf8(str(name)): _plain(str(name), value) for name, value in row.items()}
+    columns: dict[str, Scalar] = {}
+    for name, value in row.items():
+        plain = value.item() if hasattr(value, "item") and getattr(value, "ndim", 0) == 0 else value
+        if type(plain) not in (float, int, bool, str):
+            raise TypeError(f"column {name} holds a {type(value).__name__}; allowed: float, int, str, bool")
+        if type(plain) is int and plain.bit_length() > _MAX_INT_BITS:
+            bits = plain.bit_length()
+            raise ValueError(f"column {name} holds an integer of {bits} bits, beyond what a float can hold")
+        columns[_replace_surrogates(str(name))] = _replace_surrogates(plain) if isinstance(plain, str) else plain
+    return columns
 
 
-def _check_requirements(columns: Mapping[str, Scalar], requirements: Sequence[Requirement]) -> None:
-    """Raise TypeError where a metric or population column has another type in this case.
-
-    One such value would make the whole stored column text, and the requirement undecidable.
-    """
-    for asked in requirements:
-        flags = (*asked.population_columns, *(asked.metric_columns if asked.bound is None else ()))
-        for name in flags:
-            if name in columns and type(columns[name]) is not bool:
-                raise TypeError(f"column {name} holds {columns[name]!r:.100}; {asked.id} needs true or false")
-        for name in () if asked.bound is None else asked.metric_columns:
-            if type(columns.get(name, 0.0)) is str:
-                raise TypeError(f"column {name} holds {columns[name]!r:.100}; {asked.id} needs a number")
-
-
-def _utf8(text: str) -> str:
+def _replace_surrogates(text: str) -> str:
     """Text without lone surrogates."""
     return text.encode("utf-8", errors="replace").decode("utf-8")
-
-
-def _plain(column: str, value: Any) -> Scalar:
-    """Value as a plain Python scalar; NumPy scalars are unwrapped."""
-    plain = value.item() if hasattr(value, "item") and getattr(value, "ndim", 0) == 0 else value
-    if type(plain) is int and plain.bit_length() > _MAX_INT_BITS:
-        raise ValueError(f"column {column} holds an integer of {plain.bit_length()} bits, beyond what a float can hold")
-    if type(plain) in (float, int, bool):
-        return plain  # type: ignore[no-any-return]
-    if type(plain) is str:
-        return _utf8(plain)
-    raise TypeError(f"column {column} holds a {type(value).__name__}; allowed: float, int, str, bool")
 
 
 #: Maximum number of cases that are named for each kind of change.
 _MAX_NOTED = 3
 
 
-class StateNotes:
-    """Notes on cases that changed their worker process, limited per kind of change, for one run."""
-
-    def __init__(self) -> None:
-        self._noted: Counter[str] = Counter()
-
-    def describe(self, done: TaskResult[Any]) -> str:
-        """Note on a case; empty where it changed nothing, or enough cases of the same kind were noted."""
-        notes = [
-            self._limit(name.partition(" (")[0], f"case {done.item} changed its worker process: {name}")
-            for name in done.changed
-        ]
-        if done.spoiled_by is not None:
-            text = f"case {done.item} crashed in the worker that had run case {done.spoiled_by}, and not in a fresh one"
-            notes.append(self._limit("spoiled", f"{text}: an earlier case changed the state of that worker"))
-        return "; ".join(filter(None, notes))
-
-    def _limit(self, kind: str, text: str) -> str:
-        self._noted[kind] += 1
-        if self._noted[kind] > _MAX_NOTED:
-            return ""
-        return f"{text} (further cases of this kind are not named)" if self._noted[kind] == _MAX_NOTED else text
+def _describe_changes(done: TaskResult[Any], noted: Counter[str]) -> Iterator[str]:
+    """Yield notes on a case that changed its worker process; `noted` limits the notes of each kind in one run."""
+    notes = [(name.partition(" (")[0], f"case {done.item} changed its worker process: {name}") for name in done.changed]
+    if done.spoiled_by is not None:
+        text = f"case {done.item} crashed in the worker that had run case {done.spoiled_by}, and not in a fresh one"
+        notes.append(("spoiled", f"{text}: an earlier case changed the state of that worker"))
+    for kind, text in notes:
+        noted[kind] += 1
+        if noted[kind] <= _MAX_NOTED:
+            yield f"{text} (further cases of this kind are not named)" if noted[kind] == _MAX_NOTED else text

@@ -15,31 +15,25 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
-from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
-from marsyard.campaigns.definition.identity import code_hash, package_versions
+from marsyard.campaigns.definition.identity import hash_code, read_versions
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.work import Batches, Work
-from marsyard.campaigns.execution.worker_process import TaskResult
-from marsyard.campaigns.execution.workers import LocalExecutor
+from marsyard.campaigns.execution.worker_process import TaskResult, Work
+from marsyard.campaigns.execution.workers import Batches, LocalExecutor
 from marsyard.campaigns.outcomes import CRASHED, CaseEndedError
 
 Result = TypeVar("Result")
-
 #: Seconds to wait for a scheduler, and for a first worker.
 _REACH_S = 30
-
 #: Batches queued at each Dask worker, so that none waits for the network.
 _QUEUED_BATCHES = 2
-
-_LOCAL = "local:"
-
 _thread_state = threading.local()
 
 
-class ClusterExecutor:
+class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
     """Workers of a Dask cluster, as a context.
 
     address: of a scheduler (`tcp://host:8786`), or `local:N` for a cluster of N workers on this machine.
@@ -52,71 +46,61 @@ class ClusterExecutor:
         except ImportError as error:
             raise CampaignError("a cluster needs Dask: pip install 'marsyard[dask]'") from error
         self._distributed = distributed
-        self._cluster: Any = _local_cluster(address) if address.startswith(_LOCAL) else None
-        try:
-            if self._cluster is None:
-                # Checked first: Dask leaves a client with a bad address to garbage collection, which can deadlock with
-                # the next client for 10 s.
-                distributed.comm.get_address_host_port(address)
-            self._client = distributed.Client(self._cluster or address, timeout=_REACH_S, set_as_default=False)
-        except (OSError, ValueError, ImportError) as error:
-            raise CampaignError(f"--cluster {address}: no scheduler answers: {error}") from error
-        try:
-            self._client.wait_for_workers(1, timeout=_REACH_S)
-            self._check_code()
-        except TimeoutError as error:
-            self._close()
-            raise CampaignError(f"--cluster {address}: the scheduler has no workers") from error
-        except BaseException:
-            self._close()
-            raise
+        number = address.removeprefix("local:")
+        with ExitStack() as stack:
+            try:
+                cluster: Any = None
+                if number == address:
+                    # Checked first: Dask leaves a client with a bad address to garbage collection, which can deadlock
+                    # with the next client for 10 s.
+                    distributed.comm.get_address_host_port(address)
+                else:
+                    cluster = _local_cluster(address, number)
+                    stack.callback(cluster.close)
+                self._client = distributed.Client(cluster or address, timeout=_REACH_S, set_as_default=False)
+                stack.callback(self._client.close)
+            except (OSError, ValueError, ImportError) as error:
+                raise CampaignError(f"--cluster {address}: no scheduler answers: {error}") from error
+            try:
+                self._client.wait_for_workers(1, timeout=_REACH_S)
+                found = self._client.run(_identify_code)
+            except TimeoutError as error:
+                raise CampaignError(f"--cluster {address}: the scheduler has no workers") from error
+            own_code, own = _identify_code()
+            for worker, (code, versions) in found.items():
+                if code != own_code:
+                    raise CampaignError(f"worker {worker} has other code of Marsyard than this program")
+                differing = sorted(name for name in own if own[name] != versions.get(name))
+                if differing:
+                    stated = ", ".join(f"{name} {versions.get(name)} (here {own[name]})" for name in differing)
+                    raise CampaignError(f"worker {worker} has other versions: {stated}")
+            self._stack = stack.pop_all()
 
-    def _check_code(self) -> None:
-        """Refuse workers with other code or package versions."""
-        own = _code_and_versions()
-        for worker, (code, versions) in self._client.run(_code_and_versions).items():
-            if code != own[0]:
-                raise CampaignError(f"worker {worker} has other code of Marsyard than this program")
-            differing = sorted(name for name in own[1] if own[1][name] != versions.get(name))
-            if differing:
-                stated = ", ".join(f"{name} {versions.get(name)} (here {own[1][name]})" for name in differing)
-                raise CampaignError(f"worker {worker} has other versions: {stated}")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._close()
-
-    def _close(self) -> None:
-        self._client.close()
-        if self._cluster is not None:
-            self._cluster.close()
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
 
     def run(self, work: Work[Result]) -> Iterator[list[TaskResult[Result]]]:
         """See `Executor.run`."""
+        machines: Counter[str] = Counter()
+        for worker in self._client.scheduler_info(n_workers=-1)["workers"].values():
+            machines[worker["host"]] += worker["nthreads"]
+        # largest number of threads that share the memory of one machine
+        executors = max(machines.values(), default=1)
         threads = sum(self._client.nthreads().values())
-        sharers = self._max_threads_per_machine()
         batches = Batches(work.items, work.total, threads)
         pending = self._distributed.as_completed(loop=self._client.loop)
         sent: dict[Any, Sequence[int]] = {}
 
         def send(batch: Sequence[int]) -> None:
-            future = self._client.submit(
-                _run_batch_isolated, replace(work, items=tuple(batch), total=len(batch)), sharers, pure=False
-            )
-            sent[future] = batch
-            pending.add(future)
-
-        def send_next() -> None:
-            if batch := batches.next():
-                send(batch)
+            if batch:
+                part = replace(work, items=tuple(batch), total=len(batch))
+                future = self._client.submit(_run_batch_isolated, part, executors, pure=False)
+                sent[future] = batch
+                pending.add(future)
 
         try:
             for _ in range(_QUEUED_BATCHES * threads):
-                send_next()
+                send(batches.next())
             while sent:
                 future = next(pending)
                 batch = sent.pop(future)
@@ -125,19 +109,12 @@ class ClusterExecutor:
                     for item in batch:
                         send((item,))
                 else:
-                    send_next()
+                    send(batches.next())
                 future.release()
                 if done:
                     yield done
         finally:
             self._client.cancel(list(sent))
-
-    def _max_threads_per_machine(self) -> int:
-        """Largest number of threads that share the memory of one machine."""
-        threads: Counter[str] = Counter()
-        for worker in self._client.scheduler_info(n_workers=-1)["workers"].values():
-            threads[worker["host"]] += worker["nthreads"]
-        return max(threads.values(), default=1)
 
     def _collect(self, future: Any, batch: Sequence[int], batches: Batches) -> list[TaskResult[Any]] | None:
         """Results of a batch; None where it was lost with its workers and must be divided into single cases."""
@@ -155,41 +132,28 @@ class ClusterExecutor:
         return [TaskResult(batch[0], None, error if isinstance(error, Exception) else RuntimeError(repr(error)))]
 
 
-def _local_cluster(address: str) -> Any:
-    """Cluster of N workers on this machine."""
+def _local_cluster(address: str, number: str) -> Any:
     from distributed import LocalCluster
 
-    number = address.removeprefix(_LOCAL)
     if not (number.isdecimal() and int(number) >= 1):
         raise CampaignError(f"--cluster {address}: expected local:N, with N at least 1")
-    return LocalCluster(
-        n_workers=int(number),
-        threads_per_worker=1,
-        processes=True,
-        dashboard_address=None,
-        # of the Dask workers; the memory of cases is limited in their worker processes
-        memory_limit=0,
-        silence_logs="ERROR",
-    )
+    # no limit of memory for the Dask workers: that of cases is limited in their worker processes
+    processes: dict[str, Any] = {"n_workers": int(number), "threads_per_worker": 1, "processes": True}
+    return LocalCluster(**processes, dashboard_address=None, memory_limit=0, silence_logs="ERROR")
 
 
-def _code_and_versions() -> tuple[str, dict[str, str]]:
-    return code_hash(()), package_versions()
+def _identify_code() -> tuple[str, dict[str, str]]:
+    return hash_code(()), read_versions()
 
 
-def _run_batch_isolated(work: Work[Result], sharers: int) -> tuple[float, list[TaskResult[Result]]]:
+def _run_batch_isolated(work: Work[Result], executors: int) -> tuple[float, list[TaskResult[Result]]]:
     """Run a batch in the worker process of this Dask thread; return the seconds and the results."""
     began = time.perf_counter()
-    done = [one for ended in _thread_executor(sharers).run(work) for one in ended]
-    return time.perf_counter() - began, done
-
-
-def _thread_executor(sharers: int) -> LocalExecutor:
-    """Executor of this thread."""
     workers: LocalExecutor | None = getattr(_thread_state, "workers", None)
     if workers is None:
         # Dask's workers are daemons of `multiprocessing`, which may not have children. The kernel ends ours with the
         # thread that started them.
         multiprocessing.process.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
-        workers = _thread_state.workers = LocalExecutor(1, sharers)
-    return workers
+        workers = _thread_state.workers = LocalExecutor(1, executors)
+    done = [one for ended in workers.run(work) for one in ended]
+    return time.perf_counter() - began, done

@@ -19,13 +19,11 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
-from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,20 +31,11 @@ from marsyard.algorithms.processes import children
 
 #: Seconds to wait for threads and processes to end.
 _ENDING_S = 0.2
-
+FileIdentity = tuple[int, int] | None
 _SIGNALS = tuple(range(1, signal.SIGSYS + 1))
 
 
-@dataclass(frozen=True)
-class Differences:
-    """Changes of the process state: parts that were restored, and parts that cannot be."""
-
-    restored: tuple[str, ...] = ()
-    lasting: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class _Part:
+class _Part(NamedTuple):
     """A part of the state: its name, a function that reads it, and one that sets it."""
 
     name: str
@@ -54,7 +43,7 @@ class _Part:
     set: Callable[[Any], object]
 
 
-def _folder() -> str:
+def _read_folder() -> str:
     try:
         return str(Path.cwd())
     except FileNotFoundError:
@@ -65,7 +54,7 @@ def _folder() -> str:
 _OPENGL = b"PYOPENGL_PLATFORM"
 
 
-def _environment() -> dict[bytes, bytes]:
+def _read_environment() -> dict[bytes, bytes]:
     # the mapping behind `os.environ`: ten times as fast, since nothing is decoded
     variables: dict[bytes, bytes] = dict(os.environ._data)  # type: ignore[attr-defined]
     variables.pop(_OPENGL, None)
@@ -84,24 +73,19 @@ def _set_filters(saved: list[Any]) -> None:
     warnings.filters[:] = saved  # type: ignore[index]
 
 
-def _umask() -> int:
+def _read_umask() -> int:
     mask = os.umask(0o077)
     os.umask(mask)
     return mask
 
 
-def _decimals() -> tuple[Any, ...]:
+def _read_decimals() -> tuple[Any, ...]:
     context = decimal.getcontext()
-    traps = tuple(kind for kind, wanted in context.traps.items() if wanted)
-    return context.prec, context.rounding, context.Emin, context.Emax, context.capitals, context.clamp, (), traps
+    traps = [kind for kind, wanted in context.traps.items() if wanted]
+    return context.prec, context.rounding, context.Emin, context.Emax, context.capitals, context.clamp, [], traps
 
 
-def _set_decimals(saved: tuple[Any, ...]) -> None:
-    prec, rounding, e_min, e_max, capitals, clamp, flags, traps = saved
-    decimal.setcontext(decimal.Context(prec, rounding, e_min, e_max, capitals, clamp, list(flags), list(traps)))
-
-
-def _opencv() -> tuple[bool, int]:
+def _read_opencv() -> tuple[bool, int]:
     """OpenCV's optimisation flag and threads; those of a fresh worker where it is not loaded."""
     cv2: Any = sys.modules.get("cv2")
     return (True, 1) if cv2 is None else (cv2.useOptimized(), cv2.getNumThreads())
@@ -113,13 +97,10 @@ def _set_opencv(saved: tuple[bool, int]) -> None:
     cv2.setNumThreads(saved[1])
 
 
-#: Less than half a unit in the last place of 1: sums with it show how the processor rounds.
-_BELOW_HALF_ULP, _SMALLEST_NORMAL = 2.0**-60, sys.float_info.min
-
-
-def _arithmetic() -> tuple[bool, ...]:
+def _read_arithmetic() -> tuple[bool, ...]:
     """How floating-point numbers are rounded, and whether subnormal ones are flushed to zero."""
-    one, little, small = float("1"), _BELOW_HALF_ULP, _SMALLEST_NORMAL
+    # sums with less than half the distance from 1 to the next number show how the processor rounds
+    one, little, small = float("1"), 2.0**-60, sys.float_info.min
     return one + little == one, -one - little == -one, one - little == one, small * 0.5 > 0.0
 
 
@@ -132,140 +113,109 @@ def _set_arithmetic(_: object) -> None:
 
 
 _PARTS = (
-    _Part("the working folder", _folder, os.chdir),
-    _Part("environment variables", _environment, _set_environment),
+    _Part("the working folder", _read_folder, os.chdir),
+    _Part("environment variables", _read_environment, _set_environment),
     _Part("sys.path", lambda: list(sys.path), lambda saved: sys.path.__setitem__(slice(None), saved)),
     _Part("the filters of warnings", lambda: list(warnings.filters), _set_filters),
     _Part("NumPy's handling of errors (numpy.seterr)", np.geterr, lambda saved: np.seterr(**saved)),
-    _Part(
-        "the locale",
-        lambda: locale.setlocale(locale.LC_ALL),
-        lambda saved: locale.setlocale(locale.LC_ALL, saved),
-    ),
-    _Part("the mask of new files (umask)", _umask, os.umask),
+    _Part("the locale", partial(locale.setlocale, locale.LC_ALL), partial(locale.setlocale, locale.LC_ALL)),
+    _Part("the mask of new files (umask)", _read_umask, os.umask),
     _Part("the limit of recursion", sys.getrecursionlimit, sys.setrecursionlimit),
-    _Part("the context of decimal numbers", _decimals, _set_decimals),
-    _Part("OpenCV's settings (optimised code, threads)", _opencv, _set_opencv),
-    _Part("the arithmetic of floating-point numbers (rounding)", _arithmetic, _set_arithmetic),
+    _Part("the context of decimal numbers", _read_decimals, lambda saved: decimal.setcontext(decimal.Context(*saved))),
+    _Part("OpenCV's settings (optimised code, threads)", _read_opencv, _set_opencv),
+    _Part("the arithmetic of floating-point numbers (rounding)", _read_arithmetic, _set_arithmetic),
     _Part("the collection of garbage", gc.isenabled, lambda enabled: (gc.enable if enabled else gc.disable)()),
 )
+#: Indices of the parts that imports of modules change: environment, `sys.path` and warning filters.
+_CHANGED_BY_IMPORTS = (1, 2, 3)
 
 
-#: Indices of the parts that imports of modules change.
-_IMPORT_NAMES = ("environment variables", "sys.path", "the filters of warnings")
-_CHANGED_BY_IMPORTS = tuple(index for index, part in enumerate(_PARTS) if part.name in _IMPORT_NAMES)
-
-
-def _signals() -> tuple[Any, ...]:
+def _read_signals() -> tuple[Any, ...]:
     """Handlers, blocked signals and timers; `_signal` avoids building enumerations, which takes most of the time."""
     handlers = tuple(_signal.getsignal(number) for number in _SIGNALS)
     return handlers, _signal.pthread_sigmask(_signal.SIG_BLOCK, ()), _signal.getitimer(_signal.ITIMER_REAL)
 
 
-def _streams() -> tuple[Any, ...]:
+def _read_streams() -> tuple[Any, ...]:
     """Standard output and error, whether they are closed, and the files behind them."""
     objects = [(stream, getattr(stream, "closed", True)) for stream in (sys.stdout, sys.stderr)]
-    return (*objects, _identity(1), _identity(2))
+    return (*objects, file_identity(1), file_identity(2))
 
 
-class _ImportRecorder(MetaPathFinder):
-    """Import hook that passes each top-level import to a `ProcessState`."""
+class ProcessState:
+    """State of this process at a moment, as a reference; an import hook excludes the changes by imports."""
 
-    def __init__(self, state: ProcessState) -> None:
-        self._state = state
-        self._nested = False
+    def __init__(self) -> None:
+        self._parts = [part.read() for part in _PARTS]
+        self._lasting = (_read_signals(), _read_streams())
+        self._threads = set(threading.enumerate())
+        self._importing = False
+        sys.meta_path[:] = [self, *(finder for finder in sys.meta_path if not isinstance(finder, ProcessState))]
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Find a module by the other finders, and let the state execute it."""
-        if self._nested:
+        """Find a top-level import by the other finders, and execute it so that its changes are accepted."""
+        if self._importing:
             return None
-        specs = (
-            finder.find_spec(fullname, path, target)
-            for finder in sys.meta_path
-            if finder is not self and hasattr(finder, "find_spec")
-        )
+        finders = [one for one in sys.meta_path if one is not self and hasattr(one, "find_spec")]
+        specs = (finder.find_spec(fullname, path, target) for finder in finders)
         spec = next((one for one in specs if one is not None), None)
         # loaders of built-in modules are classes, shared by all modules
         if spec is not None and spec.loader is not None and not isinstance(spec.loader, type):
-            spec.loader.exec_module = partial(self._execute, spec.loader.exec_module)  # type: ignore[method-assign]
+            spec.loader.exec_module = partial(self._import, spec.loader.exec_module)  # type: ignore[method-assign]
         return spec
 
-    def _execute(self, execute: Callable[[ModuleType], None], module: ModuleType) -> None:
-        self._nested = True
+    def _import(self, execute: Callable[[ModuleType], None], module: ModuleType) -> None:
+        """Execute an imported module and accept its changes to the environment, `sys.path` and warning filters.
+
+        An import happens once per process, in whichever case comes first: its changes are not attributed to the case.
+        """
+        before = {index: _PARTS[index].read() for index in _CHANGED_BY_IMPORTS}
+        self._importing = True
         try:
-            self._state.execute(module, execute)
+            execute(module)
         finally:
-            self._nested = False
+            self._importing = False
+            for index, old in before.items():
+                new, saved = _PARTS[index].read(), self._parts[index]
+                if isinstance(saved, dict):
+                    kept = {name: value for name, value in saved.items() if name in new or name not in old}
+                    self._parts[index] = kept | {name: value for name, value in new.items() if old.get(name) != value}
+                elif saved == old:
+                    self._parts[index] = new
 
-
-class ProcessState:
-    """State of this process at a moment, as a reference."""
-
-    def __init__(self) -> None:
-        self._parts = [part.read() for part in _PARTS]
-        self._lasting = (_signals(), _streams())
-        self._threads = set(threading.enumerate())
-        sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, _ImportRecorder)]
-        sys.meta_path.insert(0, _ImportRecorder(self))
-
-    def differences(self) -> Differences:
-        """Changes since then; those that can be restored are."""
+    def restore(self) -> tuple[list[str], list[str]]:
+        """Restore what has changed since then; return the names of the restored parts, and of the lasting changes."""
         restored: list[str] = []
-        lasting = list(self._leftovers())
+        lasting = self._find_leftovers()
         for part, before in zip(_PARTS, self._parts, strict=True):
             if part.read() == before:
                 continue
             with suppress(Exception):
                 part.set(before)
             (restored if part.read() == before else lasting).append(part.name)
-        return Differences(tuple(restored), tuple(lasting))
+        return restored, lasting
 
-    def execute(self, module: ModuleType, execute: Callable[[ModuleType], None]) -> None:
-        """Execute an imported module and accept its changes to the environment, `sys.path` and warning filters.
-
-        An import happens once per process, in whichever case comes first: its changes are not attributed to the case.
-        """
-        before = {index: _PARTS[index].read() for index in _CHANGED_BY_IMPORTS}
-        try:
-            execute(module)
-        finally:
-            for index, old in before.items():
-                new, saved = _PARTS[index].read(), self._parts[index]
-                if isinstance(saved, dict):
-                    self._parts[index] = {
-                        name: value for name, value in saved.items() if name in new or name not in old
-                    } | {name: value for name, value in new.items() if old.get(name) != value}
-                elif saved == old:
-                    self._parts[index] = new
-
-    def _leftovers(self) -> list[str]:
-        """Lasting changes: signals, streams, threads and child processes."""
+    def _find_leftovers(self) -> list[str]:
+        """Lasting changes: signals, streams, threads that keep a process from ending, and child processes."""
         signals, streams = self._lasting
-        names = ["handlers of signals, or timers"] if _signals() != signals else []
-        if _streams() != streams:
+        names = ["handlers of signals, or timers"] if _read_signals() != signals else []
+        if _read_streams() != streams:
             names.append("standard output or error")
         end = time.monotonic() + _ENDING_S
-        while (left := self._left_running()) and time.monotonic() < end:
+        while True:
+            threads = [one.name for one in threading.enumerate() if one not in self._threads and not one.daemon]
+            running = {"threads": threads, "child processes": _name_other_children()}
+            if not any(running.values()) or time.monotonic() >= end:
+                left = {kind: ", ".join(sorted(set(found))) for kind, found in running.items() if found}
+                return [*names, *(f"{kind} that it left running ({found})" for kind, found in left.items())]
             # finalizers of unreferenced objects end their processes
             gc.collect()
             time.sleep(0.01)
-        return [*names, *left]
-
-    def _left_running(self) -> list[str]:
-        """Threads that keep a process from ending, and child processes."""
-        threads = [one for one in threading.enumerate() if one not in self._threads and not one.daemon]
-        names = [f"threads that it left running ({_names(one.name for one in threads)})"] if threads else []
-        processes = _other_children()
-        return [*names, f"child processes that it left running ({_names(processes)})"] if processes else names
 
 
-def _names(names: Any) -> str:
-    return ", ".join(sorted(set(names)))
-
-
-def _other_children() -> list[str]:
+def _name_other_children() -> list[str]:
     """Names of the child processes, except idle programs under test; ended ones are reaped."""
     try:
         # a microsecond where there are none
@@ -295,29 +245,20 @@ def seed_generators(item: int) -> None:
 
 def generators_were_used(item: int) -> bool:
     """Whether Python's or NumPy's generator was used since it was seeded; seeds them again."""
-    drawn = _drawn()
+    drawn = random.random(), np.random.random_sample()  # noqa: NPY002, S311
     seed_generators(item)
-    return drawn != _drawn()
+    return drawn != (random.random(), np.random.random_sample())  # noqa: NPY002, S311
 
 
-def _drawn() -> tuple[float, float]:
-    return random.random(), np.random.random_sample()  # noqa: NPY002, S311
+def open_files() -> dict[int, FileIdentity]:
+    """Descriptors that a worker needs: its output, and the pipes to its parent; without the standard streams."""
+    numbers = [int(one.name) for one in Path("/proc/self/fd").glob("*")]
+    found = {number: file_identity(number) for number in numbers if number > 2}
+    # without the listing itself
+    return {number: identity for number, identity in found.items() if identity is not None}
 
 
-class OpenFiles:
-    """Files that a worker needs: its output, and the pipes to its parent."""
-
-    def __init__(self) -> None:
-        numbers = [int(one.name) for one in Path("/proc/self/fd").glob("*")]
-        # without the standard streams and the listing itself
-        self._needed = [(one, _identity(one)) for one in numbers if one > 2 and _identity(one) is not None]
-
-    def intact(self) -> bool:
-        """Whether all of them are still open."""
-        return all(_identity(number) == identity for number, identity in self._needed)
-
-
-def _identity(number: int) -> tuple[int, int] | None:
+def file_identity(number: int) -> FileIdentity:
     """Device and inode behind a file descriptor; None where it is closed."""
     try:
         status = os.fstat(number)

@@ -22,10 +22,8 @@ from marsyard.algorithms.processes import descendants
 
 #: Makes a worker write its stack trace; the supervisor forwards it.
 DUMP_SIGNAL = signal.SIGUSR2
-
 #: Makes the supervisor kill everything and end.
 END_SIGNAL = signal.SIGTERM
-
 #: Sent by Linux when the parent ends; it also wakes a supervisor that a case has stopped.
 _PARENT_SIGNAL = signal.SIGCONT
 
@@ -54,6 +52,8 @@ def become_supervised(parent: int, folder: Path) -> None:
 
 def _supervise(worker: int, parent: int, folder: Path, handled: set[signal.Signals]) -> NoReturn:
     """Wait for the worker's end or the signal to end it; then kill all descendants and end with the worker's status."""
+    import resource
+
     status: int | None = None
     while status is None:
         number = signal.sigwait(handled)
@@ -62,43 +62,35 @@ def _supervise(worker: int, parent: int, folder: Path, handled: set[signal.Signa
         elif number == END_SIGNAL or os.getppid() != parent:
             status = -signal.SIGKILL
         else:
-            status = _exit_status(worker)
-    kill_descendants()
+            with suppress(ChildProcessError):
+                while (ended := os.waitpid(-1, os.WNOHANG))[0]:
+                    if ended[0] == worker:
+                        status = os.waitstatus_to_exitcode(ended[1])
+    end = time.monotonic() + _KILLING_S
+    with suppress(ChildProcessError):
+        # until this process has no children
+        while time.monotonic() < end:
+            kill(descendants(os.getpid()))
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
+            time.sleep(_PAUSE_S)
     if os.getppid() != parent:
         shutil.rmtree(folder, ignore_errors=True)
-    if status < 0:
-        signal.pthread_sigmask(signal.SIG_SETMASK, ())
-        _end_by(-status)
-    os._exit(status)
-
-
-def _exit_status(worker: int) -> int | None:
-    """Exit status of the worker, None while it runs; other ended children are reaped."""
-    status = None
-    with suppress(ChildProcessError):
-        while (ended := os.waitpid(-1, os.WNOHANG))[0]:
-            if ended[0] == worker:
-                status = os.waitstatus_to_exitcode(ended[1])
-    return status
-
-
-def _end_by(number: int) -> None:
-    """End this process by a signal, without a core dump."""
-    import resource
-
+    if status >= 0:
+        os._exit(status)
+    # end by the worker's signal, without a core dump
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
     resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
-    if number not in (signal.SIGKILL, signal.SIGSTOP):
-        signal.signal(number, signal.SIG_DFL)
-    os.kill(os.getpid(), number)
-    os._exit(128 + number)
+    if -status not in (signal.SIGKILL, signal.SIGSTOP):
+        signal.signal(-status, signal.SIG_DFL)
+    os.kill(os.getpid(), -status)
+    os._exit(128 - status)
 
 
 #: Options of Linux's `prctl`: signal at the parent's death, and adoption of orphaned descendants.
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
-
 #: Seconds during which killing is repeated, since processes may start others meanwhile.
 _KILLING_S = 10.0
-
 #: Seconds between two checks of killed processes.
 _PAUSE_S = 0.005
 
@@ -123,19 +115,6 @@ def kill(processes: Iterable[int]) -> None:
         if process > 1:
             with suppress(ProcessLookupError, PermissionError):
                 os.kill(process, signal.SIGKILL)
-
-
-def kill_descendants() -> None:
-    """Kill all descendants, and wait until this process has no children."""
-    end = time.monotonic() + _KILLING_S
-    while time.monotonic() < end:
-        kill(descendants(os.getpid()))
-        try:
-            while os.waitpid(-1, os.WNOHANG)[0]:
-                pass
-        except ChildProcessError:
-            return
-        time.sleep(_PAUSE_S)
 
 
 def marked_processes(mark: str) -> list[int]:

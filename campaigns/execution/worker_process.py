@@ -1,4 +1,4 @@
-"""Code inside a worker process: its setup, its batches, and its status for the monitoring parent."""
+"""Work of the worker processes and its results; and the code inside a worker: its setup, batches and status."""
 
 from __future__ import annotations
 
@@ -11,34 +11,30 @@ import signal
 import struct
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from marsyard.campaigns.execution.process_state import (
-    Differences,
-    OpenFiles,
+    FileIdentity,
     ProcessState,
+    file_identity,
     generators_were_used,
+    open_files,
     seed_generators,
 )
 from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, become_supervised
 
 Result = TypeVar("Result")
-
 #: Added by Linux to a worker's badness (of 1000) when memory runs out: workers are killed before their parent.
 _OOM_SCORE = 800
-
 #: Time for loading a campaign's code, in addition to the case's limit.
 LOADING_S = 300.0
-
 #: Duration of items that are checked together for changes of their process: a check takes 0.1 ms.
 _CHECKED_TOGETHER_S = 0.005
-
 #: Exit status of a worker whose files were closed by an item.
 FILES_CLOSED = 97
-
 _LAYOUT = struct.Struct("=qd")
 _NOTHING = -1
 
@@ -63,6 +59,47 @@ class TaskResult(Generic[Result]):
 
 
 @dataclass(frozen=True)
+class WorkLimits:
+    """Limits of one task.
+
+    time_s: wall-clock time.
+    memory_bytes: private memory of its worker and of the processes that it started, without mapped files and shared
+    libraries; None for an equal fraction of 80 % of the free memory when work begins.
+    output_bytes: bytes on standard output and standard error.
+    """
+
+    time_s: float = math.inf
+    memory_bytes: float | None = None
+    output_bytes: float = math.inf
+
+
+@dataclass(frozen=True)
+class Work(Generic[Result]):
+    """A task to be run on many items.
+
+    task: a pure function of the item that can be pickled.
+    items: taken only as workers need them.
+    limits: limits of the task for one item.
+    total: number of items, as far as known.
+    """
+
+    task: Callable[[int], Result]
+    items: Iterable[int]
+    limits: WorkLimits = WorkLimits()
+    total: int | None = None
+
+
+class Executor(Protocol):
+    """Processes that run tasks, on this machine or on a cluster."""
+
+    def run(self, work: Work[Result]) -> Iterator[list[TaskResult[Result]]]:
+        """Run the task on every item, and yield results as they arrive, in no particular order.
+
+        An error is the exception that the task raised, or a `CaseEndedError`.
+        """
+
+
+@dataclass(frozen=True)
 class BatchResult(Generic[Result]):
     """Results of a batch.
 
@@ -80,16 +117,11 @@ class BatchResult(Generic[Result]):
     spent: bool = False
 
 
-@dataclass(frozen=True)
-class WorkerStatus:
-    """Item that a worker runs (None between items), and its start time (monotonic)."""
-
-    item: int | None
-    since_s: float
-
-
 class StatusBoard:
-    """Shared memory that a worker writes and its parent reads, also when the worker hangs or has died."""
+    """Shared memory that a worker writes and its parent reads, also when the worker hangs or has died.
+
+    It holds the item that the worker runs (None between items), and its start time (monotonic).
+    """
 
     def __init__(self, path: Path) -> None:
         with path.open("r+b") as file:
@@ -101,18 +133,17 @@ class StatusBoard:
         path.write_bytes(_LAYOUT.pack(_NOTHING, math.inf))
         return StatusBoard(path)
 
-    def write(self, standing: WorkerStatus) -> None:
+    def write(self, item: int | None, since_s: float) -> None:
         """Publish the worker's status."""
-        item = _NOTHING if standing.item is None else standing.item
-        self._bytes[:] = _LAYOUT.pack(item, standing.since_s)
+        self._bytes[:] = _LAYOUT.pack(_NOTHING if item is None else item, since_s)
 
-    def read(self) -> WorkerStatus:
+    def read(self) -> tuple[int | None, float]:
         """Worker's status; read until two readings agree, as the worker may be writing."""
         first = bytes(self._bytes)
         while (second := bytes(self._bytes)) != first:
             first = second
         item, since_s = _LAYOUT.unpack(first)
-        return WorkerStatus(None if item == _NOTHING else item, since_s)
+        return None if item == _NOTHING else item, since_s
 
     def close(self) -> None:
         """Release the memory."""
@@ -127,7 +158,7 @@ class _WorkerContext:
     trace: Path
     output: int
     note: Path
-    files: OpenFiles
+    files: Mapping[int, FileIdentity]
     item: int | None = None
     state: ProcessState = field(default_factory=ProcessState)
     checks_each: bool = False
@@ -144,6 +175,8 @@ def start_worker(parent: int, folder: str) -> None:
     the parent and kills the worker's descendants. A fatal signal makes it write its stack trace. Its output goes to a
     file.
     """
+    from joblib.externals.loky import process_executor
+
     global _context
     os.setpgid(0, 0)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -154,20 +187,14 @@ def start_worker(parent: int, folder: str) -> None:
     if sys.platform == "linux":
         os.setpgid(0, 0)
         Path("/proc/self/oom_score_adj").write_text(str(_OOM_SCORE))
-    trace = Path(folder, "words")
+    trace = Path(folder, "trace")
     written = os.open(trace, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
     faulthandler.enable(written)
     faulthandler.register(DUMP_SIGNAL, written, all_threads=False, chain=False)
-    _disable_loky_memory_limit()
-    _context = _WorkerContext(StatusBoard(Path(folder, "board")), trace, output, Path(folder, "note"), OpenFiles())
-    _context.board.write(WorkerStatus(None, math.inf))
-
-
-def _disable_loky_memory_limit() -> None:
-    """Keep loky from ending workers that grow by 300 MB: cached terrains take more, and the parent enforces limits."""
-    from joblib.externals.loky import process_executor
-
+    # loky would end workers that grow by 300 MB: cached terrains take more, and the parent enforces limits
     process_executor._USE_PSUTIL = False
+    _context = _WorkerContext(StatusBoard(Path(folder, "board")), trace, output, Path(folder, "note"), open_files())
+    _context.board.write(None, math.inf)
 
 
 def run_batch(task: Callable[[int], Result], items: Sequence[int]) -> BatchResult[Result]:
@@ -183,8 +210,8 @@ def run_batch(task: Callable[[int], Result], items: Sequence[int]) -> BatchResul
         if not group:
             seed_generators(item)
         group.append(_run_item(task, item))
-        ends = index + 1 == len(items) or _must_check() or time.perf_counter() - checked > _CHECKED_TOGETHER_S
-        if not ends:
+        must_check = _context is not None and (_context.checks_each or _context.crashed)
+        if not must_check and index + 1 < len(items) and time.perf_counter() - checked <= _CHECKED_TOGETHER_S:
             continue
         spent, changed = _check_state([one.item for one in group])
         if changed is None:
@@ -195,25 +222,21 @@ def run_batch(task: Callable[[int], Result], items: Sequence[int]) -> BatchResul
             return BatchResult(time.perf_counter() - began, done, (), items[index + 1 :], spent)
         group, checked = [], time.perf_counter()
     if _context is not None:
-        _context.board.write(WorkerStatus(None, math.inf))
+        _context.board.write(None, math.inf)
     return BatchResult(time.perf_counter() - began, done)
-
-
-def _must_check() -> bool:
-    return _context is not None and (_context.checks_each or _context.crashed)
 
 
 def _check_state(group: Sequence[int]) -> tuple[bool, tuple[str, ...] | None]:
     """Whether the process is spent after some items, and the changes; None where it is open which item made them."""
     if _context is None:
         return False, ()
-    if not _context.files.intact():
+    if any(file_identity(number) != identity for number, identity in _context.files.items()):
         # no result can be delivered any more: the status board names the item
         _context.trace.write_text("Fatal: the files that the worker process needs were closed\n")
         os._exit(FILES_CLOSED)
-    differences: Differences = _context.state.differences()
-    spent = bool(differences.lasting) or _context.crashed
-    names = (*differences.restored, *differences.lasting)
+    restored, lasting = _context.state.restore()
+    spent = bool(lasting) or _context.crashed
+    names = (*restored, *lasting)
     if len(group) > 1 and (names or generators_were_used(group[0])):
         _context.checks_each = True
         return spent, None
@@ -221,21 +244,21 @@ def _check_state(group: Sequence[int]) -> tuple[bool, tuple[str, ...] | None]:
 
 
 def _run_item(task: Callable[[int], Result], item: int) -> TaskResult[Result]:
-    """Run a task on one item."""
-    if _context is None:
-        return _outcome(task, item)
-    _clear_output(_context.output)
-    before, _context.item, _context.crashed = _context.item, item, False
+    """Run a task on one item, with an empty output file, whose size is then that of the item's output."""
+    before = None
+    if _context is not None:
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None and not stream.closed:
+                stream.flush()
+        if os.fstat(_context.output).st_size > 0:
+            os.ftruncate(_context.output, 0)
+        before, _context.item, _context.crashed = _context.item, item, False
     start_clock()
-    done = _outcome(task, item)
-    return replace(done, crashed=True, before=before) if _context.crashed else done
-
-
-def _outcome(task: Callable[[int], Result], item: int) -> TaskResult[Result]:
     try:
-        return TaskResult(item, task(item), None)
+        done = TaskResult(item, task(item), None)
     except Exception as error:
-        return TaskResult(item, None, error)
+        done = TaskResult(item, None, error)
+    return replace(done, crashed=True, before=before) if _context is not None and _context.crashed else done
 
 
 def request_fresh_worker() -> None:
@@ -244,19 +267,10 @@ def request_fresh_worker() -> None:
         _context.crashed = True
 
 
-def _clear_output(output: int) -> None:
-    """Empty the output file, so that its size is that of the item's output."""
-    for stream in (sys.stdout, sys.stderr):
-        if stream is not None and not stream.closed:
-            stream.flush()
-    if os.fstat(output).st_size > 0:
-        os.ftruncate(output, 0)
-
-
 def start_clock(grace_s: float = 0.0) -> None:
     """Start the time limit of the current item now, or `grace_s` later."""
     if _context is not None:
-        _context.board.write(WorkerStatus(_context.item, time.monotonic() + grace_s))
+        _context.board.write(_context.item, time.monotonic() + grace_s)
 
 
 def leave_note(text: str) -> None:

@@ -8,37 +8,58 @@ about twenty times a second, and ends one whose case exceeds a limit.
 from __future__ import annotations
 
 import fcntl
+import itertools
 import math
 import os
 import re
 import shutil
 import tempfile
+import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
+from joblib.externals.loky import ProcessPoolExecutor
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
+from marsyard.algorithms.processes import descendants, used_memory
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.watched import POLL_INTERVAL_S, WatchedWorker
-from marsyard.campaigns.execution.work import Batches, Executor, Work
-from marsyard.campaigns.execution.worker_process import BatchResult, TaskResult
-from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, CaseEndedError
+from marsyard.campaigns.execution import supervisor, worker_process
+from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, END_SIGNAL, kill, marked_processes
+from marsyard.campaigns.execution.worker_process import BatchResult, Executor, TaskResult, Work, WorkLimits, run_batch
+from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CaseEndedError
 
 Result = TypeVar("Result")
 
+_THREAD_VARIABLES = (
+    *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "NUMEXPR_NUM_THREADS"),
+    *("VECLIB_MAXIMUM_THREADS", "OPENCV_FOR_THREADS_NUM", "LP_NUM_THREADS"),
+)
+#: Set before a worker loads any library: one thread each, reproducible order of sets, and assertions enabled (pyrender
+#: calls GL inside assertions, which `python -O` removes).
+_WORKER_ENVIRONMENT = dict.fromkeys(_THREAD_VARIABLES, "1") | {"PYTHONHASHSEED": "0", "PYTHONOPTIMIZE": ""}
+#: Seconds between two checks of a worker.
+_POLL_INTERVAL_S = 0.05
+#: Bytes kept of the last output of a dead process, and bytes read of a task's note.
+_MAX_OUTPUT, _MAX_NOTE = 2000, 1_000_000
+#: Seconds that a worker has to write its stack trace.
+_DUMP_S = 0.3
+#: Seconds that a worker has to end by itself after all work, and that its supervisor has to kill everything.
+_EXIT_S, _KILLING_S = 5.0, 2.0
+#: Environment variable of a worker, which identifies its descendants even without their supervisor.
+_MARK = "MARSYARD_WORKER"
 #: Attempts before a crash or lack of memory is attributed to the task, the last in a fresh worker: an earlier task may
 #: have damaged or filled the worker, or it was killed from outside.
 _MAX_ATTEMPTS = 2
-
 #: Maximum number of consecutive deaths of workers before they begin a task.
 _MAX_START_DEATHS = 3
-
+_PREFIX = "marsyard-"
+#: Locked by the owner of a folder while it lives.
+_LOCK = "lock"
 #: Fraction of the free memory at the start that all workers share, where no limit is stated.
 _MEMORY_FRACTION = 0.8
 
@@ -48,34 +69,226 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
-class LocalExecutor:
+#: Target duration of a batch: sending one costs 3 ms, and a worker that dies loses at most one.
+_BATCH_S = 1.0
+#: Maximum number of items in a batch.
+MAX_BATCH = 1000
+#: Weight of the latest batch in the running mean of the time per item.
+_WEIGHT = 0.3
+
+
+class Batches:
+    """Batches of items, sized by the measured time per item.
+
+    items: taken only as batches are requested.
+    total: number of items, as far as known: the last batches are then small, so that all workers end together.
+    workers: number of workers that share the items.
+    """
+
+    def __init__(self, items: Iterable[int], total: int | None, workers: int) -> None:
+        self._source = iter(items)
+        self._left = math.inf if total is None else total
+        self._workers = workers
+        self._size = 1
+        self._item_s = math.nan
+
+    def next(self) -> list[int]:
+        """Next batch; empty where no items are left."""
+        size = max(1, int(min(self._size, self._left / (2 * self._workers))))
+        batch = list(itertools.islice(self._source, size))
+        self._left -= len(batch)
+        return batch
+
+    def record_time(self, items: int, seconds: float) -> None:
+        """Update the time per item from a finished batch; a batch is at most twice as large as the one before."""
+        latest, mean = seconds / items, self._item_s
+        self._item_s = latest if math.isnan(mean) else mean + _WEIGHT * (latest - mean)
+        wanted = MAX_BATCH if self._item_s <= 0.0 else int(_BATCH_S / self._item_s)
+        self._size = max(1, min(wanted, 2 * self._size, MAX_BATCH))
+
+
+class WatchedWorker:
+    """One worker process, monitored, and replaced when it dies.
+
+    Signals go only to the process that the executor started, the worker's supervisor; it ends after its descendants.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir()
+        self._home = folder
+        self._generation = 0
+        self._start()
+
+    def _start(self) -> None:
+        """Prepare another process, with a folder of its own; loky starts it with the first batch."""
+        self._generation += 1
+        self._folder = self._home / str(self._generation)
+        (self._folder / "tmp").mkdir(parents=True)
+        self._mark = f"{_MARK}={self._folder}"
+        self._board = worker_process.StatusBoard.create(self._folder / "board")
+        self._ended: tuple[int, CaseEndedError] | None = None
+        self._checked_s = -math.inf
+        self._process: Any = None
+        self._executor: Any = ProcessPoolExecutor(
+            max_workers=1,
+            initializer=worker_process.start_worker,
+            initargs=(os.getpid(), str(self._folder)),
+            env={**_WORKER_ENVIRONMENT, _MARK: str(self._folder), "TMPDIR": str(self._folder / "tmp")},
+        )
+
+    def submit(self, task: Callable[[int], Result], batch: Sequence[int]) -> Future[BatchResult[Result]]:
+        """Submit a batch; start a fresh process where the last one died while idle."""
+        try:
+            future: Future[Any] = self._executor.submit(run_batch, task, batch)
+        except BrokenProcessPool:
+            self.replace()
+            future = self._executor.submit(run_batch, task, batch)
+        if self._process is None:
+            self._process = next(iter(list(self._executor._processes.values())), None)
+        return future
+
+    def enforce_limits(self, limits: WorkLimits, memory_bytes: float) -> None:
+        """End the process where its task exceeds a limit."""
+        now = time.monotonic()
+        if self._ended is not None or now - self._checked_s < _POLL_INTERVAL_S:
+            return
+        self._checked_s = now
+        if not self._alive():
+            # loky waits for a pipe that any process that outlived its supervisor holds open
+            kill(marked_processes(self._mark))
+            return
+        item, since_s = self._board.read()
+        if item is None:
+            return
+        output = self._folder / "output"
+        if now - since_s > limits.time_s:
+            self._end(item, TIMED_OUT, f"took longer than its limit of {limits.time_s:g} s")
+        elif used_memory(descendants(self._process.pid), memory_bytes) > memory_bytes:
+            limit = "its share" if limits.memory_bytes is None else f"its limit of {memory_bytes / 1e9:g} GB"
+            self._end(item, OUT_OF_MEMORY, f"took more memory than {limit}")
+        elif output.exists() and output.stat().st_size > limits.output_bytes:
+            self._end(item, TOO_MUCH_OUTPUT, f"wrote more than its limit of {limits.output_bytes / 1e6:g} MB")
+
+    def _end(self, item: int, outcome: str, reason: str) -> None:
+        """Have the process write its stack trace, and kill it."""
+        trace = self._folder / "trace"
+        self._signal(DUMP_SIGNAL)
+        deadline = time.monotonic() + _DUMP_S
+        while not (trace.exists() and trace.stat().st_size > 0) and time.monotonic() < deadline:
+            time.sleep(0.01)
+        self._ended = (item, CaseEndedError(outcome, reason, self._last_trace(with_output=False)))
+        self._kill()
+
+    def _alive(self) -> bool:
+        return self._process is not None and self._process.is_alive()
+
+    def _signal(self, number: int) -> None:
+        """Signal the supervisor; its number cannot be reused before the executor's object has seen its end."""
+        if self._alive():
+            with suppress(ProcessLookupError):
+                os.kill(self._process.pid, number)
+
+    def _kill(self) -> None:
+        """Kill the process and its descendants, and wait for their end."""
+        self._signal(END_SIGNAL)
+        if self._process is None or self._ends_within(_KILLING_S):
+            return
+        # the supervisor was stopped or is busy
+        kill([*descendants(self._process.pid), self._process.pid, *marked_processes(self._mark)])
+
+    def _ends_within(self, seconds: float) -> bool:
+        deadline = time.monotonic() + seconds
+        while self._alive() and time.monotonic() < deadline:
+            time.sleep(0.005)
+        return not self._alive()
+
+    def handle_death(self, error: BaseException) -> tuple[int | None, CaseEndedError]:
+        """Identify the task that the process died of (None if it had none) and the cause; prepare another process."""
+        item: int | None
+        if self._ended is not None:
+            item, cause = self._ended
+        else:
+            # loky's message names the exit status: ``SIGABRT(-6)``
+            codes = re.findall(r"([A-Z]+)\((-?\d+)\)", str(error))
+            status = ", ".join(f"{name} ({code})" for name, code in codes) or "exit status unknown"
+            reason = f"the worker process died: {status}"
+            if status == f"EXIT ({worker_process.FILES_CLOSED})":
+                reason = "the case closed or replaced the worker's file descriptors"
+            item, cause = self._board.read()[0], CaseEndedError(CRASHED, reason, self._last_trace(with_output=True))
+        self._kill()
+        note = self._folder / "note"
+        cause.note = note.read_bytes()[:_MAX_NOTE].decode(errors="replace") if note.exists() else ""
+        self.replace()
+        return item, cause
+
+    def _last_trace(self, *, with_output: bool) -> str:
+        """Fatal error, stack of the thread in which it happened, and last output of the process."""
+        trace, output = (self._folder / name for name in ("trace", "output"))
+        text = trace.read_text(errors="replace") if trace.exists() else ""
+        parts = [part.strip() for part in text.split("\n\n") if part.strip()]
+        stacks = [part for part in parts if "(most recent call first)" in part.partition("\n")[0]]
+        stacks.sort(key=lambda part: not part.startswith("Current thread"))
+        lines = [parts[0]] if parts and parts[0].startswith("Fatal") else []
+        lines += stacks[:1]
+        if with_output and output.exists():
+            tail = output.read_bytes()[-_MAX_OUTPUT:].decode(errors="replace").strip()
+            lines += [f"Its output:\n{tail}"] if tail else []
+        return "\n".join(lines)
+
+    def replace(self) -> None:
+        """Kill the process, if it lives, and prepare another."""
+        self._kill()
+        self._executor.shutdown(wait=False)
+        self._board.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+        self._start()
+
+    def stop(self, *, kill: bool) -> None:
+        """End the process, which has some seconds to do so by itself, and wait for its end."""
+        manager = self._executor._executor_manager_thread
+        if kill:
+            self._kill()
+        self._executor.shutdown(wait=False)
+        if not self._ends_within(_EXIT_S):
+            self._kill()
+        if manager is not None:
+            manager.join(_KILLING_S)
+            if manager.is_alive():
+                supervisor.kill(marked_processes(self._mark))
+                manager.join(_KILLING_S)
+        self._board.close()
+
+
+class LocalExecutor(AbstractContextManager["LocalExecutor"]):
     """Worker processes on this machine, as a context: they end at its exit, and are killed at an exit by an exception.
 
     jobs: number of workers.
-    sharers: number of such executors, this one included, that share the memory of the machine.
+    executors: number of such executors, this one included, that use the memory of the machine.
     """
 
-    def __init__(self, jobs: int, sharers: int = 1) -> None:
-        self._default_memory_bytes = _MEMORY_FRACTION * free_memory() / (jobs * sharers)
+    def __init__(self, jobs: int, executors: int = 1) -> None:
+        self._default_memory_bytes = _MEMORY_FRACTION * free_memory() / (jobs * executors)
         try:
-            self._folder = WorkersFolder()
-            self._workers = [WatchedWorker(self._folder.path / str(number)) for number in range(jobs)]
+            _remove_abandoned_folders()
+            self._folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
+            # renamed only once it is locked
+            partial = self._folder / "lock.partial"
+            self._lock = os.open(partial, os.O_RDWR | os.O_CREAT, 0o600)
+            fcntl.flock(self._lock, fcntl.LOCK_EX)
+            partial.rename(self._folder / _LOCK)
+            self._workers = [WatchedWorker(self._folder / str(number)) for number in range(jobs)]
         except OSError as error:
             raise CampaignError(f"temporary files cannot be written (TMPDIR says where they go): {error}") from error
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.stop(kill=kind is not None)
 
     def stop(self, *, kill: bool) -> None:
-        """End the processes."""
+        """End the processes, and remove their folder."""
         with ThreadPoolExecutor(len(self._workers)) as pool:
             list(pool.map(lambda worker: worker.stop(kill=kill), self._workers))
-        self._folder.remove()
+        os.close(self._lock)
+        shutil.rmtree(self._folder, ignore_errors=True)
 
     def run(self, work: Work[Result]) -> Iterator[list[TaskResult[Result]]]:
         """See `Executor.run`."""
@@ -102,7 +315,7 @@ class _Run:
             self._submit_batches()
             if not self._running:
                 return
-            ended, _ = wait(self._running, timeout=POLL_INTERVAL_S, return_when=FIRST_COMPLETED)
+            ended, _ = wait(self._running, timeout=_POLL_INTERVAL_S, return_when=FIRST_COMPLETED)
             done = [one for future in ended for one in self._collect(future)]
             for worker, _ in self._running.values():
                 worker.enforce_limits(self._work.limits, self._memory_bytes)
@@ -112,7 +325,6 @@ class _Run:
                 yield done
 
     def _submit_batches(self) -> None:
-        """Submit a batch to every idle worker, while there are any."""
         while self._idle:
             batch = self._again.popleft() if self._again else self._batches.next()
             if not batch:
@@ -123,7 +335,6 @@ class _Run:
         self._running[worker.submit(self._work.task, batch)] = (worker, batch)
 
     def _collect(self, future: Future[Any]) -> list[TaskResult[Any]]:
-        """Results of a batch that ended."""
         worker, batch = self._running.pop(future)
         error = future.exception()
         if isinstance(error, BrokenProcessPool):
@@ -154,12 +365,9 @@ class _Run:
             self._submit(worker, [one.item])
         if not suspects:
             self._idle.append(worker)
-        return [self._with_spoiler(one) for one in end.done if one not in suspects]
-
-    def _with_spoiler(self, done: TaskResult[Any]) -> TaskResult[Any]:
-        """Result with the earlier item that made it crash, where it does not crash in a fresh process."""
-        spoiler = self._spoilers.pop(done.item, None)
-        return done if done.crashed else replace(done, spoiled_by=spoiler)
+        others = [(one, self._spoilers.pop(one.item, None)) for one in end.done if one not in suspects]
+        # an item that does not crash in a fresh process was spoiled by the one before it
+        return [one if one.crashed else replace(one, spoiled_by=spoiler) for one, spoiler in others]
 
     def _handle_worker_crash(
         self, worker: WatchedWorker, batch: Sequence[int], error: BaseException
@@ -167,7 +375,10 @@ class _Run:
         """Find the task that ended the worker; run the others of its batch again."""
         item, death = worker.handle_death(error)
         if item is None or item not in batch:
-            self._note_death_at_start(death)
+            self._deaths_at_start += 1
+            if self._deaths_at_start >= _MAX_START_DEATHS:
+                reason = f"{death}\n{death.trace}".strip()
+                raise CampaignError(f"worker processes die before they begin a case; the last: {reason}")
             self._again.append(list(batch))
             self._idle.append(worker)
             return []
@@ -182,11 +393,17 @@ class _Run:
         self._idle.append(worker)
         return [TaskResult(item, None, death)]
 
-    def _note_death_at_start(self, death: CaseEndedError) -> None:
-        self._deaths_at_start += 1
-        if self._deaths_at_start >= _MAX_START_DEATHS:
-            reason = f"{death}\n{death.trace}".strip()
-            raise CampaignError(f"worker processes die before they begin a case; the last: {reason}")
+
+def _remove_abandoned_folders() -> None:
+    """Remove the temporary folders of killed executors."""
+    for lock in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*/{_LOCK}"):
+        with suppress(OSError):
+            held = os.open(lock, os.O_RDWR)
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(lock.parent, ignore_errors=True)
+            finally:
+                os.close(held)
 
 
 def free_memory() -> float:
@@ -197,41 +414,6 @@ def free_memory() -> float:
         return math.inf
     found = re.search(r"^MemAvailable:\s+(\d+) kB", text, re.MULTILINE)
     return float(found[1]) * 1024.0 if found else math.inf
-
-
-_PREFIX = "marsyard-"
-
-#: Locked by the owner of a folder while it lives.
-_LOCK = "lock"
-
-
-class WorkersFolder:
-    """A new temporary folder of a group of workers; abandoned ones of killed owners are removed."""
-
-    def __init__(self) -> None:
-        _remove_abandoned(Path(tempfile.gettempdir()))
-        self.path = Path(tempfile.mkdtemp(prefix=_PREFIX))
-        # renamed only once it is locked
-        partial = self.path / "lock.partial"
-        self._lock = os.open(partial, os.O_RDWR | os.O_CREAT, 0o600)
-        fcntl.flock(self._lock, fcntl.LOCK_EX)
-        partial.rename(self.path / _LOCK)
-
-    def remove(self) -> None:
-        """Remove the folder with its contents."""
-        os.close(self._lock)
-        shutil.rmtree(self.path, ignore_errors=True)
-
-
-def _remove_abandoned(parent: Path) -> None:
-    for lock in parent.glob(f"{_PREFIX}*/{_LOCK}"):
-        with suppress(OSError):
-            held = os.open(lock, os.O_RDWR)
-            try:
-                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(lock.parent, ignore_errors=True)
-            finally:
-                os.close(held)
 
 
 @dataclass(frozen=True)
@@ -249,17 +431,13 @@ class ExecutorConfig:
         return f"{self.jobs} on this machine" if self.cluster is None else f"cluster {self.cluster}"
 
 
-@contextmanager
-def create_executor(config: ExecutorConfig) -> Iterator[Executor]:
-    """Start an executor; its workers are killed at an exit by an exception, and end otherwise.
+def create_executor(config: ExecutorConfig) -> AbstractContextManager[Executor]:
+    """Executor as a context; its workers are killed at an exit by an exception, and end otherwise.
 
     Raises CampaignError where the cluster cannot be reached, or Dask is not installed.
     """
     if config.cluster is None:
-        with LocalExecutor(config.jobs) as local:
-            yield local
-        return
+        return LocalExecutor(config.jobs)
     from marsyard.campaigns.execution.cluster import ClusterExecutor
 
-    with ClusterExecutor(config.cluster) as cluster:
-        yield cluster
+    return ClusterExecutor(config.cluster)

@@ -1,1 +1,1 @@
-"""Campaigns run, gone on with and estimated; single cases run again."""
+"""Run, resume, extend and estimate campaigns; run single cases again."""

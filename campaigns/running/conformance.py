@@ -7,8 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.work import Work, WorkLimits
-from marsyard.campaigns.execution.worker_process import LOADING_S, TaskResult, accept_process_state, start_clock
+from marsyard.campaigns.execution.worker_process import LOADING_S, Work, WorkLimits, accept_process_state, start_clock
 from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.outcomes import CaseEndedError
 from marsyard.scenarios.conformance import (
@@ -42,15 +41,26 @@ def subject_of(spec: str, task: str | None, limit_s: float) -> Subject:
 
 def examine(subject: Subject) -> Iterator[Finding]:
     """Run all checks in order; only the first, the ordinary case, if its worker process ends."""
-    names = check_names(subject)
     # the time limit of an answer, and as much again for the rest of the check
     limits = WorkLimits(2.0 * subject.limit_s + 5.0, _MEMORY_BYTES, _OUTPUT_BYTES)
     with LocalExecutor(1) as workers:
-        for number, (name, asked) in enumerate(names):
-            work = Work(partial(_run_check, subject), [number], limits)
-            ((done,),) = workers.run(work)
-            yield _finding(done, name, asked)
-            if number == 0 and isinstance(done.error, CaseEndedError):
+        for number, (name, asked) in enumerate(check_names(subject)):
+            ((done,),) = workers.run(Work(partial(_run_check, subject), [number], limits))
+            finding, error = done.result, done.error
+            if finding is None and isinstance(error, CaseEndedError):
+                where = [line.strip() for line in error.trace.splitlines() if line.strip().startswith("File ")][:1]
+                problem = f"{error.outcome}: {error}{f' ({where[0]})' if where else ''}"
+                advice = "no picture may make it hang, end its process or take all memory"
+                finding = Finding(name, asked, problem, advice)
+            elif finding is None:
+                problem = f"{type(error).__name__}: {error}"
+                finding = Finding(name, asked, problem, "this is a defect of the suite or of the answer's types")
+            elif finding.passed and done.changed:
+                problem = f"it changed the state of its process: {'; '.join(done.changed)}"
+                advice = "set it back before returning, and end every thread and child process"
+                finding = replace(finding, problem=problem, next_step=f"{advice}: a case must leave no trace")
+            yield finding
+            if number == 0 and isinstance(error, CaseEndedError):
                 return
 
 
@@ -61,23 +71,3 @@ def _run_check(subject: Subject, number: int) -> Finding:
     accept_process_state()
     start_clock()
     return run_check(subject, number)
-
-
-def _finding(done: TaskResult[Finding], name: str, asked: str) -> Finding:
-    """Finding of a check, failed where it changed the process state that later cases would meet."""
-    finding, error = done.result, done.error
-    if finding is not None and finding.passed and done.changed:
-        return replace(
-            finding,
-            problem=f"it changed the state of its process: {'; '.join(done.changed)}",
-            next_step="set it back before returning, and end every thread and child process: "
-            "a case must leave no trace",
-        )
-    if finding is not None:
-        return finding
-    if isinstance(error, CaseEndedError):
-        where = [line.strip() for line in error.trace.splitlines() if line.strip().startswith("File ")][:1]
-        problem = f"{error.outcome}: {error}{f' ({where[0]})' if where else ''}"
-        return Finding(name, asked, problem, "no picture may make it hang, end its process or take all memory")
-    problem = f"{type(error).__name__}: {error}"
-    return Finding(name, asked, problem, "this is a defect of the suite or of the answer's types")

@@ -3,38 +3,31 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 from pydantic import ValidationError
 
-from marsyard.campaigns.definition.algorithms import describe_algorithms
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.configuration import POPULATIONS, CampaignConfiguration, Limits
-from marsyard.campaigns.definition.identity import Identity, identity_of
-from marsyard.campaigns.errors import CampaignError, ConfigurationError, Problem, StoreError, not_allowed
-from marsyard.campaigns.execution.cases import (
-    CompletedCase,
-    configuration_text,
-    prepare_input,
-    prepare_limits,
-    run_cases,
-)
-from marsyard.campaigns.execution.work import Executor, Work
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, key_text
+from marsyard.campaigns.definition.identity import Identity, describe_algorithms, identity_of
+from marsyard.campaigns.definition.loading import NUMBERS, find_unknown_columns
+from marsyard.campaigns.errors import CampaignError, ConfigurationError, Problem, StoreError
+from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
+from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
 from marsyard.campaigns.outcomes import RETRYABLE, UNFINISHED
-from marsyard.campaigns.running.compilation import compilation_reported
-from marsyard.campaigns.running.inputs import plan_inputs
+from marsyard.campaigns.running.preparation import plan_inputs, report_compilation
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_with
 from marsyard.campaigns.store import record
+from marsyard.campaigns.store.products import ProductStore, select_kept_cases
 from marsyard.campaigns.store.record import folder_lock
-from marsyard.campaigns.store.retention import ProductStore, keep_while_running
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
-from marsyard.campaigns.store.table import TABLE_FILE, showcase_case, worst_cases, write_table
+from marsyard.campaigns.store.table import TABLE_FILE, find_showcase, find_worst_cases, write_table
 from marsyard.scenarios.systems import RowColumns, row_columns
 from marsyard.sim.kernel_cache import mark_ready
 
@@ -44,30 +37,21 @@ class Watch(Protocol):
 
     def begin(self, stage: str, total: int) -> None:
         """Begin a stage of a number of steps."""
-        ...
 
     def step(self) -> None:
         """Count a finished step of the stage."""
-        ...
 
     def note(self, text: str) -> None:
         """Report a text to the user; may be called from another thread."""
-        ...
 
 
 @dataclass(frozen=True)
 class _Run:
-    """A running campaign: its folder, executor, row store and progress receiver."""
-
     campaign: Campaign
     directory: Path
     executor: ExecutorConfig
     store: RowStore
     watch: Watch
-
-    @property
-    def configuration(self) -> CampaignConfiguration:
-        return self.campaign.configuration
 
 
 def run_campaign(campaign: Campaign, directory: Path, executor: ExecutorConfig, watch: Watch) -> None:
@@ -83,14 +67,8 @@ def run_campaign(campaign: Campaign, directory: Path, executor: ExecutorConfig, 
         identity = identity_of(campaign.configuration)
         algorithms = describe_algorithms(campaign)
         create_store(directory / ROWS_FILE, {"identity": identity.configuration})
-        record.begin(
-            directory,
-            campaign.configuration,
-            identity,
-            executor.describe(),
-            command=campaign.command,
-            algorithms=algorithms,
-        )
+        words, stated = campaign.command, campaign.configuration
+        record.begin(directory, stated, identity, executor.describe(), command=words, algorithms=algorithms)
         with RowStore(directory / ROWS_FILE) as store:
             _execute(_Run(campaign, directory, executor, store, watch), ())
 
@@ -111,7 +89,8 @@ def resume_campaign(
     allow_changed: continue with other code or versions than the campaign was run with, and record that.
     Raises CampaignError where the folder holds no campaign that can be continued; it stays unchanged.
     """
-    with folder_lock(_with_record(directory)):
+    record.read(directory)  # no lock file is created in a folder without a campaign
+    with folder_lock(directory):
         configuration = record.stored_configuration(directory)
         if case_time_s is not None:
             try:
@@ -130,7 +109,8 @@ def append_cases(
 
     Raises CampaignError as `resume_campaign` does, where the campaign is not finished, or its design refuses the block.
     """
-    with folder_lock(_with_record(directory)):
+    record.read(directory)  # no lock file is created in a folder without a campaign
+    with folder_lock(directory):
         state = record.read(directory)["state"]
         if state != "finished":
             raise CampaignError(f"{directory} is not finished ({state}): marsyard resume {directory}")
@@ -142,16 +122,10 @@ def campaign_with_block(directory: Path, cases: int) -> Campaign:
     """Stored campaign with another block of cases, which is not run. Raises CampaignError as `append_cases` does."""
     configuration = record.stored_configuration(directory)
     appended = configuration.model_copy(update={"appended": (*configuration.appended, cases)})
-    problems = [message for _, message in appended.sampling_problems()]
+    problems = [message for _, message in appended.find_sampling_problems()]
     if cases < 1 or problems:
         raise CampaignError(f"{cases} cases cannot be added to {directory}: {'; '.join(problems) or 'at least 1'}")
     return load_stored_campaign(directory, appended)
-
-
-def _with_record(directory: Path) -> Path:
-    """Folder, if it holds a campaign: no lock file is created in any other."""
-    record.read(directory)
-    return directory
 
 
 def _continue_campaign(
@@ -171,11 +145,16 @@ def _continue_campaign(
             f"{directory} was run by an earlier version, which stored no rows to continue from; run it again"
         )
     before, identity = Identity.read(stored["identity"]), identity_of(configuration)
-    changes = _identity_changes(directory, before, identity, allow_changed)
-    if before.inputs is None and identity.inputs:
-        watch.note(
-            f"whether these files have changed so far is not known, as no hash was kept: {', '.join(identity.inputs)}"
+    changes = before.differences(identity)
+    if changes and not allow_changed:
+        listed = "\n  ".join(changes)
+        raise CampaignError(
+            f"{directory} was run with another program, configuration or input files; rows would not belong together. "
+            f"Changed:\n  {listed}\nTo continue nevertheless, with a note in the record: --allow-changed"
         )
+    if before.inputs is None and identity.inputs:
+        files = ", ".join(identity.inputs)
+        watch.note(f"whether these files have changed so far is not known, as no hash was kept: {files}")
     with RowStore(directory / ROWS_FILE, thorough=True) as store:
         if store.about.get("identity") != stored["identity"]["configuration"] and not stored["changes"]:
             raise StoreError(f"{directory}: {ROWS_FILE} and {record.RECORD_FILE} belong to different campaigns")
@@ -185,80 +164,83 @@ def _continue_campaign(
         if not again and ended and not store.missing(configuration.total_cases):
             watch.note(f"the campaign is finished: all {count} cases have rows; nothing is run")
             return
-        session = record.session(command, executor.describe(), count)
+        session = record.describe_session(command, executor.describe(), count)
         updates: dict[str, Any] = {"state": "running", "exit_code": None, "finished_utc": None}
         updates["sessions"] = [*stored["sessions"], session]
         if changes:
             updates["changes"] = [*stored["changes"], {"utc": record.utc_now(), "cases_before": count, "in": changes}]
             updates["algorithms"] = describe_algorithms(campaign)
         if changes or before.inputs is None:
-            updates["identity"] = identity.plain()
+            updates["identity"] = asdict(identity)
         updates.update(cases=configuration.total_cases, configuration=configuration.model_dump(mode="json"))
         record.update(directory, updates)
         old, new = stored["environment"], session["environment"]
         if any(old.get(key) != new[key] for key in ("machine", "processor", "processor_features")):
-            processor = old.get("processor")
-            watch.note(
-                f"the campaign began on another processor ({processor}): "
-                "rows may differ from its rows in their last bits"
-            )
+            name = f"the campaign began on another processor ({old.get('processor')})"
+            watch.note(f"{name}: rows may differ from its rows in their last bits")
         _execute(_Run(campaign, directory, executor, store, watch), again)
-
-
-def _identity_changes(directory: Path, before: Identity, now: Identity, allow_changed: bool) -> list[str]:
-    """Changes of program and input files since the campaign's last session; refused unless allowed."""
-    changes = before.differences(now)
-    if changes and not allow_changed:
-        listed = "\n  ".join(changes)
-        raise CampaignError(
-            f"{directory} was run with another program, configuration or input files; rows would not belong together. "
-            f"Changed:\n  {listed}\nTo continue nevertheless, with a note in the record: --allow-changed"
-        )
-    return changes
 
 
 def _execute(run: _Run, again: Sequence[int]) -> None:
     """Run the missing cases and those of `again`; write the table, keep products, and record the progress."""
-    with _recorded(run), create_executor(run.executor) as executor:
-        missing = run.store.missing(run.configuration.total_cases)
-        if missing or again:
-            with compilation_reported(run.configuration.scenario, run.watch.note) as first_case_ended:
-                _prepare(run, executor, itertools.chain(*missing, again))
-                _run_cases(run, executor, [*missing, again], first_case_ended)
-        measures = [asked.metric for asked in run.configuration.requirements if asked.bound is not None]
-        write_table(run.directory / TABLE_FILE, run.store, measures)
-        _keep_worst(run, executor)
+    configuration, table = run.campaign.configuration, run.directory / TABLE_FILE
 
-
-@contextmanager
-def _recorded(run: _Run) -> Iterator[None]:
-    """Record the progress of the campaign when the context ends, also by an exception."""
-
-    def update(state: str) -> None:
+    def record_end(state: str) -> None:
         progress = {"cases_finished": run.store.count(), "cases_crashed": run.store.unfinished()}
         record.update(run.directory, {"state": state, "finished_utc": record.utc_now(), **progress})
 
     try:
-        yield
+        with create_executor(run.executor) as executor:
+            missing = run.store.missing(configuration.total_cases)
+            if missing or again:
+                with report_compilation(configuration.scenario, run.watch.note) as first_case_ended:
+                    _prepare_inputs(run, executor, itertools.chain(*missing, again))
+                    _run_cases(run, executor, [*missing, again], first_case_ended)
+            write_table(table, run.store, [one.metric for one in configuration.requirements if one.bound is not None])
+            _keep_worst(run, executor)
     except BaseException:
         # on a full disk the record keeps the state "running", and the released lock shows that no process runs
         with suppress(StoreError):
-            update("interrupted")
+            record_end("interrupted")
         raise
-    update("finished")
+    record_end("finished")
+
+
+def _prepare_inputs(run: _Run, executor: Executor, cases: Iterable[int]) -> None:
+    """Build the inputs that cases share; where that fails, the rows of the affected cases state it."""
+    configuration, watch = run.campaign.configuration, run.watch
+    plan = plan_inputs(run.campaign, cases)
+    inputs = plan.to_prepare
+    if plan.build_bytes > plan.limit_bytes:
+        watch.note(
+            f"the terrains to be built take {plan.build_bytes / 1e9:.1f} GB, more than the cache may "
+            f"({plan.limit_bytes / 1e9:.1f} GB): some are built more than once; MARSYARD_CACHE_GB sets the limit"
+        )
+    if not inputs:
+        return
+    watch.begin("preparing", len(inputs))
+    task = partial(prepare_input, configuration_text(configuration))
+    limits = work_limits(configuration.limits, configuration.limits.prepare_time_s)
+    for done in itertools.chain.from_iterable(executor.run(Work(task, inputs, limits, len(inputs)))):
+        if done.error is not None:
+            error = f"{type(done.error).__name__}: {done.error}"
+            watch.note(f"shared input {done.item} could not be prepared: {error}")
+        elif done.result:
+            watch.note(done.result)
+        watch.step()
 
 
 def _run_cases(
     run: _Run, executor: Executor, parts: Sequence[Sequence[int]], first_case_ended: Callable[[], None]
 ) -> None:
     """Run cases; store products before their rows, and the rows of one batch in one transaction."""
-    configuration, watch = run.configuration, run.watch
+    configuration, watch = run.campaign.configuration, run.watch
     total = sum(len(part) for part in parts)
     products = ProductStore(run.directory, configuration.retain.budget_gb)
     cases = itertools.chain.from_iterable(parts)
     watch.begin("cases", total)
     checked = False
-    for ended in run_cases(executor, configuration, cases, keep=keep_while_running(configuration), total=total):
+    for ended in run_cases(executor, configuration, cases, keep=select_kept_cases(configuration), total=total):
         for completed in ended:
             _keep_products(products, completed, watch)
         run.store.add(completed.row for completed in ended)
@@ -273,7 +255,6 @@ def _run_cases(
 
 
 def _keep_products(products: ProductStore, completed: CompletedCase, watch: Watch) -> None:
-    """Store the products of a case, within the budget."""
     if completed.note:
         watch.note(completed.note)
     if completed.products is None or products.full:
@@ -283,55 +264,24 @@ def _keep_products(products: ProductStore, completed: CompletedCase, watch: Watc
         watch.note(f"the budget for kept products (retain.budget_gb) is used up: none is kept from case {case} on")
 
 
-def _prepare(run: _Run, executor: Executor, cases: Iterable[int]) -> None:
-    """Build the inputs that cases share; where that fails, the rows of the affected cases state it."""
-    configuration, watch = run.configuration, run.watch
-    plan = plan_inputs(run.campaign, cases)
-    inputs = plan.to_prepare
-    if plan.build_bytes > plan.limit_bytes:
-        watch.note(
-            f"the terrains to be built take {plan.build_bytes / 1e9:.1f} GB, more than the cache may "
-            f"({plan.limit_bytes / 1e9:.1f} GB): some are built more than once; MARSYARD_CACHE_GB sets the limit"
-        )
-    if not inputs:
-        return
-    watch.begin("preparing", len(inputs))
-    task = partial(prepare_input, configuration_text(configuration))
-    for ended in executor.run(Work(task, inputs, prepare_limits(configuration.limits), len(inputs))):
-        for done in ended:
-            if done.error is not None:
-                error = f"{type(done.error).__name__}: {done.error}"
-                watch.note(f"shared input {done.item} could not be prepared: {error}")
-            elif done.result:
-                watch.note(done.result)
-            watch.step()
-
-
 def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Path) -> None:
     """Check the columns that requirements name against a finished case, before more cases run.
 
     A row may lack columns that the scenario states: these are checked when the campaign is loaded
-    (`marsyard.campaigns.definition.checking.metric_problems`).
+    (`marsyard.campaigns.definition.loading`).
     Raises ConfigurationError where a requirement names a missing column, or one of another type: numbers for a metric
     with a bound, true and false for a metric without one and for a population.
     """
     stated = row_columns(configuration.scenario) or RowColumns((), ())
     flags = [name for name, value in row.items() if isinstance(value, bool)]
     numbers = [name for name, value in row.items() if isinstance(value, int | float) and name not in (*flags, "case")]
-    flag_kind = "column of true and false"
-    problems = []
-    for index, requirement in enumerate(configuration.requirements):
-        kind, allowed = ("column of numbers", numbers) if requirement.bound is not None else (flag_kind, flags)
-        checks = (
-            ("metric", requirement.metric_columns, kind, allowed, allowed),
-            ("population", requirement.population_columns, flag_kind, flags, [*POPULATIONS, *flags]),
-        )
-        for key, columns, expected, valid, listed in checks:
-            for name in columns:
-                absent = name not in row and (stated.has_flag(name) or stated.has_number(name))
-                if name not in valid and not absent:
-                    message = not_allowed(expected, name, listed)
-                    problems.append(Problem(configuration.name, f"requirements[{index}].{key}", message))
+
+    def is_known(name: str, kind: str) -> bool:
+        absent = name not in row and (stated.has_flag(name) or stated.has_number(name))
+        return absent or name in (numbers if kind == NUMBERS else flags)
+
+    found = find_unknown_columns(configuration.requirements, flags, numbers, is_known)
+    problems = [Problem(configuration.name, key_text(key), message) for key, message in found]
     if problems:
         stopped = Problem(str(directory), "", "the campaign was stopped; the rows so far are kept")
         raise ConfigurationError([*problems, stopped])
@@ -339,16 +289,18 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
 
 def _keep_worst(run: _Run, executor: Executor) -> None:
     """Run the showcase, and the worst cases where they are kept, again for their products."""
-    retain, table = run.configuration.retain, run.directory / TABLE_FILE
-    showcase = showcase_case(run.configuration, table, run.store)
-    worst = worst_cases(run.configuration, table) if retain.products == "worst" else ()
-    cases = list(dict.fromkeys([*([] if showcase is None else [showcase]), *worst]))
+    configuration, table = run.campaign.configuration, run.directory / TABLE_FILE
+    showcase = find_showcase(configuration, table, run.store)
+    cases = [] if showcase is None else [showcase]
+    if configuration.retain.products == "worst":
+        cases += find_worst_cases(configuration, table, configuration.retain.worst)
     if not cases:
         return
+    cases = list(dict.fromkeys(cases))
     run.watch.begin("showcase", len(cases))
-    products = ProductStore(run.directory, retain.budget_gb)
+    products = ProductStore(run.directory, configuration.retain.budget_gb)
     for case in cases:
-        replayed = replay_with(executor, run.configuration, case, run.store.row(case))
+        replayed = replay_with(executor, configuration, case, run.store.row(case))
         if replayed.differing:
             record.update(run.directory, {"showcase_differs": list(replayed.differing)})
             run.watch.note(f"case {case} run again came out differently in: {', '.join(replayed.differing)}")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.campaign import Campaign, replaced
+from marsyard.campaigns.definition.campaign import Campaign, replace_value
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
 from marsyard.campaigns.definition.identity import configuration_hash
 from marsyard.campaigns.errors import CampaignError, StoreError, writing
@@ -65,32 +65,24 @@ def export_campaign(campaign: Campaign, exported: Exported, executor: ExecutorCo
 
 
 def _write_manifest(campaign: Campaign, directory: Path) -> None:
-    form = _task(campaign).offline
+    task, name, cases = _find_task(campaign), campaign.configuration.name, campaign.configuration.total_cases
+    form = task.offline
     columns = () if form is None else form.columns
-    manifest = {
-        "schema": SCHEMA,
-        "campaign": campaign.configuration.name,
-        "task": _task(campaign).name,
-        "cases": campaign.configuration.total_cases,
-        "columns": list(columns),
-    }
-    text = "\n".join(
-        [
-            f"# {campaign.configuration.total_cases} cases of {campaign.configuration.name}",
-            "",
-            f"Each folder of `{CASES}/` is one case (task: {_task(campaign).name}): `case.json`, 16-bit pictures and",
-            "cameras, in the exchange of docs/custom-algorithms.md. Nothing here is the truth.",
-            "",
-            "Answer in a table with commas, one line for each case, with a first line of these columns:",
-            "",
-            f"    {','.join(columns)}",
-            "",
-            "`case` is the folder's number. Units are those that the names end with. A case without an answer has an",
-            f"outcome and no numbers; outcomes: {', '.join(form.outcomes.__members__) if form else ''}.",
-            *([form.note] if form and form.note else []),
-            "",
-        ]
-    )
+    manifest = {"schema": SCHEMA, "campaign": name, "task": task.name, "cases": cases, "columns": list(columns)}
+    text = f"""# {cases} cases of {name}
+
+Each folder of `{CASES}/` is one case (task: {task.name}): `case.json`, 16-bit pictures and
+cameras, in the exchange of docs/custom-algorithms.md. Nothing here is the truth.
+
+Answer in a table with commas, one line for each case, with a first line of these columns:
+
+    {",".join(columns)}
+
+`case` is the folder's number. Units are those that the names end with. A case without an answer has an
+outcome and no numbers; outcomes: {", ".join(form.outcomes.__members__) if form else ""}.
+"""
+    if form and form.note:
+        text += f"{form.note}\n"
     with writing(directory):
         (directory / MANIFEST_FILE).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
         (directory / README_FILE).write_text(text, encoding="utf-8")
@@ -101,61 +93,56 @@ def scored_campaign(exported: Exported, answers: Path) -> Campaign:
 
     Raises CampaignError where the folders hold no finished export, or the table does not answer each case once.
     """
-    manifest = _manifest(exported.directory)
-    stored = record.stored_configuration(exported.truth)
-    if record.read(exported.truth)["state"] != "finished":
-        raise CampaignError(f"{exported.truth} is not finished: export again to continue")
-    if (manifest["campaign"], manifest["cases"]) != (stored.name, stored.total_cases):
-        raise CampaignError(f"{exported.directory} and {exported.truth} belong to different exports")
-    exporting = Campaign(stored, scenario(stored.scenario))
-    _check_answers(exporting, answers)
-    table = exporting.scenario.algorithm_table if isinstance(exporting.scenario, HasAlgorithms) else ()
-    parameters = replaced(stored.parameters, [*table, "algorithm"], f"{ANSWERS}{answers.resolve()}")
-    changed = stored.model_copy(update={"parameters": parameters, "retain": Retain()})
-    return Campaign(CampaignConfiguration.model_validate(changed.model_dump()), exporting.scenario)
-
-
-def _manifest(directory: Path) -> dict[str, Any]:
-    path = directory / MANIFEST_FILE
+    path = exported.directory / MANIFEST_FILE
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
         if manifest["schema"] != SCHEMA:
             raise ValueError(f"has schema {manifest['schema']}; this version of Marsyard reads {SCHEMA}")
-        return {"campaign": str(manifest["campaign"]), "cases": int(manifest["cases"])}
+        stated = str(manifest["campaign"]), int(manifest["cases"])
     except OSError as error:
-        raise StoreError(f"{directory} holds no finished export: {path.name}: {error.strerror or error}") from error
+        reason = f"{path.name}: {error.strerror or error}"
+        raise StoreError(f"{exported.directory} holds no finished export: {reason}") from error
     except (KeyError, TypeError, ValueError) as error:
         raise StoreError(f"{path} is damaged: {error}") from error
+    stored = record.stored_configuration(exported.truth)
+    if record.read(exported.truth)["state"] != "finished":
+        raise CampaignError(f"{exported.truth} is not finished: export again to continue")
+    if stated != (stored.name, stored.total_cases):
+        raise CampaignError(f"{exported.directory} and {exported.truth} belong to different exports")
+    exporting = Campaign(stored, scenario(stored.scenario))
+    _check_answers(_find_task(exporting), stored, answers)
+    table = exporting.scenario.algorithm_table if isinstance(exporting.scenario, HasAlgorithms) else ()
+    parameters = replace_value(stored.parameters, [*table, "algorithm"], f"{ANSWERS}{answers.resolve()}")
+    changed = stored.model_copy(update={"parameters": parameters, "retain": Retain()})
+    return Campaign(CampaignConfiguration.model_validate(changed.model_dump()), exporting.scenario)
 
 
-def _check_answers(campaign: Campaign, answers: Path) -> None:
+def _check_answers(task: Task[Any, Any], configuration: CampaignConfiguration, answers: Path) -> None:
     """Refuse a table that cannot be read, lacks cases or has unknown ones."""
-    form = _task(campaign).offline
-    if form is None:
-        raise CampaignError(f"{campaign.configuration.name} cannot be answered in a table")
+    if task.offline is None:
+        raise CampaignError(f"{configuration.name} cannot be answered in a table")
     try:
-        found = read_answers(answers, form)
+        found = read_answers(answers, task.offline)
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    total = campaign.configuration.total_cases
+    total = configuration.total_cases
     unknown = sorted(case for case in found if case >= total)
     if unknown:
-        raise CampaignError(f"{answers}: there is no case {_some(unknown)}; allowed: 0 to {total - 1}")
+        raise CampaignError(f"{answers}: there is no case {_list_first(unknown)}; allowed: 0 to {total - 1}")
     missing = [case for case in range(total) if case not in found]
     if missing:
-        failures = list(form.outcomes.__members__)[1:]
+        failures = list(task.offline.outcomes.__members__)[1:]
         raise CampaignError(
-            f"{answers}: no answer to {len(missing)} of {total} cases: {_some(missing)}; "
+            f"{answers}: no answer to {len(missing)} of {total} cases: {_list_first(missing)}; "
             f"a case without one is stated with its outcome, such as {failures[0]}"
         )
 
 
-def _some(cases: Sequence[int]) -> str:
-    """First eight cases as text."""
+def _list_first(cases: Sequence[int]) -> str:
     return ", ".join(str(case) for case in cases[:8]) + (", ..." if len(cases) > 8 else "")
 
 
-def _task(campaign: Campaign) -> Task[Any, Any]:
+def _find_task(campaign: Campaign) -> Task[Any, Any]:
     if not isinstance(campaign.scenario, HasAlgorithms):
         raise CampaignError(f"the scenario of {campaign.configuration.name} has no choice of algorithms")
     return campaign.scenario.task

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from pydantic import ValidationError
 
@@ -13,12 +12,11 @@ from marsyard.campaigns.definition.configuration import CampaignConfiguration, k
 from marsyard.campaigns.definition.identity import Identity, identity_of
 from marsyard.campaigns.errors import CampaignError, ConfigurationError, Problem
 from marsyard.campaigns.execution.cases import run_cases
-from marsyard.campaigns.execution.work import Executor
+from marsyard.campaigns.execution.worker_process import Executor
 from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.outcomes import UNFINISHED
-from marsyard.campaigns.store.products import PackedProducts
+from marsyard.campaigns.store.products import KEEP_ALL, PackedProducts
 from marsyard.campaigns.store.record import read, stored_configuration
-from marsyard.campaigns.store.retention import KEEP_ALL
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.store.table import stored_row
 from marsyard.scenarios.registry import UnknownScenarioError, scenario
@@ -86,18 +84,13 @@ def differing_columns(row: Row, other: Row) -> tuple[str, ...]:
     The traceback of an unfinished case is not compared: a process is not ended at the same instruction twice.
     """
     excluded = {"traceback"} if row.get("outcome") in UNFINISHED else set()
-    names = [name for name in dict.fromkeys((*row, *other)) if "time" not in name and name not in excluded]
-    return tuple(name for name in names if not _is_same(row.get(name), other.get(name)))
-
-
-def _is_same(value: Any, other: Any) -> bool:
-    if _is_missing(value) or _is_missing(other):
-        return _is_missing(value) and _is_missing(other)
-    return bool(value == other)
-
-
-def _is_missing(value: Any) -> bool:
-    return value is None or value != value
+    differing = []
+    for name in dict.fromkeys((*row, *other)):
+        # NaN differs from itself
+        values = [None if one is None or one != one else one for one in (row.get(name), other.get(name))]
+        if "time" not in name and name not in excluded and values[0] != values[1]:
+            differing.append(name)
+    return tuple(differing)
 
 
 def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) -> Campaign:
@@ -107,17 +100,15 @@ def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) 
     """
     try:
         campaign = Campaign(configuration, scenario(configuration.scenario))
-    except UnknownScenarioError as error:
-        raise _refusal(directory, [("scenario", str(error))]) from error
-    try:
         campaign.base_parameters()
-    except ValidationError as error:
-        found = problems_of(error, campaign.scenario.parameters_type)
-        raise _refusal(directory, [(key_text(("parameters", *key)), message) for key, message in found]) from error
+    except (UnknownScenarioError, ValidationError) as error:
+        problems = [("scenario", str(error))]
+        if isinstance(error, ValidationError):
+            found = problems_of(error, campaign.scenario.parameters_type)
+            problems = [(key_text(("parameters", *key)), message) for key, message in found]
+        hint = (
+            "modules of your own are searched for in the current folder: start the command where the campaign was run"
+        )
+        problems.append(("", f"nothing was run or changed; {hint}"))
+        raise ConfigurationError([Problem(str(directory), *problem) for problem in problems]) from error
     return campaign
-
-
-def _refusal(directory: Path, problems: list[tuple[str, str]]) -> ConfigurationError:
-    hint = "modules of your own are searched for in the current folder: start the command where the campaign was run"
-    stated = [Problem(str(directory), key, message) for key, message in problems]
-    return ConfigurationError([*stated, Problem(str(directory), "", f"nothing was run or changed; {hint}")])

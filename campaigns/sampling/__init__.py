@@ -1,1 +1,1 @@
-"""How parameters vary over a campaign's cases: distributions, formulas, correlated groups, designs."""
+"""Variation of parameters over a campaign's cases: distributions, formulas, correlated groups, designs."""

@@ -1,4 +1,4 @@
-"""Sampling designs: how the uniform numbers behind the draws are distributed over the cases.
+"""Sampling designs and correlated groups: how the uniform numbers behind the draws are distributed over the cases.
 
 ``random`` draws every number independently: the only design from which a probability follows. ``latin-hypercube`` and
 ``sobol`` are stratified, which gives sharper means and sensitivities with fewer cases; their cases are not independent,
@@ -9,18 +9,28 @@ Any case can be drawn alone. Its position follows from its number: the block of 
 appended one), its point of the grid (its number within the block, modulo the grid's size), and its index in the design
 of this block and grid point. A stratified design is built as a whole, from one stream per dispersion; its size is part
 of its definition.
+
+Correlated groups are stated by a covariance, a correlation or a rank correlation. All three are one Gaussian copula
+(Nelsen, An Introduction to Copulas, 2006, section 2.3). The independent uniform numbers u of the members become normal,
+z = Phi^-1(u). The normals are mixed, z' = L z with the Cholesky factor L L^T = R of their correlation. Phi(z') replaces
+u. Every member keeps its distribution for any R. As L is lower triangular, the first member draws as it would alone,
+and a member added at the end changes no earlier one.
+
+- ``covariance`` and ``correlation`` (Pearson's) are for normal dispersions without truncation, whose draws are exactly
+  multivariate normal: R is the correlation itself. A covariance also states the standard deviations.
+- ``rank`` (Spearman's) is for any continuous dispersions: R = 2 sin(pi/6 rank), exactly (Kruskal 1958, J. Am. Stat.
+  Assoc. 53, 814-861; ranks do not depend on the marginals).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import Annotated, Literal
+from functools import cached_property, lru_cache
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import Field
+from pydantic import Field, model_validator
 from scipy.special import ndtr, ndtri
 
 from marsyard.sim.parameters import Parameters
@@ -36,8 +46,9 @@ MAX_STRATIFIED = 2**20
 _SOBOL_BITS = 52
 #: Designs that a process keeps: neighbouring cases share one.
 _CACHED_DESIGNS = 4
-
 Kind = Literal["random", "latin-hypercube", "sobol"]
+#: Indices of a correlated group's members among the dispersions, and the rows of its factor L.
+Group = tuple[tuple[int, ...], tuple[tuple[float, ...], ...]]
 
 
 class Design(Parameters):
@@ -49,52 +60,34 @@ class Design(Parameters):
     kind: Kind = "random"
     nominal: Annotated[bool, Field(strict=True)] = False
 
-    def problem(self, blocks: Sequence[int], grid_size: int) -> tuple[int, str] | None:
+    def find_problem(self, blocks: Sequence[int], grid_size: int) -> tuple[int, str] | None:
         """First block of cases that has no such design, and the reason; None where all have one."""
         for number, block in enumerate(blocks):
             nominal = int(self.nominal and number == 0)
-            problem = self._block_problem(block - nominal, grid_size)
+            cases = block - nominal
+            size, rest = divmod(cases, grid_size)
+            problem = ""
+            if rest or (cases == 0 and (self.kind != "random" or grid_size > 1)):
+                problem = "none is left"
+                if grid_size > 1:
+                    problem = f"the grid has {grid_size} points; allowed: a multiple of them"
+            elif self.kind != "random" and size > MAX_STRATIFIED:
+                problem = f"a {self.kind} design has at most {MAX_STRATIFIED} cases a point of the grid"
+            elif self.kind == "sobol" and size & (size - 1):
+                below = 1 << (size.bit_length() - 1)
+                each = " at each point of the grid" if grid_size > 1 else ""
+                problem = f"a Sobol design takes a power of 2{each}, such as {below} or {2 * below}"
             if problem:
-                return (
-                    number,
-                    f"{block - nominal} cases{' behind the nominal one' * nominal} cannot be laid out: {problem}",
-                )
+                return number, f"{cases} cases{' behind the nominal one' * nominal} cannot be laid out: {problem}"
         return None
 
-    def _block_problem(self, cases: int, grid_size: int) -> str:
-        """Reason why a block of so many cases has no such design; empty where it has one."""
-        if cases == 0 and self.kind == "random" and grid_size == 1:
-            return ""
-        if cases == 0 or cases % grid_size:
-            return f"the grid has {grid_size} points; allowed: a multiple of them" if grid_size > 1 else "none is left"
-        size = cases // grid_size
-        if self.kind != "random" and size > MAX_STRATIFIED:
-            return f"a {self.kind} design has at most {MAX_STRATIFIED} cases a point of the grid"
-        if self.kind == "sobol" and size & (size - 1):
-            below = 1 << (size.bit_length() - 1)
-            each = " at each point of the grid" if grid_size > 1 else ""
-            return f"a Sobol design takes a power of 2{each}, such as {below} or {2 * below}"
-        return ""
 
+def locate_case(design: Design, blocks: Sequence[int], grid_size: int, case: int) -> tuple[int, int, int, int] | None:
+    """Position of a case in blocks of given sizes; None for the nominal case.
 
-@dataclass(frozen=True)
-class CasePosition:
-    """Position of a case in the design.
-
-    grid_point: index of its point of the grid.
-    first: first case at this point in its block.
-    size: number of cases at this point in its block.
-    index: index of the case among these.
+    Returns the index of its point of the grid, the first case and the number of cases at this point in its block, and
+    the index of the case among these.
     """
-
-    grid_point: int
-    first: int
-    size: int
-    index: int
-
-
-def locate_case(design: Design, blocks: Sequence[int], grid_size: int, case: int) -> CasePosition | None:
-    """Position of a case in blocks of given sizes; None for the nominal case."""
     if design.nominal and case == 0:
         return None
     start, number = 0, 0
@@ -105,32 +98,20 @@ def locate_case(design: Design, blocks: Sequence[int], grid_size: int, case: int
     if design.nominal and number == 0:
         start, size = 1, size - 1
     index, point = divmod(case - start, grid_size)
-    return CasePosition(point, start + point, size // grid_size, index)
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Everything that determines the numbers of one stratified design.
-
-    kind: `latin-hypercube` or `sobol`.
-    seed, campaign: of the random streams.
-    first, size: see `CasePosition`.
-    paths: dispersions, in the order of their dimensions.
-    groups: indices of each correlated group's members in `paths`, and the rows of its factor L.
-    """
-
-    kind: Kind
-    seed: int
-    campaign: str
-    first: int
-    size: int
-    paths: tuple[str, ...]
-    groups: tuple[tuple[tuple[int, ...], tuple[tuple[float, ...], ...]], ...]
+    return point, start + point, size // grid_size, index
 
 
 @lru_cache(maxsize=_CACHED_DESIGNS)
-def build_stratified_design(layout: Layout) -> Float64[np.ndarray, "cases dispersions"]:
+def build_stratified_design(
+    kind: Kind, seed: int, campaign: str, first: int, size: int, paths: tuple[str, ...], groups: tuple[Group, ...]
+) -> Float64[np.ndarray, "cases dispersions"]:
     """Uniform numbers of a stratified design, each above 0 and below 1.
+
+    kind: `latin-hypercube` or `sobol`.
+    seed, campaign, first: of the random streams; `first` is the first case of the design.
+    size: number of cases.
+    paths: dispersions, in the order of their dimensions.
+    groups: see `Group`.
 
     Every dispersion has its own stream. A Latin hypercube is a random permutation of the strata for each dispersion; no
     dispersion depends on another. The dimensions of a Sobol sequence follow the order of the file; each is scrambled
@@ -139,14 +120,26 @@ def build_stratified_design(layout: Layout) -> Float64[np.ndarray, "cases disper
     Members of a correlated group keep their strata in a Latin hypercube: their numbers are sorted into the rank order
     of the mixed ones (Stein 1987, Technometrics 29, 143-151). For a Sobol sequence the numbers themselves are mixed.
     """
-    streams = Streams(layout.seed, layout.campaign, layout.first)
-    generate = _generate_latin if layout.kind == "latin-hypercube" else _generate_sobol
-    columns = [generate(streams.generator(f"design:{path}"), layout.size, k) for k, path in enumerate(layout.paths)]
-    points = np.clip(np.column_stack(columns), MIN_DRAW, MAX_DRAW) if columns else np.zeros((layout.size, 0))
-    for members, factor in layout.groups:
-        chosen = list(members)
-        mixed = correlate_uniform(points[:, chosen], np.array(factor))
-        points[:, chosen] = _reorder_by_rank(points[:, chosen], mixed) if layout.kind == "latin-hypercube" else mixed
+    from scipy.stats import qmc
+
+    streams = Streams(seed, campaign, first)
+    points = np.zeros((size, len(paths)))
+    for k, path in enumerate(paths):
+        rng = streams.generator(f"design:{path}")
+        if kind == "latin-hypercube":
+            points[:, k] = qmc.LatinHypercube(d=1, rng=rng).random(size)[:, 0]
+        else:
+            sequence = qmc.Sobol(d=k + 1, scramble=True, bits=_SOBOL_BITS, rng=rng).random(size)
+            # centre of the step, never 0
+            points[:, k] = sequence[:, k] + 2.0 ** -(_SOBOL_BITS + 1)
+    points = np.clip(points, MIN_DRAW, MAX_DRAW)
+    for members, factor in groups:
+        values = points[:, list(members)]
+        mixed = correlate_uniform(values, np.array(factor))
+        if kind == "latin-hypercube":
+            ranks = np.argsort(np.argsort(mixed, axis=0, kind="stable"), axis=0, kind="stable")
+            mixed = np.take_along_axis(np.sort(values, axis=0), ranks, axis=0)
+        points[:, list(members)] = mixed
     points.flags.writeable = False
     return points
 
@@ -154,35 +147,11 @@ def build_stratified_design(layout: Layout) -> Float64[np.ndarray, "cases disper
 def correlate_uniform(
     uniform: Float64[np.ndarray, "*cases members"], factor: Float64[np.ndarray, "members members"]
 ) -> Float64[np.ndarray, "*cases members"]:
-    """Correlated uniform numbers of a group from independent ones: Phi(L Phi^-1(u)), see
-    `marsyard.campaigns.sampling.correlation`.
-    """
-    mixed: Float64[np.ndarray, "*cases members"] = np.clip(ndtr(ndtri(uniform) @ factor.T), MIN_DRAW, MAX_DRAW)
-    return mixed
+    """Correlated uniform numbers of a group from independent ones: Phi(L Phi^-1(u))."""
+    return np.asarray(np.clip(ndtr(ndtri(uniform) @ factor.T), MIN_DRAW, MAX_DRAW))
 
 
-def _generate_latin(rng: np.random.Generator, size: int, _dimension: int) -> Float64[np.ndarray, " cases"]:
-    from scipy.stats import qmc
-
-    return np.asarray(qmc.LatinHypercube(d=1, rng=rng).random(size)[:, 0], dtype=np.float64)
-
-
-def _generate_sobol(rng: np.random.Generator, size: int, dimension: int) -> Float64[np.ndarray, " cases"]:
-    from scipy.stats import qmc
-
-    points = qmc.Sobol(d=dimension + 1, scramble=True, bits=_SOBOL_BITS, rng=rng).random(size)
-    # centre of the step, never 0
-    return np.asarray(points[:, dimension], dtype=np.float64) + 2.0 ** -(_SOBOL_BITS + 1)
-
-
-def _reorder_by_rank(
-    values: Float64[np.ndarray, "cases members"], other: Float64[np.ndarray, "cases members"]
-) -> Float64[np.ndarray, "cases members"]:
-    ranks = np.argsort(np.argsort(other, axis=0, kind="stable"), axis=0, kind="stable")
-    return np.take_along_axis(np.sort(values, axis=0), ranks, axis=0)
-
-
-def grid_probabilities(sizes: Mapping[str, int], point: int) -> dict[str, float]:
+def compute_grid_probabilities(sizes: Mapping[str, int], point: int) -> dict[str, float]:
     """Probabilities of the grids' levels at one point of the full factorial; the last grid varies fastest."""
     levels = np.unravel_index(point, tuple(sizes.values())) if sizes else ()
     return {path: (int(level) + 0.5) / size for (path, size), level in zip(sizes.items(), levels, strict=True)}
@@ -197,3 +166,75 @@ def describe_design(kind: str, grids: Sequence[str], *, nominal: bool) -> str:
     if grids:
         text += f" at each point of a grid over {', '.join(grids)}"
     return f"{text}; case 0 is the nominal one" if nominal else text
+
+
+_Matrix = tuple[tuple[Annotated[float, Field(strict=True, allow_inf_nan=False)], ...], ...]
+#: Relative tolerance of symmetry: files state rounded numbers.
+_ROUNDING = 1e-9
+#: Minimum eigenvalue of a correlation; below it, members are numerically functions of one another.
+_MIN_EIGENVALUE = 1e-10
+#: Matrices by which a group is stated.
+MATRICES = ("covariance", "correlation", "rank")
+
+
+class Correlation(Parameters):
+    """Dispersed parameters that are drawn together, with one matrix in their order."""
+
+    parameters: Annotated[tuple[str, ...], Field(min_length=1, max_length=200)]
+    covariance: _Matrix | None = None
+    correlation: _Matrix | None = None
+    rank: _Matrix | None = None
+    source: str = ""
+
+    @model_validator(mode="after")
+    def _check_statement(self) -> Self:
+        given = [name for name in MATRICES if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"one of {', '.join(MATRICES)} is needed, got {', '.join(given) or 'none'}")
+        repeated = sorted({name for name in self.parameters if self.parameters.count(name) > 1})
+        if repeated:
+            raise ValueError(f"named twice: {', '.join(repeated)}")
+        rows, size = getattr(self, self.kind), len(self.parameters)
+        if len(rows) != size or any(len(row) != size for row in rows):
+            raise ValueError(f"{self.kind} must have {size} rows of {size} numbers, one for each parameter")
+        matrix = np.array(rows, dtype=np.float64)
+        if np.any(np.abs(matrix - matrix.T) > _ROUNDING * np.abs(matrix).max()):
+            raise ValueError(f"{self.kind} is not symmetric")
+        diagonal = np.diag(matrix)
+        if self.kind == "covariance" and not np.all(diagonal > 0.0):
+            raise ValueError("covariance has a variance that is not above 0")
+        if self.kind != "covariance" and not np.allclose(diagonal, 1.0, rtol=0.0, atol=_ROUNDING):
+            raise ValueError(f"{self.kind} must be 1 along its diagonal")
+        if self.kind != "covariance" and np.any(np.abs(matrix) > 1.0 + _ROUNDING):
+            raise ValueError(f"{self.kind} has an entry that is not between -1 and 1")
+        normals = self.normal_correlation
+        smallest = float(np.linalg.eigvalsh(normals)[0]) if np.isfinite(normals).all() else float("nan")
+        if not smallest > _MIN_EIGENVALUE:
+            raise ValueError(
+                f"{self.kind} is not valid for a group: the normals' correlation is not positive definite, "
+                f"with the smallest eigenvalue {smallest:.3g}"
+            )
+        return self
+
+    @property
+    def kind(self) -> str:
+        """Name of the matrix that is stated."""
+        return next(name for name in MATRICES if getattr(self, name) is not None)
+
+    @property
+    def normal_correlation(self) -> Float64[np.ndarray, "n n"]:
+        """Correlation R of the normal numbers behind the draws."""
+        matrix = np.array(getattr(self, self.kind), dtype=np.float64)
+        symmetric: Float64[np.ndarray, "n n"] = 0.5 * (matrix + matrix.T)
+        if self.kind == "rank":
+            symmetric = 2.0 * np.sin(np.pi / 6.0 * symmetric)
+        elif self.kind == "covariance":
+            sd = np.sqrt(np.diag(symmetric))
+            symmetric = symmetric / sd[:, None] / sd
+        np.fill_diagonal(symmetric, 1.0)
+        return symmetric
+
+    @cached_property
+    def factor(self) -> Float64[np.ndarray, "n n"]:
+        """Lower triangular L with L L^T = R."""
+        return np.asarray(np.linalg.cholesky(self.normal_correlation))

@@ -1,20 +1,25 @@
-"""Base class of the dispersions: a parameter's distribution over the cases, as an inverse distribution function.
+"""Base class of the dispersions, types of their fields, and quantiles of truncated distributions.
 
-Every dispersion maps one uniform number to a value. The values of a case therefore depend on one number per dispersion,
-whether these numbers are independent, correlated or stratified. Numbers of a distribution may be formulas
-(`marsyard.campaigns.sampling.formulas`) of other parameters; `Dispersion.given` inserts the values of a case.
+A dispersion is a parameter's distribution over the cases, as an inverse distribution function. It maps one uniform
+number to a value. The values of a case therefore depend on one number per dispersion, whether these numbers are
+independent, correlated or stratified. Numbers of a distribution may be formulas
+(`marsyard.campaigns.sampling.formulas`) of other parameters; `Dispersion.insert_values` inserts the values of a case.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Annotated, Any, ClassVar, Self
 
+import numpy as np
 from pydantic import Field, PlainValidator
 from pydantic_core import PydanticKnownError
+from scipy.special import ndtr, ndtri
 
 from marsyard.campaigns.sampling.formulas import Formula, formula
 from marsyard.sim.parameters import Parameters
@@ -63,8 +68,8 @@ class Dispersion(Parameters, ABC):
         """Paths of the parameters on which the distribution depends, each once."""
         return tuple(dict.fromkeys(name for one in self.formulas.values() for name in one.names))
 
-    def given(self, values: Mapping[str, Any]) -> Self:
-        """Return the distribution for given values of the parameters that its formulas name.
+    def insert_values(self, values: Mapping[str, Any]) -> Self:
+        """Return the distribution for values of the parameters that its formulas name.
 
         Raises ValueError where a formula has no value, limits are in the wrong order, or a width is not positive.
         """
@@ -81,7 +86,14 @@ class Dispersion(Parameters, ABC):
     def describe(self) -> str:
         """Distribution and its parameters in one line."""
         stated = self.model_dump(exclude={"distribution", "unit", "description", "source"}, exclude_none=True)
-        texts = [f"{name}={_short(value)}" for name, value in stated.items()]
+        texts = []
+        for name, value in stated.items():
+            text = str(value)
+            if isinstance(value, list | tuple):
+                listed = ", ".join(str(one) for one in value)
+                is_short = len(value) <= 2 or len(listed) <= 60
+                text = f"[{listed}]" if is_short else f"[{value[0]}, ... {len(value)} in all]"
+            texts.append(f"{name}={text}")
         return f"{getattr(self, 'distribution', '?')}({', '.join(texts)})"
 
 
@@ -94,14 +106,7 @@ def _find_formulas(stated: Any, key: tuple[str | int, ...] = ()) -> Iterator[tup
         yield from _find_formulas(value, (*key, part))
 
 
-def _short(value: Any) -> str:
-    if isinstance(value, list | tuple):
-        text = ", ".join(str(one) for one in value)
-        return f"[{text}]" if len(value) <= 2 or len(text) <= 60 else f"[{value[0]}, ... {len(value)} in all]"
-    return str(value)
-
-
-def _number_or_formula(stated: Any) -> float | str:
+def _check_number(stated: Any) -> float | str:
     if isinstance(stated, str):
         return formula(stated).text
     if isinstance(stated, bool) or not isinstance(stated, int | float):
@@ -114,14 +119,14 @@ def _number_or_formula(stated: Any) -> float | str:
         raise PydanticKnownError("finite_number") from None
 
 
-def _positive_number_or_formula(stated: Any) -> float | str:
-    number = _number_or_formula(stated)
+def _check_positive_number(stated: Any) -> float | str:
+    number = _check_number(stated)
     if isinstance(number, float) and not number > 0.0:
         raise PydanticKnownError("greater_than", {"gt": 0})
     return number
 
 
-def _whole_number_or_formula(stated: Any) -> int | str:
+def _check_whole_number(stated: Any) -> int | str:
     """Whole number that a float represents exactly, or the text of a formula."""
     if isinstance(stated, str):
         return formula(stated).text
@@ -132,24 +137,134 @@ def _whole_number_or_formula(stated: Any) -> int | str:
     return stated
 
 
-def _literal(stated: Any) -> Any:
+def _check_literal(stated: Any) -> Any:
     """Value without formulas; numbers in it must be finite, since result files cannot hold others."""
     tables = stated.values() if isinstance(stated, Mapping) else stated if isinstance(stated, list | tuple) else ()
     for inner in tables:
-        _literal(inner)
+        _check_literal(inner)
     if isinstance(stated, float) and not math.isfinite(stated):
         raise PydanticKnownError("finite_number")
     return stated
 
 
-Number = Annotated[float | str, PlainValidator(_number_or_formula)]
-PositiveNumber = Annotated[float | str, PlainValidator(_positive_number_or_formula)]
+Number = Annotated[float | str, PlainValidator(_check_number)]
+PositiveNumber = Annotated[float | str, PlainValidator(_check_positive_number)]
 Limits = tuple[Number, Number]
-WholeNumber = Annotated[int | str, PlainValidator(_whole_number_or_formula)]
-Literally = Annotated[Any, PlainValidator(_literal)]
+WholeNumber = Annotated[int | str, PlainValidator(_check_whole_number)]
+Literally = Annotated[Any, PlainValidator(_check_literal)]
 Weight = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
 
 
-def interval_of(low: float | str, high: float | str) -> tuple[float, float] | None:
+def read_interval(low: float | str, high: float | str) -> tuple[float, float] | None:
     """Limits as numbers; None where one of them is a formula."""
     return None if isinstance(low, str) or isinstance(high, str) else (float(low), float(high))
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A distribution of one variable.
+
+    evaluate: value of its function `cdf` or `sf` (survival function), or of their inverses `ppf` and `isf`, by name.
+    support: minimum and maximum.
+    """
+
+    evaluate: Callable[[str, float], float]
+    support: tuple[float, float] = (-math.inf, math.inf)
+    is_discrete: bool = False
+
+
+_NORMAL_FUNCTIONS: Mapping[str, Callable[[float], Any]] = {
+    "cdf": ndtr,
+    "sf": lambda x: ndtr(-x),
+    "ppf": ndtri,
+    "isf": lambda q: -ndtri(q),
+}
+#: Standard normal distribution without importing `scipy.stats`, which takes a second.
+STANDARD_NORMAL = Shape(lambda function, x: float(_NORMAL_FUNCTIONS[function](x)))
+
+
+@lru_cache(maxsize=1)
+def scipy_distributions() -> Mapping[str, bool]:
+    """Univariate distributions of `scipy.stats` by name: whether each is discrete.
+
+    `uniform` is excluded, since campaign files write it with other parameters.
+    """
+    from scipy import stats
+
+    kinds = ((name, getattr(stats, name)) for name in dir(stats) if name != "uniform")
+    known = (stats.rv_continuous, stats.rv_discrete)
+    return {name: isinstance(kind, stats.rv_discrete) for name, kind in kinds if isinstance(kind, known)}
+
+
+def scipy_parameters(distribution: str) -> tuple[list[str], list[str]]:
+    """Parameters that a distribution of `scipy.stats` requires, and all that it accepts."""
+    from scipy import stats
+
+    shapes = getattr(stats, distribution).shapes
+    required = [name.strip() for name in shapes.split(",")] if shapes else []
+    return required, [*required, "loc"] if scipy_distributions()[distribution] else [*required, "loc", "scale"]
+
+
+def scipy_shape(distribution: str, parameters: Mapping[str, float]) -> Shape:
+    """Distribution of `scipy.stats` with given parameters.
+
+    Raises ValueError where it is not defined for them, now or when it is evaluated.
+    """
+    from scipy import stats
+
+    where = f"{distribution} is not defined for {', '.join(f'{key} = {one}' for key, one in parameters.items())}"
+
+    def call(function: Callable[[], Any]) -> Any:
+        # without SciPy's warnings: an invalid result is NaN
+        try:
+            with np.errstate(all="ignore"), warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                return function()
+        except (ArithmeticError, TypeError, ValueError, RuntimeError) as error:
+            raise ValueError(f"{where}: {error}") from error
+
+    def evaluate(function: str, x: float) -> float:
+        result = call(lambda: float(getattr(frozen, function)(x)))
+        if math.isnan(result):
+            raise ValueError(f"{where}: its {function} of {x} is not a number")
+        return float(result)
+
+    frozen = call(lambda: getattr(stats, distribution)(**parameters))
+    low, high = call(lambda: [float(one) for one in frozen.support()])
+    if not low <= high:
+        raise ValueError(where)
+    return Shape(evaluate, (low, high), scipy_distributions()[distribution])
+
+
+def truncated_quantile(shape: Shape, limits: tuple[float, float] | None, probability: float) -> float | int:
+    """Quantile of a distribution truncated to `limits`, evaluated in the tail that keeps its digits.
+
+    The inverse of F truncated to [a, b] is F^-1(F(a) + p (F(b) - F(a))). Where a lies above the median, the survival
+    function replaces F, since its small values keep digits that 1 - F loses. Limits of discrete distributions are
+    included.
+
+    Raises ValueError where the limits are in the wrong order or have no probability between them.
+    """
+    low, high = shape.support if limits is None else limits
+    if limits is None:
+        value = shape.evaluate("ppf", probability)
+    else:
+        inverse, at_low, at_high = _find_truncated_inverse(shape, low, high)
+        value = shape.evaluate(inverse, at_low + probability * (at_high - at_low))
+    value = min(max(value, low), high)
+    if shape.is_discrete and not math.isfinite(value):
+        raise ValueError(f"the distribution reaches {value}")
+    return round(value) if shape.is_discrete else value
+
+
+@lru_cache(maxsize=1024)
+def _find_truncated_inverse(shape: Shape, low: float, high: float) -> tuple[str, float, float]:
+    """Name of the inverse function that keeps its digits between two limits, and its arguments at them."""
+    if not (low <= high if shape.is_discrete else low < high):
+        raise ValueError(f"truncate = [{low}, {high}]: the first limit must be below the second")
+    below = math.ceil(low) - 1.0 if shape.is_discrete else low
+    function, inverse = ("sf", "isf") if shape.evaluate("cdf", below) > 0.5 else ("cdf", "ppf")
+    at_low, at_high = shape.evaluate(function, below), shape.evaluate(function, high)
+    if not abs(at_high - at_low) > 0.0:
+        raise ValueError(f"truncate = [{low}, {high}]: the distribution has no probability between the limits")
+    return inverse, at_low, at_high

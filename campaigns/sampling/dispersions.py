@@ -1,3 +1,4 @@
+# ruff: noqa: D102  (the methods are described in `Dispersion`)
 """Dispersions of a campaign file: the built-in ones by name, others by their names in `scipy.stats`."""
 
 from __future__ import annotations
@@ -7,33 +8,30 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import ConfigDict, Discriminator, Field, Tag, field_validator, model_validator
 
 from marsyard.campaigns.errors import near_match
 from marsyard.campaigns.sampling.dispersion import (
+    STANDARD_NORMAL,
     Dispersion,
     Limits,
     Literally,
     Number,
     PositiveNumber,
+    Shape,
     Weight,
     WholeNumber,
-    interval_of,
-)
-from marsyard.campaigns.sampling.shapes import (
-    STANDARD_NORMAL,
-    ScipyShape,
-    Shape,
+    read_interval,
     scipy_distributions,
     scipy_parameters,
+    scipy_shape,
     truncated_quantile,
 )
 
 #: Maximum number of levels of one grid.
 MAX_LEVELS = 100_000
-
 _Bound = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 
 
@@ -45,17 +43,18 @@ def _check_range(low: float, high: float) -> None:
 
 
 class _Levels(Dispersion):
-    """A dispersion over listed values."""
+    """A dispersion over listed values, its `points`, in order."""
 
     @property
     def points(self) -> Sequence[Any]:
         raise NotImplementedError
 
     def bounds(self) -> tuple[float, float] | None:
-        if any(isinstance(value, bool) or not isinstance(value, int | float) for value in self.points):
+        points = self.points
+        if any(isinstance(value, bool) or not isinstance(value, int | float) for value in points):
             return None
         try:
-            return float(min(self.points)), float(max(self.points))
+            return float(min(points)), float(max(points))
         except OverflowError:
             return None
 
@@ -87,13 +86,11 @@ class Choice(_Levels):
 
     @property
     def points(self) -> Sequence[Any]:
-        """The values."""
         return self.values
 
     def quantile(self, probability: float) -> Any:
-        """See `Dispersion.quantile`."""
-        index = bisect.bisect_right(self._cumulative, probability * self._cumulative[-1])
-        return self.values[min(index, len(self.values) - 1)]
+        last = len(self.values) - 1
+        return self.values[bisect.bisect_right(self._cumulative, probability * self._cumulative[-1], hi=last)]
 
 
 class Fixed(_Levels):
@@ -104,11 +101,9 @@ class Fixed(_Levels):
 
     @property
     def points(self) -> Sequence[Any]:
-        """The value."""
         return (self.value,)
 
     def quantile(self, probability: float) -> Any:
-        """See `Dispersion.quantile`."""
         return self.value
 
 
@@ -119,12 +114,10 @@ class Derived(Dispersion):
     formula: Number
 
     def quantile(self, probability: float) -> float:
-        """See `Dispersion.quantile`."""
         return float(self.formula)
 
     def bounds(self) -> tuple[float, float] | None:
-        """See `Dispersion.bounds`."""
-        return interval_of(self.formula, self.formula)
+        return read_interval(self.formula, self.formula)
 
 
 class Grid(_Levels):
@@ -159,7 +152,6 @@ class Grid(_Levels):
 
     @cached_property
     def points(self) -> tuple[Any, ...]:
-        """The levels, in order."""
         if self.values is not None:
             return tuple(self.values)
         low, high = float(self.low or 0.0), float(self.high or 0.0)
@@ -187,19 +179,17 @@ class Uniform(Dispersion):
         return self
 
     def quantile(self, probability: float) -> float:
-        """See `Dispersion.quantile`."""
         low, high = float(self.low), float(self.high)
         return min(low + (high - low) * probability, high)
 
     def bounds(self) -> tuple[float, float] | None:
-        """See `Dispersion.bounds`."""
-        return interval_of(self.low, self.high)
+        return read_interval(self.low, self.high)
 
 
 class Normal(Dispersion):
     """Normal distribution with mean `mean` and standard deviation `sd`, truncated to `truncate` where given.
 
-    `sd` is omitted where a group states a covariance (`marsyard.campaigns.sampling.correlation`), and nowhere else.
+    `sd` is omitted where a group states a covariance (`marsyard.campaigns.sampling.design`), and nowhere else.
     """
 
     continuous = True
@@ -229,7 +219,6 @@ class Normal(Dispersion):
         return float(self.sd)
 
     def quantile(self, probability: float) -> float:
-        """See `Dispersion.quantile`."""
         standard = truncated_quantile(STANDARD_NORMAL, self._standard_limits, probability)
         value = float(self.mean) + self._sd * standard
         if self.truncate is None:
@@ -237,8 +226,7 @@ class Normal(Dispersion):
         return min(max(value, float(self.truncate[0])), float(self.truncate[1]))
 
     def bounds(self) -> tuple[float, float] | None:
-        """See `Dispersion.bounds`."""
-        return (-math.inf, math.inf) if self.truncate is None else interval_of(*self.truncate)
+        return (-math.inf, math.inf) if self.truncate is None else read_interval(*self.truncate)
 
 
 class _WholeNumbers(Dispersion):
@@ -266,7 +254,7 @@ class _WholeNumbers(Dispersion):
         return min(low + int((high - low + 1) * probability), high)
 
     def bounds(self) -> tuple[float, float] | None:
-        return interval_of(self.low, self.high)
+        return read_interval(self.low, self.high)
 
 
 class Integer(_WholeNumbers):
@@ -334,41 +322,21 @@ class Scipy(Dispersion):
     @cached_property
     def _shape(self) -> Shape:
         parameters = {name: float(value) for name, value in (self.__pydantic_extra__ or {}).items()}
-        return ScipyShape(self.distribution, parameters)
+        return scipy_shape(self.distribution, parameters)
 
     def quantile(self, probability: float) -> float | int:
-        """See `Dispersion.quantile`."""
         limits = None if self.truncate is None else (float(self.truncate[0]), float(self.truncate[1]))
         return truncated_quantile(self._shape, limits, probability)
 
     def bounds(self) -> tuple[float, float] | None:
-        """See `Dispersion.bounds`."""
         if self.formulas:
             return None
-        low, high = self._shape.support()
+        low, high = self._shape.support
         limits = self.truncate or (-math.inf, math.inf)
         return max(low, float(limits[0])), min(high, float(limits[1]))
 
 
-#: Distributions with names and parameters of their own; any other name is looked up in `scipy.stats`.
-BUILT_IN: Mapping[str, type[Dispersion]] = {
-    "uniform": Uniform,
-    "normal": Normal,
-    "choice": Choice,
-    "integer": Integer,
-    "in-turn": InTurn,
-    "fixed": Fixed,
-    "derived": Derived,
-    "grid": Grid,
-}
-
-
-def _model_tag(stated: Any) -> str:
-    name = stated.get("distribution") if isinstance(stated, Mapping) else getattr(stated, "distribution", None)
-    return name if isinstance(name, str) and name in BUILT_IN else "scipy"
-
-
-AnyDispersion = Annotated[
+_Dispersion = (
     Annotated[Uniform, Tag("uniform")]
     | Annotated[Normal, Tag("normal")]
     | Annotated[Choice, Tag("choice")]
@@ -377,6 +345,17 @@ AnyDispersion = Annotated[
     | Annotated[Fixed, Tag("fixed")]
     | Annotated[Derived, Tag("derived")]
     | Annotated[Grid, Tag("grid")]
-    | Annotated[Scipy, Tag("scipy")],
-    Discriminator(_model_tag),
-]
+    | Annotated[Scipy, Tag("scipy")]
+)
+#: Distributions with names and parameters of their own; any other name is looked up in `scipy.stats`.
+BUILT_IN: Mapping[str, type[Dispersion]] = {
+    tag.tag: kind for kind, tag in map(get_args, get_args(_Dispersion)) if kind is not Scipy
+}
+
+
+def _select_tag(stated: Any) -> str:
+    name = stated.get("distribution") if isinstance(stated, Mapping) else getattr(stated, "distribution", None)
+    return name if isinstance(name, str) and name in BUILT_IN else "scipy"
+
+
+AnyDispersion = Annotated[_Dispersion, Discriminator(_select_tag)]

@@ -20,7 +20,6 @@ from marsyard.campaigns.errors import near_match
 
 #: Maximum number of characters.
 MAX_LENGTH = 300
-
 _BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -55,18 +54,21 @@ class Formula:
 
         Raises ValueError where a parameter is not a number, or the result is not finite.
         """
-        numbers = {name: _number(self.text, name, values[name]) for name in self.names}
+        numbers: dict[str, float] = {}
+        for name in self.names:
+            value = values[name]
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise ValueError(f"'{self.text}' uses {name}, which is {value!r} and not a number")
+            numbers[name] = float(value)
+        given = ", ".join(f"{name} = {value:.6g}" for name, value in numbers.items())
+        failure = f"'{self.text}' has no value{' where ' if given else ''}{given}"
         try:
             result = float(_evaluate(self._root, numbers))
         except (ArithmeticError, ValueError) as error:
-            raise ValueError(f"{self._describe_failure(numbers)}: {error}") from error
+            raise ValueError(f"{failure}: {error}") from error
         if not math.isfinite(result):
-            raise ValueError(f"{self._describe_failure(numbers)}: it comes to {result}")
+            raise ValueError(f"{failure}: it comes to {result}")
         return result
-
-    def _describe_failure(self, numbers: Mapping[str, float]) -> str:
-        given = ", ".join(f"{name} = {value:.6g}" for name, value in numbers.items())
-        return f"'{self.text}' has no value{' where ' if given else ''}{given}"
 
 
 @lru_cache(maxsize=1024)
@@ -78,25 +80,25 @@ def formula(text: str) -> Formula:
         with warnings.catch_warnings():  # the parser warns of unusual texts
             warnings.simplefilter("ignore")
             root = ast.parse(text.strip(), mode="eval").body
-        names = dict.fromkeys(_names(root))
+        names = dict.fromkeys(_list_names(root))
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         reason = error.msg if isinstance(error, SyntaxError) else str(error)
         raise ValueError(f"'{text}' is neither a number nor a formula: {reason}") from None
     return Formula(text, tuple(names), root)
 
 
-def _names(node: ast.expr) -> list[str]:
+def _list_names(node: ast.expr) -> list[str]:
     """Paths of the parameters below a node. Raises ValueError for syntax that formulas do not have."""
     match node:
         case ast.Constant(value=value) if type(value) in (int, float):
             return []
         case ast.Name() | ast.Attribute() | ast.Subscript():
-            path = _path(node)
+            path = _format_path(node)
             return [] if path in _CONSTANTS else [path]
         case ast.UnaryOp(op=op, operand=inner) if type(op) in _UNARY:
-            return _names(inner)
+            return _list_names(inner)
         case ast.BinOp(left=left, op=op, right=right) if type(op) in _BINARY:
-            return _names(left) + _names(right)
+            return _list_names(left) + _list_names(right)
         case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
             _, minimum, maximum = _FUNCTIONS.get(name, (None, 0, 0))
             if not maximum:
@@ -105,38 +107,31 @@ def _names(node: ast.expr) -> list[str]:
             if not minimum <= len(arguments) <= maximum:
                 takes = str(minimum) if minimum == maximum else f"{minimum} to {maximum}"
                 raise ValueError(f"{name} takes {takes} arguments, not {len(arguments)}")
-            return [path for argument in arguments for path in _names(argument)]
+            return [path for argument in arguments for path in _list_names(argument)]
     raise ValueError("allowed: numbers, names of parameters, + - * / **, parentheses and functions")
 
 
-def _path(node: ast.expr) -> str:
-    """Dotted path of a parameter."""
+def _format_path(node: ast.expr) -> str:
     match node:
         case ast.Name(id=name):
             return name
         case ast.Attribute(value=table, attr=name):
-            return f"{_path(table)}.{name}"
+            return f"{_format_path(table)}.{name}"
         case ast.Subscript(value=table, slice=ast.Constant(value=int(index))) if type(index) is int:
-            return f"{_path(table)}.{index}"
+            return f"{_format_path(table)}.{index}"
     raise ValueError("a parameter is named as in wind.east_m_s or heights_m[1]")
 
 
 def _evaluate(node: ast.expr, numbers: Mapping[str, float]) -> float:
-    """Value of a node that `_names` has accepted."""
+    """Value of a node that `_list_names` has accepted."""
     match node:
         case ast.Constant(value=value):
-            return float(value)  # type: ignore[arg-type]  # `_names` accepts numbers only
+            return float(value)  # type: ignore[arg-type]  # `_list_names` accepts numbers only
         case ast.UnaryOp(op=op, operand=inner):
             return _UNARY[type(op)](_evaluate(inner, numbers))
         case ast.BinOp(left=left, op=op, right=right):
             return _BINARY[type(op)](_evaluate(left, numbers), _evaluate(right, numbers))
         case ast.Call(func=ast.Name(id=name), args=arguments):
             return float(_FUNCTIONS[name][0](*(_evaluate(argument, numbers) for argument in arguments)))
-    path = _path(node)
+    path = _format_path(node)
     return _CONSTANTS[path] if path in _CONSTANTS else numbers[path]
-
-
-def _number(text: str, name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"'{text}' uses {name}, which is {value!r} and not a number")
-    return float(value)

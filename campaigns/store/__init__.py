@@ -1,1 +1,1 @@
-"""A campaign's folder: its record, rows and table, what is kept of cases, and the lock on it."""
+"""Folder of a campaign: record, rows, table, kept products, and lock."""

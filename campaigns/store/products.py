@@ -1,4 +1,4 @@
-"""Products of a case on disk: arrays in `products.npz`, everything else in `products.json`."""
+"""Products of cases: which cases keep them, and their files: arrays in `products.npz`, all else in `products.json`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, Requirement
 from marsyard.campaigns.errors import StoreError, writing
+from marsyard.campaigns.outcomes import UNFINISHED
 
 #: Key in `products.json` that replaces an array by its name in `products.npz`.
 _ARRAY = "__array__"
@@ -28,11 +30,6 @@ class PackedProducts:
 
     outline: bytes
     arrays: bytes
-
-    @staticmethod
-    def nothing() -> PackedProducts:
-        """Empty products."""
-        return pack_products({})
 
     @property
     def size(self) -> int:
@@ -47,8 +44,7 @@ def pack_products(products: Mapping[str, Any]) -> PackedProducts:
     these.
     """
     arrays: dict[str, np.ndarray] = {}
-    outline = _outline(products, "products", arrays)
-    text = json.dumps(outline, indent=2) + "\n"
+    text = json.dumps(_move_arrays(products, "products", arrays), indent=2) + "\n"
     file = io.BytesIO()
     np.savez_compressed(file, allow_pickle=False, **arrays)
     return PackedProducts(text.encode(), file.getvalue())
@@ -93,11 +89,15 @@ def replaced_files(directory: Path) -> Iterator[Path]:
 def unpack_products(packed: PackedProducts) -> dict[str, Any]:
     """Products that were packed; tuples become lists."""
     with np.load(io.BytesIO(packed.arrays), allow_pickle=False) as arrays:
-        filled: dict[str, Any] = _filled(json.loads(packed.outline), arrays)
+
+        def insert_array(table: dict[str, Any]) -> Any:
+            return arrays[table[_ARRAY]] if set(table) == {_ARRAY} else table
+
+        filled: dict[str, Any] = json.loads(packed.outline, object_hook=insert_array)
     return filled
 
 
-def _outline(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
+def _move_arrays(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     """Product with its arrays moved to `arrays`."""
     if isinstance(value, np.generic):
         value = value.item()
@@ -112,9 +112,9 @@ def _outline(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     if isinstance(value, Mapping):
         if _ARRAY in value:
             raise TypeError(f"{path} has a key {_ARRAY}, which is taken")
-        return {str(name): _outline(inner, f"{path}.{name}", arrays) for name, inner in value.items()}
+        return {str(name): _move_arrays(inner, f"{path}.{name}", arrays) for name, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_outline(inner, f"{path}.{place}", arrays) for place, inner in enumerate(value)]
+        return [_move_arrays(inner, f"{path}.{index}", arrays) for index, inner in enumerate(value)]
     if value is None or isinstance(value, str | int | float | bool):
         return value
     raise TypeError(f"{path} is a {type(value).__name__}; allowed: arrays, texts, numbers, tables and lists of those")
@@ -129,12 +129,80 @@ def load_products(directory: Path) -> dict[str, Any]:
         raise StoreError(f"{directory} holds no products of a case: {error}") from error
 
 
-def _filled(outline: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    """Outline with its arrays inserted."""
-    if isinstance(outline, dict):
-        if set(outline) == {_ARRAY}:
-            return arrays[outline[_ARRAY]]
-        return {name: _filled(inner, arrays) for name, inner in outline.items()}
-    if isinstance(outline, list):
-        return [_filled(inner, arrays) for inner in outline]
-    return outline
+#: Folder of the kept products, with a folder for each case.
+CASES_FOLDER = "cases"
+
+
+def case_directory(directory: Path, case: int) -> Path:
+    """Folder of a case's products."""
+    return directory / CASES_FOLDER / str(case)
+
+
+@dataclass(frozen=True)
+class Keep:
+    """Selection of rows whose products a worker returns.
+
+    every: step between numbers of kept cases; 0 for none by their number.
+    failed: requirements; a case that fails any of them is kept.
+    """
+
+    every: int = 0
+    failed: tuple[Requirement, ...] = ()
+
+    def wants(self, row: Mapping[str, Any]) -> bool:
+        """Whether the products of the case with this row are kept."""
+        if self.every and row["case"] % self.every == 0:
+            return True
+        return any(fails(row, requirement) for requirement in self.failed)
+
+
+KEEP_ALL = Keep(every=1)
+
+
+def select_kept_cases(configuration: CampaignConfiguration) -> Keep:
+    """Selection while a campaign runs; the worst cases are run again at its end."""
+    retain = configuration.retain
+    if retain.products == "all":
+        return KEEP_ALL
+    if retain.products == "every":
+        return Keep(every=retain.every)
+    return Keep(failed=configuration.requirements) if retain.products == "failed" else Keep()
+
+
+def fails(row: Mapping[str, Any], requirement: Requirement) -> bool:
+    """Whether a row fails a requirement; an unfinished case does in every population that may contain it."""
+    unfinished = row["outcome"] in UNFINISHED
+    known = {"all": True, "completed": not unfinished, "valid": row["answered"]}
+    parts = [known[part] if part in known else row.get(part) for part in requirement.population.split(" and ")]
+    if any(part is False for part in parts):
+        return False
+    if None in parts or unfinished:
+        return True
+    values: list[Any] = [row.get(name) for name in requirement.metric_columns]
+    if requirement.bound is None:
+        return values != [True]
+    if not all(isinstance(value, int | float) for value in values):
+        return True
+    return not abs(requirement.scale * sum(values)) <= requirement.bound
+
+
+class ProductStore:
+    """Kept products of a campaign, within its disk budget."""
+
+    def __init__(self, directory: Path, budget_gb: float) -> None:
+        self._directory = directory
+        used = sum(path.stat().st_size for path in (directory / CASES_FOLDER).rglob("*") if path.is_file())
+        self._left = budget_gb * 1e9 - used
+        self.full = False
+
+    def save(self, case: int, packed: PackedProducts, row: Mapping[str, Any]) -> bool:
+        """Save a case's products, unless they exceed the budget; from then on none are saved.
+
+        Raises StoreError where they cannot be written.
+        """
+        self.full = self.full or packed.size > self._left
+        if self.full:
+            return False
+        self._left -= packed.size
+        save_packed(case_directory(self._directory, case), packed, row)
+        return True

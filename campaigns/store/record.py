@@ -12,6 +12,7 @@ import shutil
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -23,26 +24,15 @@ from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
 
 #: Version of the layout of a campaign's folder.
 SCHEMA = 1
-
 RECORD_FILE = "campaign.json"
-
 #: Files of a campaign; a folder with any of them is never used for another one.
 _CAMPAIGN_FILES = (RECORD_FILE, "cases.parquet", ROWS_FILE, "report.html", "report.json", "cases")
-
-
 #: JSON types of the keys of a record that commands read.
 _TYPES: Mapping[str, tuple[type, str]] = {
-    "name": (str, "a text"),
-    "state": (str, "a text"),
-    "cases": (int, "a whole number"),
-    "cases_finished": (int, "a whole number"),
-    "cases_crashed": (int, "a whole number"),
-    "requirements": (list, "a list"),
-    "configuration": (dict, "a table"),
-    "identity": (dict, "a table"),
-    "sessions": (list, "a list"),
-    "changes": (list, "a list"),
-    "environment": (dict, "a table"),
+    **dict.fromkeys(("name", "state"), (str, "a text")),
+    **dict.fromkeys(("cases", "cases_finished", "cases_crashed"), (int, "a whole number")),
+    **dict.fromkeys(("requirements", "sessions", "changes"), (list, "a list")),
+    **dict.fromkeys(("configuration", "identity", "environment"), (dict, "a table")),
 }
 
 
@@ -56,17 +46,14 @@ def claim(directory: Path) -> None:
 
     Raises StoreError where it holds a campaign, or cannot be written.
     """
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
+    with writing(directory):
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except FileExistsError as error:
+            raise StoreError(f"{directory} is taken; choose another folder with --out") from error
         held = [name for name in _CAMPAIGN_FILES if (directory / name).exists()]
-        if held == [ROWS_FILE] and is_empty_store(directory / ROWS_FILE):
-            held = []
-    except FileExistsError as error:
-        raise StoreError(f"{directory} is taken; choose another folder with --out") from error
-    except OSError as error:
-        raise StoreError(f"{directory} cannot be written: {error.strerror or error}") from error
-    if held:
-        raise StoreError(f"{directory} already holds a campaign ({held[0]}); choose another folder with --out")
+        if held and (held != [ROWS_FILE] or not is_empty_store(directory / ROWS_FILE)):
+            raise StoreError(f"{directory} already holds a campaign ({held[0]}); choose another folder with --out")
 
 
 def begin(
@@ -100,27 +87,27 @@ def begin(
             "seed": configuration.seed,
             "requirements": stated["requirements"],
             "configuration": stated,
-            "identity": identity.plain(),
+            "identity": asdict(identity),
             "command": {"words": list(command), "folder": str(Path.cwd())} if command else None,
             "algorithms": list(algorithms),
-            "sessions": [session("run", executor, 0)],
+            "sessions": [describe_session("run", executor, 0)],
             "changes": [],
             "showcase": None,
             "versions": dict(identity.versions),
             "git_commit": git_commit(),
-            "environment": machine(),
+            "environment": describe_machine(),
         },
     )
 
 
-def session(command: str, executor: str, cases_before: int) -> dict[str, Any]:
+def describe_session(command: str, executor: str, cases_before: int) -> dict[str, Any]:
     """Record entry of one session of work on a campaign."""
     return {
         "command": command,
         "started_utc": utc_now(),
         "workers": executor,
         "cases_before": cases_before,
-        "environment": machine(),
+        "environment": describe_machine(),
     }
 
 
@@ -147,7 +134,8 @@ def write(directory: Path, record: Mapping[str, Any]) -> None:
 def read(directory: Path) -> dict[str, Any]:
     """Read a campaign's record.
 
-    Raises StoreError where the folder holds none, or one of another version.
+    Raises StoreError where the folder holds none, one of another version, or one whose required keys are missing or of
+    another JSON type.
     """
     path = directory / RECORD_FILE
     if not directory.is_dir():
@@ -166,27 +154,21 @@ def read(directory: Path) -> dict[str, Any]:
         raise StoreError(f"{path} is damaged: {error}") from error
     if schema != SCHEMA:
         raise StoreError(f"{path} has schema {schema}; this version of Marsyard reads {SCHEMA}")
-    _check_types(path, record)
-    return record
-
-
-def _check_types(path: Path, record: Mapping[str, Any]) -> None:
-    """Raise StoreError where a required key is missing or of another JSON type."""
     # records of versions without an identity lack the other keys as well, and can still be reported
     required = _TYPES if "identity" in record else ("name", "state", "cases", "configuration")
-    missing = [key for key in required if key not in record]
-    if missing:
-        raise StoreError(f"{path} is damaged: it has no {missing[0]}")
+    problems = [f"it has no {key}" for key in required if key not in record]
     for key, (kind, what) in _TYPES.items():
         if key in record and (not isinstance(record[key], kind) or isinstance(record[key], bool)):
-            raise StoreError(f"{path} is damaged: {key} is not {what}")
-    last = record.get("sessions", [{}])[-1:]
-    if "identity" in record:
-        versions = record["identity"].get("versions")
-        if not isinstance(versions, dict) or not {"configuration", "code"} <= set(record["identity"]):
-            raise StoreError(f"{path} is damaged: identity lacks configuration, code or versions")
-        if not last or not isinstance(last[0], dict):
-            raise StoreError(f"{path} is damaged: sessions holds none")
+            problems.append(f"{key} is not {what}")
+    if not problems and "identity" in record:
+        identity, sessions = record["identity"], record["sessions"]
+        if not isinstance(identity.get("versions"), dict) or not {"configuration", "code"} <= set(identity):
+            problems.append("identity lacks configuration, code or versions")
+        if not sessions or not isinstance(sessions[-1], dict):
+            problems.append("sessions holds none")
+    if problems:
+        raise StoreError(f"{path} is damaged: {problems[0]}")
+    return record
 
 
 def stored_configuration(directory: Path) -> CampaignConfiguration:
@@ -199,51 +181,40 @@ def stored_configuration(directory: Path) -> CampaignConfiguration:
 
 def git_commit() -> str | None:
     """Commit of the checked-out program, with ``+changes`` if files were edited; None where unknown."""
-    git = shutil.which("git")
-    if git is None:
-        return None
-    home = Path(__file__).resolve().parent
-
-    def ask(*arguments: str) -> str:
-        command = [git, "-C", str(home), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()  # noqa: S603
-
+    git, source = shutil.which("git"), Path(__file__).resolve()
+    answers = []
+    commands = (["rev-parse", "HEAD"], ["ls-files", source.name], ["status", "--porcelain", "--untracked-files=no"])
     try:
-        commit = ask("rev-parse", "HEAD")
-        tracked = ask("ls-files", Path(__file__).name)
-        edited = ask("status", "--porcelain", "--untracked-files=no")
+        for words in commands if git is not None else ():
+            command = [str(git), "-C", str(source.parent), *words]
+            done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603
+            answers.append(done.stdout.strip())
     except (subprocess.SubprocessError, OSError):
         return None
-    if not tracked:
+    if git is None or not answers[1]:
         return None
+    commit, _, edited = answers
     return f"{commit}+changes" if edited else commit
 
 
-def machine() -> dict[str, Any]:
-    """Python, platform and processor with its features: rows are equal bit for bit where these are equal."""
-    model, features = _processor()
+def describe_machine() -> dict[str, Any]:
+    """Python, platform and processor with a hash of its features: rows are equal bit for bit where these are equal."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        text = ""
+    model = re.search(r"^(?:model name|CPU part)\s*:\s*(.*)$", text, re.MULTILINE)
+    features = re.search(r"^(?:flags|Features)\s*:\s*(.*)$", text, re.MULTILINE)
+    listed = " ".join(sorted(features[1].split())) if features else ""
     return {
         "python": platform.python_version(),
         "implementation": platform.python_implementation(),
         "platform": platform.platform(),
         "machine": platform.machine(),
-        "processor": model,
-        "processor_features": features,
+        "processor": model[1] if model else platform.processor(),
+        "processor_features": hashlib.sha256(listed.encode()).hexdigest()[:16] if listed else None,
         "variables": {name: value for name, value in sorted(os.environ.items()) if name.startswith("MARSYARD_")},
     }
-
-
-def _processor() -> tuple[str, str | None]:
-    """Processor's model and a hash of its features, where Linux states them."""
-    try:
-        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return platform.processor(), None
-    model = re.search(r"^(?:model name|CPU part)\s*:\s*(.*)$", text, re.MULTILINE)
-    features = re.search(r"^(?:flags|Features)\s*:\s*(.*)$", text, re.MULTILINE)
-    listed = " ".join(sorted(features[1].split())) if features else None
-    digest = hashlib.sha256(listed.encode()).hexdigest()[:16] if listed else None
-    return (model[1] if model else platform.processor()), digest
 
 
 #: Locked by the process that works in the folder; the kernel releases the lock when the process ends.

@@ -16,24 +16,20 @@ import shutil
 import sqlite3
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.outcomes import UNFINISHED
 from marsyard.scenarios.interface import Scalar
 
 ROWS_FILE = "cases.sqlite"
-
 #: Version of the tables below, stored as `PRAGMA user_version`.
 STORE_VERSION = 2
-
 #: Identifies the file type (`PRAGMA application_id`): "Mars".
 _APPLICATION = int.from_bytes(b"Mars", "big")
-
 _TABLES = f"""
 PRAGMA journal_mode = DELETE;
 PRAGMA application_id = {_APPLICATION};
@@ -65,7 +61,7 @@ def create_store(path: Path, about: Mapping[str, str]) -> None:
         raise StoreError(f"{path} cannot be written: {error}") from error
 
 
-class RowStore:
+class RowStore(AbstractContextManager["RowStore"]):
     """Rows of a campaign, as a context.
 
     path: a file made by `create_store`.
@@ -81,59 +77,46 @@ class RowStore:
             self._connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=rw", uri=True, isolation_level=None)
         except sqlite3.Error as error:
             raise StoreError(f"{path} cannot be opened: {error}") from error
+        execute = self._connection.execute
         try:
-            self._check(thorough)
-            self._connection.execute("PRAGMA journal_mode = WAL")
-            self._connection.execute("PRAGMA synchronous = FULL")
-            self._layouts = dict(map(self._read_layout, self._connection.execute("SELECT names, layout FROM layouts")))
-            self._kinds = set(self._connection.execute("SELECT name, kind FROM kinds"))
+            (application,), (version,) = (
+                execute(f"PRAGMA {key}").fetchone() for key in ("application_id", "user_version")
+            )
+            if application != _APPLICATION:
+                raise StoreError(f"{path} is damaged, or no store of this version: it does not say that it is one")
+            if version != STORE_VERSION:
+                raise StoreError(f"{path} has version {version}; this version of Marsyard reads {STORE_VERSION}")
+            found = [text for (text,) in execute("PRAGMA quick_check(1)")] if thorough else ["ok"]
+            if found != ["ok"]:
+                raise StoreError(f"{path} is damaged: {' '.join(found)}; nothing was written to it")
+            execute("PRAGMA journal_mode = WAL")
+            execute("PRAGMA synchronous = FULL")
+            self._layouts: dict[tuple[str, ...], int] = {}
+            for text, layout in execute("SELECT names, layout FROM layouts"):
+                try:
+                    names = json.loads(text)
+                except (ValueError, TypeError):
+                    names = None
+                if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+                    raise StoreError(f"{path} is damaged: layout {layout} is not a list of column names")
+                self._layouts[tuple(names)] = layout
+            self._kinds = set(execute("SELECT name, kind FROM kinds"))
         except BaseException as error:
             self._connection.close()
             if isinstance(error, sqlite3.Error):
                 raise self._store_error(error) from error
             raise
 
-    def _check(self, thorough: bool) -> None:
-        """Refuse a file of another type or version, or a damaged one."""
-        (application,) = self._connection.execute("PRAGMA application_id").fetchone()
-        (version,) = self._connection.execute("PRAGMA user_version").fetchone()
-        if application != _APPLICATION:
-            raise StoreError(f"{self._path} is damaged, or no store of this version: it does not say that it is one")
-        if version != STORE_VERSION:
-            raise StoreError(f"{self._path} has version {version}; this version of Marsyard reads {STORE_VERSION}")
-        if thorough:
-            found = [text for (text,) in self._connection.execute("PRAGMA quick_check(1)")]
-            if found != ["ok"]:
-                raise StoreError(f"{self._path} is damaged: {' '.join(found)}; nothing was written to it")
-
-    def _read_layout(self, entry: tuple[str, int]) -> tuple[tuple[str, ...], int]:
-        """Column names and number of a layout."""
-        text, layout = entry
-        try:
-            names = json.loads(text)
-        except (ValueError, TypeError):
-            names = None
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise StoreError(f"{self._path} is damaged: layout {layout} is not a list of column names")
-        return tuple(names), layout
-
     def _store_error(self, error: sqlite3.Error) -> StoreError:
-        """Error in one sentence, with advice."""
         text = str(error)
         if "full" in text:
-            return StoreError(
-                f"{self._path}: the disk is full; the rows before that are safe: free disk space and resume"
-            )
+            advice = "free disk space and resume"
+            return StoreError(f"{self._path}: the disk is full; the rows before that are safe: {advice}")
         if "malformed" in text or "not a database" in text:
             return StoreError(f"{self._path} is damaged: {text}; nothing was written to it")
         return StoreError(f"{self._path}: {text}")
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         # closing may fail where writing did; the log then stays and is read the next time
         with suppress(sqlite3.Error):
             self._connection.close()
@@ -148,46 +131,37 @@ class RowStore:
 
         Raises StoreError where that fails; then none of them is stored.
         """
+        execute = self._connection.execute
         try:
-            self._connection.execute("BEGIN IMMEDIATE")
+            execute("BEGIN IMMEDIATE")
             try:
-                self._connection.executemany(
-                    "INSERT OR REPLACE INTO cases VALUES (?, ?, ?, ?)", [self._entry(row) for row in rows]
-                )
-                self._connection.execute("COMMIT")
+                for row in rows:
+                    names = tuple(row)
+                    if names not in self._layouts:
+                        execute("INSERT INTO layouts VALUES (?, ?)", (len(self._layouts), json.dumps(names)))
+                        self._layouts[names] = len(self._layouts)
+                    for kind in ((name, classify_value(value)) for name, value in row.items()):
+                        if kind not in self._kinds:
+                            execute("INSERT INTO kinds VALUES (?, ?)", kind)
+                            self._kinds.add(kind)
+                    entry = row["case"], row["outcome"], self._layouts[names], json.dumps(list(row.values()))
+                    execute("INSERT OR REPLACE INTO cases VALUES (?, ?, ?, ?)", entry)
+                execute("COMMIT")
             except BaseException:
                 if self._connection.in_transaction:
-                    self._connection.execute("ROLLBACK")
+                    execute("ROLLBACK")
                 raise
         except sqlite3.Error as error:
             raise self._store_error(error) from error
-
-    def _entry(self, row: Row) -> tuple[Any, ...]:
-        names = tuple(row)
-        layout = self._layouts.get(names)
-        if layout is None:
-            layout = len(self._layouts)
-            self._connection.execute("INSERT INTO layouts VALUES (?, ?)", (layout, json.dumps(names)))
-            self._layouts[names] = layout
-        for name, value in row.items():
-            kind = (name, kind_of(value))
-            if kind not in self._kinds:
-                self._connection.execute("INSERT INTO kinds VALUES (?, ?)", kind)
-                self._kinds.add(kind)
-        return row["case"], row["outcome"], layout, json.dumps(list(row.values()))
 
     def count(self) -> int:
         """Number of cases that have a row."""
         (number,) = self._ask("SELECT count(*) FROM cases").fetchone()
         return int(number)
 
-    def outcomes(self) -> dict[str, int]:
-        """Number of cases of each outcome."""
-        return dict(self._ask("SELECT outcome, count(*) FROM cases GROUP BY outcome"))
-
     def unfinished(self) -> int:
         """Number of unfinished cases."""
-        return sum(number for outcome, number in self.outcomes().items() if outcome in UNFINISHED)
+        return len(self.with_outcomes(UNFINISHED))
 
     def missing(self, total: int) -> list[range]:
         """Cases below `total` that have no row."""
@@ -196,10 +170,10 @@ class RowStore:
 
     def with_outcomes(self, outcomes: Iterable[str]) -> list[int]:
         """Cases with any of some outcomes."""
-        asked = sorted(outcomes)
-        marks = ", ".join("?" * len(asked))
+        named = sorted(outcomes)
+        marks = ", ".join("?" * len(named))
         query = f"SELECT case_number FROM cases WHERE outcome IN ({marks}) ORDER BY 1"  # noqa: S608 (marks only)
-        return [number for (number,) in self._ask(query, asked)]
+        return [number for (number,) in self._ask(query, named)]
 
     def first_completed(self) -> int | None:
         """First finished case; None where there is none."""
@@ -211,17 +185,8 @@ class RowStore:
     def row(self, case: int) -> Row | None:
         """Row of a case; None where it has none."""
         found = self._ask("SELECT layout, row FROM cases WHERE case_number = ?", [case]).fetchone()
-        return None if found is None else self._decoded(self.names()[found[0]], found[1])
-
-    def rows(self) -> Iterator[Row]:
-        """Rows in the order of their cases."""
-        names = self.names()
-        for layout, text in self._ask("SELECT layout, row FROM cases ORDER BY case_number"):
-            yield self._decoded(names[layout], text)
-
-    def _decoded(self, names: Sequence[str], text: str) -> Row:
         try:
-            return dict(zip(names, json.loads(text), strict=True))
+            return None if found is None else dict(zip(self.names()[found[0]], json.loads(found[1]), strict=True))
         except (ValueError, TypeError) as error:
             raise StoreError(f"{self._path} is damaged: a row cannot be read: {error}") from error
 
@@ -275,22 +240,20 @@ def readable_store(path: Path) -> Iterator[RowStore]:
     SQLite needs files of its own next to the log even for reading. Raises StoreError as `RowStore` does, and where the
     copy cannot be made.
     """
-    if all(os.access(one, os.W_OK, effective_ids=True) for one in (path, path.parent)):
-        with RowStore(path) as store:
-            yield store
-        return
     with ExitStack() as stack:
-        try:
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="marsyard-"))
-            for file in (path, path.with_name(f"{path.name}-wal")):
-                if file.exists():
-                    shutil.copyfile(file, Path(folder, file.name))
-        except OSError as error:
-            raise StoreError(f"{path} cannot be copied to be read: {error.strerror or error}") from error
-        yield stack.enter_context(RowStore(Path(folder, path.name)))
+        if not all(os.access(one, os.W_OK, effective_ids=True) for one in (path, path.parent)):
+            try:
+                folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="marsyard-"))
+                for file in (path, path.with_name(f"{path.name}-wal")):
+                    if file.exists():
+                        shutil.copyfile(file, Path(folder, file.name))
+            except OSError as error:
+                raise StoreError(f"{path} cannot be copied to be read: {error.strerror or error}") from error
+            path = Path(folder, path.name)
+        yield stack.enter_context(RowStore(path))
 
 
-def kind_of(value: Any) -> str:
+def classify_value(value: Any) -> str:
     """Type of a value, in the words of `RowStore.kinds`."""
     kind = type(value)
     if kind is int and not -(2**63) <= value < 2**63:
@@ -300,7 +263,6 @@ def kind_of(value: Any) -> str:
 
 #: One case as stored.
 Row = Mapping[str, Scalar]
-
 #: Columns that the engine writes, before and behind those of the scenario.
 LEADING_COLUMNS = ("case", "outcome", "answered")
 TRAILING_COLUMNS = ("wall_time_s", "cpu_time_s", "error", "traceback")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -18,38 +19,40 @@ from marsyard.campaigns.store.record import stored_configuration
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, ROWS_FILE, TRAILING_COLUMNS, Row, RowStore, readable_store
 
 TABLE_FILE = "cases.parquet"
-
 #: Number of rows in a row group.
 _GROUP = 50_000
-
-
-def _all_columns(layouts: Iterable[Sequence[str]], measures: Sequence[str] = ()) -> list[str]:
-    """Columns of all layouts and of `measures`: the engine's first and last, the scenario's between them in order."""
-    found = dict.fromkeys(name for names in layouts for name in names)
-    found.update(dict.fromkeys(measures))
-    own = [name for name in found if name not in LEADING_COLUMNS and name not in TRAILING_COLUMNS]
-    return [*LEADING_COLUMNS, *own, *TRAILING_COLUMNS]
 
 
 def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> None:
     """Write the rows of a store as a Parquet table in the order of the cases, whole or not at all.
 
-    A missing number is NaN, any other missing value null. `measures` are columns of numbers that the table always has.
+    The engine's columns are the first and last. A missing number is NaN, any other missing value null. `measures` are
+    columns of numbers that the table always has.
     """
     import pyarrow as pa
+    import pyarrow.compute as pc
     import pyarrow.parquet as pq
 
-    layouts = store.names()
-    columns = _all_columns(layouts.values(), measures)
-    kinds = store.kinds()
-    forms = {name: _form(kinds.get(name, set())) for name in columns}
-    schema = pa.schema([(name, form[0]) for name, form in forms.items()])
+    layouts, kinds = store.names(), store.kinds()
+    found = dict.fromkeys((*itertools.chain.from_iterable(layouts.values()), *measures))
+    own = [name for name in found if name not in LEADING_COLUMNS and name not in TRAILING_COLUMNS]
+    forms = {name: _choose_type(kinds.get(name, set())) for name in (*LEADING_COLUMNS, *own, *TRAILING_COLUMNS)}
+    schema = pa.schema([(name, kind) for name, (kind, _) in forms.items()])
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
-        with pq.ParquetWriter(partial, schema) as writer, _garbage_collection_paused():
+        with pq.ParquetWriter(partial, schema) as writer, ExitStack() as stack:
+            if gc.isenabled():
+                # it takes as long as reading millions of rows, and none has cyclic references
+                gc.disable()
+                stack.callback(gc.enable)
             for chunk in store.chunks(_GROUP):
-                pairs = zip(_chunk_columns(chunk, layouts, columns), forms.values(), strict=True)
-                arrays = [_array(values, *form) for values, form in pairs]
+                arrays = []
+                for values, (kind, convert) in zip(_columns(chunk, layouts, list(forms)), forms.values(), strict=True):
+                    if convert is not None:
+                        values = [None if value is None else convert(value) for value in values]
+                    array = pa.array(values, kind)
+                    fills = array.null_count and pa.types.is_floating(kind)
+                    arrays.append(pc.fill_null(array, math.nan) if fills else array)
                 writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=_GROUP)
         with partial.open("rb") as file:
             os.fsync(file.fileno())
@@ -61,16 +64,16 @@ def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> No
         raise StoreError(f"{path} cannot be made, as {ROWS_FILE} is damaged: a row cannot be read: {error}") from error
 
 
-def _chunk_columns(
+def _columns(
     chunk: Sequence[tuple[int, list[Any]]], layouts: Mapping[int, Sequence[str]], columns: Sequence[str]
 ) -> Iterator[Sequence[Any]]:
-    """The values of each column in a chunk of rows; None where a row lacks it."""
-    places: dict[int, list[int]] = {}
-    for place, (layout, _) in enumerate(chunk):
-        places.setdefault(layout, []).append(place)
+    """Values of each column in a chunk of rows; None where a row lacks it."""
+    indices: dict[int, list[int]] = {}
+    for index, (layout, _) in enumerate(chunk):
+        indices.setdefault(layout, []).append(index)
     parts = {
-        layout: dict(zip(layouts[layout], zip(*(chunk[place][1] for place in found), strict=True), strict=True))
-        for layout, found in places.items()
+        layout: dict(zip(layouts[layout], zip(*(chunk[index][1] for index in found), strict=True), strict=True))
+        for layout, found in indices.items()
     }
     for name in columns:
         if len(parts) == 1:
@@ -78,33 +81,13 @@ def _chunk_columns(
             yield part.get(name, [None] * len(chunk))
             continue
         values: list[Any] = [None] * len(chunk)
-        for layout, found in places.items():
-            for place, value in zip(found, parts[layout].get(name, ()), strict=False):
-                values[place] = value
+        for layout, found in indices.items():
+            for index, value in zip(found, parts[layout].get(name, ()), strict=False):
+                values[index] = value
         yield values
 
 
-@contextmanager
-def _garbage_collection_paused() -> Iterator[None]:
-    """Pause garbage collection, which takes as long as reading millions of rows, none with cyclic references."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
-def _array(values: Sequence[Any], type_: Any, convert: Callable[[Any], Any] | None) -> Any:
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    array = pa.array([convert(value) for value in values] if convert else values, type_)
-    return pc.fill_null(array, math.nan) if array.null_count and pa.types.is_floating(type_) else array
-
-
-def _form(kinds: set[str]) -> tuple[Any, Callable[[Any], Any] | None]:
+def _choose_type(kinds: set[str]) -> tuple[Any, Callable[[Any], Any] | None]:
     """Narrowest Arrow type that holds all values of a column, and the conversion to it."""
     import pyarrow as pa
 
@@ -112,19 +95,9 @@ def _form(kinds: set[str]) -> tuple[Any, Callable[[Any], Any] | None]:
         return pa.bool_(), None
     if kinds == {"int"}:
         return pa.int64(), None
-    if kinds <= {"float"}:
-        return pa.float64(), None
     if kinds <= {"int", "big", "float"}:
-        return pa.float64(), _number
-    return pa.string(), None if kinds == {"str"} else _text
-
-
-def _number(value: Any) -> float | None:
-    return None if value is None else float(value)
-
-
-def _text(value: Any) -> str | None:
-    return None if value is None else str(value)
+        return pa.float64(), None if kinds <= {"float"} else float
+    return pa.string(), None if kinds == {"str"} else str
 
 
 def read_rows(path: Path, case: int | None = None) -> list[dict[str, Any]]:
@@ -152,7 +125,7 @@ def refresh_table(directory: Path) -> None:
         return  # of an earlier version, which wrote the table when it was interrupted
     requirements = stored_configuration(directory).requirements
     with RowStore(directory / ROWS_FILE) as store:
-        write_table(directory / TABLE_FILE, store, [asked.metric for asked in requirements if asked.bound is not None])
+        write_table(directory / TABLE_FILE, store, [one.metric for one in requirements if one.bound is not None])
 
 
 def stored_row(directory: Path, case: int) -> Row | None:
@@ -164,24 +137,19 @@ def stored_row(directory: Path, case: int) -> Row | None:
     return next(iter(read_rows(table, case)), None) if table.exists() else None
 
 
-def showcase_case(configuration: CampaignConfiguration, table: Path, store: RowStore) -> int | None:
+def find_showcase(configuration: CampaignConfiguration, table: Path, store: RowStore) -> int | None:
     """Case whose products are kept for the report; None where none is requested or finished."""
     if configuration.retain.showcase == "none":
         return None
-    worst = _ranked(configuration, table, 1) if configuration.retain.showcase == "worst" else []
+    worst = find_worst_cases(configuration, table, 1) if configuration.retain.showcase == "worst" else []
     return worst[0] if worst else store.first_completed()
 
 
-def worst_cases(configuration: CampaignConfiguration, table: Path) -> list[int]:
-    """Answered cases with the largest metrics, the worst first, as many as `retain.worst`."""
-    return _ranked(configuration, table, configuration.retain.worst)
-
-
-def _ranked(configuration: CampaignConfiguration, table: Path, number: int) -> list[int]:
-    """First `number` answered cases by the magnitude of the first requirement's metric that is a single column."""
+def find_worst_cases(configuration: CampaignConfiguration, table: Path, number: int) -> list[int]:
+    """Answered cases with the largest metrics, the worst first: of the first requirement with a single column."""
     # a sum of columns is a sum of times, which does not rank cases
     single = (one for one in configuration.requirements if one.bound is not None and len(one.metric_columns) == 1)
-    metric = next((asked.metric for asked in single), None)
+    metric = next((one.metric for one in single), None)
     if metric is None:
         return []
     import pyarrow.parquet as pq

@@ -150,7 +150,7 @@ def replay(
 ) -> None:
     """Rerun one case, write and plot its intermediate results, and compare its row with the stored one."""
     from marsyard.campaigns.running.replay import replay as run_again
-    from marsyard.campaigns.store.retention import case_directory
+    from marsyard.campaigns.store.products import case_directory
 
     replayed = run_again(directory, case)
     target = out if out is not None else case_directory(directory, case)
@@ -168,11 +168,11 @@ def replay(
 
 def _write_products(target: Path, replayed: Replay, *, step: bool) -> list[str]:
     """Write the products, stages and figures of a replayed case, all or none; return lines that name them."""
-    from marsyard.campaigns.store.products import PackedProducts, replaced_files, unpack_products, write_packed
+    from marsyard.campaigns.store.products import pack_products, replaced_files, unpack_products, write_packed
     from marsyard.cli.steps import write_steps
     from marsyard.reports.cases import write_case_figures
 
-    packed = replayed.products or PackedProducts.nothing()
+    packed = replayed.products or pack_products({})
     products = unpack_products(packed)
     with replaced_files(target) as folder:
         write_packed(folder, packed, replayed.row)
@@ -274,7 +274,7 @@ def stopped_by_signals() -> Iterator[None]:
 
 def _print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:
     """Print the estimated time and disk space of a campaign."""
-    from marsyard.campaigns.running.estimate import estimate
+    from marsyard.campaigns.running.preparation import estimate
     from marsyard.reports.wording import count
 
     workers = executor.jobs if executor.cluster is None else os.cpu_count() or 1

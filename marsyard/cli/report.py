@@ -101,12 +101,12 @@ def compare(
 
 def _file_requirements(directory: Path, path: Path) -> Sequence[dict[str, Any]]:
     """The requirements of a file that name the campaign."""
-    from marsyard.campaigns.definition.requirements import applicable, read_requirements
+    from marsyard.campaigns.definition.requirements import read_requirements, select_applicable
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.store import record
 
     name = str(record.read(directory)["name"])
-    found = applicable(read_requirements(path), name)
+    found = select_applicable(read_requirements(path), name)
     if not found:
         raise CampaignError(f"{path}: no requirement names the campaign '{name}' in its campaigns")
     return found
@@ -157,9 +157,8 @@ def _rerun_notable_cases(directory: Path) -> None:
     """
     from marsyard.campaigns.execution.workers import LocalExecutor
     from marsyard.campaigns.running.replay import load_stored_campaign, replay_with
-    from marsyard.campaigns.store.products import save_packed
+    from marsyard.campaigns.store.products import case_directory, save_packed
     from marsyard.campaigns.store.record import stored_configuration
-    from marsyard.campaigns.store.retention import case_directory
     from marsyard.campaigns.store.table import stored_row
     from marsyard.reports.cases import notable_cases
     from marsyard.reports.stored import read_run

@@ -1,1 +1,1 @@
-"""Statistics of samples and success rates: numbers in, numbers out; nothing here knows rows or requirements."""
+"""Statistics of samples and success rates, without knowledge of rows or requirements."""

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
-from marsyard.reports.statistics.clusters import terrain_index
+from marsyard.reports.statistics.clusters import number_terrains
 from marsyard.reports.statistics.samples import Groups, is_shared, mean_interval
 
 #: Minimum fraction of the cases of either set on common terrains for a comparison within terrains.
@@ -38,11 +38,9 @@ _FULL = 0.8
 #: p-value of the normal approximation below which permutations are used.
 _PERMUTED_BELOW = 0.05
 #: Permutations per batch; sufficient number of exceedances; maximum number of permuted values.
-_BATCH, _ENOUGH, _MAX_PERMUTED = 500, 50, 2_000_000_000
+_BATCH, _MAX_EXCEEDANCES, _MAX_PERMUTED = 500, 50, 2_000_000_000
 #: Fixed seed: the same rows give the same p-value.
 _SEED = 19370101
-#: Default number of permutations.
-PERMUTATIONS = 10_000
 
 
 @dataclass(frozen=True)
@@ -70,7 +68,7 @@ class Sample:
         return np.asarray(self.values[order][chosen].mean(axis=1))
 
 
-def difference_p(now: Sample, before: Sample, permutations: int = PERMUTATIONS) -> float:
+def difference_p(now: Sample, before: Sample, permutations: int = 10_000) -> float:
     """Two-sided p-value of the difference of two sets; NaN where there is too little data.
 
     Values of only 0 and 1 are compared as rates. No p-value of ranks is below one over the permutations.
@@ -80,97 +78,81 @@ def difference_p(now: Sample, before: Sample, permutations: int = PERMUTATIONS) 
         return math.nan
     common = np.intersect1d(now.terrains, before.terrains)
     if min(float(np.isin(one.terrains, common).mean()) for one in (now, before)) < _COMMON:
-        pairs = [_whole_terrains(now, before)]
+        # equally many cases on each terrain, since the variance of a mean depends on their number
+        counts = (np.quantile(one.cases_on_terrains(), 1.0 - _FULL, method="lower") for one in (now, before))
+        cases = int(min(counts))
+        pairs = [(now.terrain_means(cases), before.terrain_means(cases))]
     else:
         pairs = [(now.values[now.terrains == one], before.values[before.terrains == one]) for one in common]
     rates = all(np.isin(values, (0.0, 1.0)).all() for pair in pairs for values in pair)
-    return _rates_p(pairs) if rates else _ranks_p(pairs, permutations)
-
-
-def _whole_terrains(now: Sample, before: Sample) -> tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]:
-    """Terrain means of both sets over equally many cases, since the variance of a mean depends on their number."""
-    enough = [np.quantile(one.cases_on_terrains(), 1.0 - _FULL, method="lower") for one in (now, before)]
-    cases = int(min(enough))
-    return now.terrain_means(cases), before.terrain_means(cases)
+    return _test_rates(pairs) if rates else _test_ranks(pairs, permutations)
 
 
 #: Values of both sets, terrain by terrain.
 Pairs = Sequence[tuple[Float[np.ndarray, " _"], Float[np.ndarray, " _"]]]
 
 
-def _rates_p(pairs: Pairs) -> float:
+def _test_rates(pairs: Pairs) -> float:
     """Exact two-sided p-value of the ones in the first sets, given the ones in each pair: twice the smaller tail."""
     tables = [(int(a.sum()), a.size, int(a.sum() + b.sum()), a.size + b.size) for a, b in pairs]
     tables = [one for one in tables if 0 < one[2] < one[3]]
     if not tables:
         return 1.0
-    seen = sum(one[0] for one in tables)
+    observed = sum(one[0] for one in tables)
     if sum(min(n, ones) for _, n, ones, _ in tables) > _MAX_EXACT:
-        return _normal_p(seen, tables)
-    law, least = np.ones(1), 0
-    for _, n, ones, total in tables:
-        low, high = max(0, n + ones - total), min(n, ones)
-        law = np.convolve(law, stats.hypergeom.pmf(np.arange(low, high + 1), total, ones, n))
-        least += low
-    place = seen - least
-    return float(min(1.0, 2.0 * min(law[: place + 1].sum(), law[place:].sum())))
+        _, n, ones, total = np.array(tables, dtype=np.float64).T
+        variance = float((n * ones * (total - ones) * (total - n) / (total**2 * (total - 1.0))).sum())
+        excess = max(0.0, abs(observed - float((n * ones / total).sum())) - 0.5)
+        return float(2.0 * stats.norm.sf(excess / math.sqrt(variance)))
+    law, minimum = np.ones(1), 0
+    for _, size, in_both, cases in tables:
+        low, high = max(0, size + in_both - cases), min(size, in_both)
+        law = np.convolve(law, stats.hypergeom.pmf(np.arange(low, high + 1), cases, in_both, size))
+        minimum += low
+    index = observed - minimum
+    return float(min(1.0, 2.0 * min(law[: index + 1].sum(), law[index:].sum())))
 
 
-def _normal_p(seen: int, tables: Sequence[tuple[int, int, int, int]]) -> float:
-    _, n, ones, total = np.array(tables, dtype=np.float64).T
-    variance = float((n * ones * (total - ones) * (total - n) / (total**2 * (total - 1.0))).sum())
-    excess = max(0.0, abs(seen - float((n * ones / total).sum())) - 0.5)
-    return float(2.0 * stats.norm.sf(excess / math.sqrt(variance)))
+def _test_ranks(pairs: Pairs, permutations: int) -> float:
+    """Van Elteren's test with ties; NaN for fewer than eight values of either set.
 
-
-def _ranks_p(pairs: Pairs, permutations: int) -> float:
-    """Van Elteren's test with ties; NaN for fewer than eight values of either set."""
+    Small p-values are the fraction of the permutations within strata with at least the same excess; fewer are drawn
+    where that is clearly large (Besag & Clifford, "Sequential Monte Carlo p-values", Biometrika 78, 1991).
+    """
     if min(sum(a.size for a, _ in pairs), sum(b.size for _, b in pairs)) < _MIN_RANKED:
         return math.nan
-    strata = [_scores(first, second) for first, second in pairs if first.size and second.size]
-    excess = sum(float(scores[:n].sum()) for scores, n in strata)
+    # scores of the values of both sets, of mean zero, and the size of the first set
+    ranked = [(stats.rankdata(np.concatenate([a, b])), a.size) for a, b in pairs if a.size and b.size]
+    strata = [((ranks - ranks.mean()) / (ranks.size + 1.0), n) for ranks, n in ranked]
+    excess = abs(sum(float(scores[:n].sum()) for scores, n in strata))
     variance = sum(
         n * (scores.size - n) / (scores.size * (scores.size - 1.0)) * float((scores**2).sum()) for scores, n in strata
     )
     if variance == 0.0:
         return 1.0
-    p = float(2.0 * stats.norm.sf(abs(excess) / math.sqrt(variance)))
+    p = float(2.0 * stats.norm.sf(excess / math.sqrt(variance)))
     if p >= _PERMUTED_BELOW or permutations * sum(scores.size for scores, _ in strata) > _MAX_PERMUTED:
         return p
-    return _permuted_p(strata, abs(excess), permutations)
-
-
-def _scores(first: Float[np.ndarray, " n"], second: Float[np.ndarray, " m"]) -> tuple[Float[np.ndarray, " both"], int]:
-    """Van Elteren's scores of the values of both sets, of mean zero, and the size of the first set."""
-    ranks = stats.rankdata(np.concatenate([first, second]))
-    return (ranks - ranks.mean()) / (ranks.size + 1.0), first.size
-
-
-def _permuted_p(strata: Sequence[tuple[Float[np.ndarray, " _"], int]], excess: float, permutations: int) -> float:
-    """Fraction of the permutations within strata with at least this excess; fewer are drawn where it is clearly large.
-
-    Besag & Clifford, "Sequential Monte Carlo p-values" (Biometrika 78, 1991).
-    """
     rng = np.random.default_rng(_SEED)
-    beyond = drawn = 0
-    while drawn < permutations and beyond < _ENOUGH:
+    exceedances = drawn = 0
+    while drawn < permutations and exceedances < _MAX_EXCEEDANCES:
         sums = np.zeros(_BATCH)
         for scores, n in strata:
             shuffled = rng.permuted(np.broadcast_to(scores, (_BATCH, scores.size)), axis=1)
             sums += shuffled[:, :n].sum(axis=1)
         # sums of the same scores in another order are the same
-        beyond += int((np.abs(sums) >= excess - 1e-9).sum())
+        exceedances += int((np.abs(sums) >= excess - 1e-9).sum())
         drawn += _BATCH
-    return (beyond + 1.0) / (drawn + 1.0)
+    return (exceedances + 1.0) / (drawn + 1.0)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
     """p-values corrected for multiple tests, NaN left out (Holm 1979): controls the family-wise error rate."""
-    known = [(p, place) for place, p in enumerate(p_values) if not math.isnan(p)]
+    known = sorted((p, index) for index, p in enumerate(p_values) if not math.isnan(p))
     corrected, largest = [math.nan] * len(p_values), 0.0
-    for rank, (p, place) in enumerate(sorted(known)):
+    for rank, (p, index) in enumerate(known):
         largest = max(largest, min(1.0, p * (len(known) - rank)))
-        corrected[place] = largest
+        corrected[index] = largest
     return corrected
 
 
@@ -180,7 +162,7 @@ def compare_successes(
     """Numbers of cases in which only the first and only the other succeeds, and the two-sided p-value."""
     only_first, only_other = int((first & ~other).sum()), int((other & ~first).sum())
     if groups is not None and is_shared(groups):
-        return only_first, only_other, _signed_ranks_p(_sums(other.astype(np.float64) - first, groups))
+        return only_first, only_other, _test_signed_ranks(_sums(other.astype(np.float64) - first, groups))
     total = only_first + only_other
     p = 1.0 if total == 0 else float(stats.binomtest(only_first, total, 0.5).pvalue)
     return only_first, only_other, p
@@ -197,13 +179,13 @@ def compare_errors(
         return math.nan, math.nan, math.nan, math.nan
     mean, interval = float(differences.mean()), mean_interval(differences, confidence, groups)
     sums = _sums(differences, groups) if groups is not None and is_shared(groups) else differences
-    return mean, *interval, _signed_ranks_p(sums)
+    return mean, *interval, _test_signed_ranks(sums)
 
 
 def _sums(differences: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"]) -> Float[np.ndarray, " terrains"]:
-    return np.bincount(terrain_index(groups), weights=differences)
+    return np.bincount(number_terrains(groups), weights=differences)
 
 
-def _signed_ranks_p(differences: Float[np.ndarray, " n"]) -> float:
-    moved = differences[differences != 0.0]
-    return 1.0 if moved.size == 0 else float(stats.wilcoxon(moved).pvalue)
+def _test_signed_ranks(differences: Float[np.ndarray, " n"]) -> float:
+    changed = differences[differences != 0.0]
+    return 1.0 if changed.size == 0 else float(stats.wilcoxon(changed).pvalue)

@@ -25,8 +25,8 @@ from marsyard.reports.statistics.proportions import proportion_lower, proportion
 
 #: Minimum number of terrains, and of terrains with a failure (and with a success), to estimate the design effect.
 #: Chosen by simulation (`tests/reports/statistics/test_clusters.py`) so that the bounds keep their confidence.
-FEWEST_TERRAINS = 50
-FEWEST_MIXED_TERRAINS = 10
+_MIN_TERRAINS = 50
+_MIN_MIXED_TERRAINS = 10
 
 
 class ClusterMethod(StrEnum):
@@ -60,33 +60,44 @@ class ClusteredEvidence:
 def clustered_evidence(
     success: Bool[np.ndarray, " n"], terrain: Int[np.ndarray, " n"], confidence: float
 ) -> ClusteredEvidence:
-    """Bounds of a success rate, each at `confidence`, for at least one case; `terrain` numbers the terrain of each."""
-    index = terrain_index(terrain)
+    """Bounds of a success rate, each at `confidence`, for at least one case; `terrain` numbers the terrain of each.
+
+    Few terrains with failures or successes are counted whole. Otherwise the bounds are those of Clopper and Pearson
+    with the effective sample size of Korn & Graubard 1998, never larger than n.
+    """
+    index = number_terrains(terrain)
     sizes = np.bincount(index).astype(np.float64)
     successes = np.bincount(index, weights=success.astype(np.float64))
     failed, succeeded = int((successes < sizes).sum()), int((successes > 0).sum())
-    design_effect = _design_effect(successes, sizes)
-    if sizes.size >= FEWEST_TERRAINS and min(failed, succeeded) >= FEWEST_MIXED_TERRAINS:
-        return _korn_graubard(successes, sizes, design_effect, confidence)
-    # With equally many cases on each, a terrain has a failure at least as often as a case fails, and a success at least
-    # as often as a case succeeds: both bounds are safe. Where bad terrains have fewer cases (they answer less often) or
-    # more, the rate of the cases is on the safe side of the terrains' rate for one of the two bounds.
-    terrains = sizes.size
-    of_cases = terrains * float(successes.sum() / sizes.sum())
-    fewest, most = min(float(terrains - failed), of_cases), max(float(succeeded), of_cases)
-    return ClusteredEvidence(
-        terrains,
-        failed,
-        ClusterMethod.TERRAIN_COUNT,
-        float("nan"),
-        float(terrains),
-        fewest,
-        proportion_lower(fewest, terrains, confidence),
-        proportion_upper(most, terrains, confidence),
-    )
+    n, terrains = float(sizes.sum()), sizes.size
+    if terrains >= _MIN_TERRAINS and min(failed, succeeded) >= _MIN_MIXED_TERRAINS:
+        method, design_effect = ClusterMethod.KORN_GRAUBARD, _estimate_design_effect(successes, sizes)
+        # The second factor pays for estimating the variance from so many terrains only.
+        freedom = (stats.t.ppf(confidence, n - 1) / stats.t.ppf(confidence, terrains - 1)) ** 2
+        effective_n = min(n, n / max(design_effect, 1e-9) * float(freedom))
+        min_successes = max_successes = float(successes.sum() / n * effective_n)
+    else:
+        # With equally many cases on each, a terrain has a failure at least as often as a case fails, and a success at
+        # least as often as a case succeeds: both bounds are safe. Where bad terrains have fewer cases (they answer less
+        # often) or more, the rate of the cases is on the safe side of the terrains' rate for one of the two bounds.
+        method, design_effect, effective_n = ClusterMethod.TERRAIN_COUNT, float("nan"), float(terrains)
+        of_cases = terrains * float(successes.sum() / n)
+        min_successes, max_successes = min(float(terrains - failed), of_cases), max(float(succeeded), of_cases)
+    lower = proportion_lower(min_successes, effective_n, confidence)
+    upper = proportion_upper(max_successes, effective_n, confidence)
+    return ClusteredEvidence(terrains, failed, method, design_effect, effective_n, min_successes, lower, upper)
 
 
-def terrain_index(terrain: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+def _estimate_design_effect(successes: Float[np.ndarray, " terrains"], sizes: Float[np.ndarray, " terrains"]) -> float:
+    """Variance of the rate over terrains (Taylor linearisation) over the binomial one."""
+    terrains, n = sizes.size, sizes.sum()
+    rate = successes.sum() / n
+    residuals = successes - rate * sizes
+    variance = terrains / (terrains - 1) * float((residuals**2).sum()) / n**2
+    return float(variance / (rate * (1.0 - rate) / n))
+
+
+def number_terrains(terrain: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     """Consecutive terrain numbers from 0, in the order of the given ones."""
     first, last = int(terrain.min()), int(terrain.max())
     if last - first > 4 * terrain.size:
@@ -94,38 +105,3 @@ def terrain_index(terrain: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     # without sorting, which takes most of a report of a million cases
     shifted = terrain - first
     return np.asarray((np.cumsum(np.bincount(shifted) > 0) - 1)[shifted])
-
-
-def _design_effect(successes: Float[np.ndarray, " terrains"], sizes: Float[np.ndarray, " terrains"]) -> float:
-    """Variance of the rate over terrains (Taylor linearisation) over the binomial one; NaN where either is 0."""
-    terrains, n = sizes.size, sizes.sum()
-    rate = successes.sum() / n
-    if terrains < 2 or not 0.0 < rate < 1.0:
-        return float("nan")
-    residuals = successes - rate * sizes
-    variance = terrains / (terrains - 1) * float((residuals**2).sum()) / n**2
-    return float(variance / (rate * (1.0 - rate) / n))
-
-
-def _korn_graubard(
-    successes: Float[np.ndarray, " terrains"],
-    sizes: Float[np.ndarray, " terrains"],
-    design_effect: float,
-    confidence: float,
-) -> ClusteredEvidence:
-    """Clopper-Pearson with the effective sample size of Korn & Graubard 1998, never larger than n."""
-    n, terrains = float(sizes.sum()), sizes.size
-    # The second factor pays for estimating the variance from so many terrains only.
-    freedom = (stats.t.ppf(confidence, n - 1) / stats.t.ppf(confidence, terrains - 1)) ** 2
-    effective_n = min(n, n / max(design_effect, 1e-9) * float(freedom))
-    effective_successes = successes.sum() / n * effective_n
-    return ClusteredEvidence(
-        terrains,
-        int((successes < sizes).sum()),
-        ClusterMethod.KORN_GRAUBARD,
-        design_effect,
-        effective_n,
-        float(effective_successes),
-        proportion_lower(effective_successes, effective_n, confidence),
-        proportion_upper(effective_successes, effective_n, confidence),
-    )

@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import optimize, stats
 
-#: Fewest cases that say anything.
+#: Minimum number of cases.
 MIN_CASES = 20
-#: Cases in a bin of the share of variance, and the most bins.
-_CASES_PER_BIN, _MOST_BINS = 15, 20
+#: Cases in a bin of the fraction of variance, and the maximum number of bins.
+_CASES_PER_BIN, _MAX_BINS = 15, 20
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Driver:
     n, effective_n: cases with both, and the equivalent number of independent ones.
     correlation, lower, upper: Spearman's rank correlation and its interval.
     share, share_lower, share_upper: fraction of the variance of the response's ranks that the condition alone explains,
-    for
-    any form of the curve: the first-order index of a variance-based analysis, estimated from the given cases; 0 to 1.
+    for any form of the curve, and its interval: the first-order index of a variance-based analysis, estimated from the
+    given cases; 0 to 1.
     p_value: p-value of the null hypothesis that it explains nothing.
     """
 
@@ -65,68 +65,70 @@ def driver(
     if n < MIN_CASES or np.ptp(condition[known]) == 0.0 or np.ptp(response[known]) == 0.0:
         return None
     x, y = stats.rankdata(condition[known]), stats.rankdata(response[known])
-    effective = float(n) if groups is None else n / _design_effect(x, y, groups[known])
+    effective = float(n)
+    if groups is not None:
+        index = np.unique(groups[known], return_inverse=True)[1]
+        sizes = np.bincount(index).astype(np.float64)
+        size = float((sizes**2).sum() / sizes.sum())
+        effective = n / max(
+            1.0,
+            1.0
+            + (size - 1.0)
+            * _estimate_intraclass_correlation(x, index, sizes)
+            * _estimate_intraclass_correlation(y, index, sizes),
+        )
     correlation = float(np.corrcoef(x, y)[0, 1])
     half = float(stats.norm.ppf(0.5 * (1.0 + confidence)))
     half *= math.sqrt((1.0 + 0.5 * correlation**2) / max(effective - 3.0, 1.0))
     middle = math.atanh(float(np.clip(correlation, -1.0 + 1e-12, 1.0 - 1e-12)))
     lower, upper = math.tanh(middle - half), math.tanh(middle + half)
-    return Driver(n, effective, correlation, lower, upper, *_share(x, y, effective, confidence))
+    return Driver(n, effective, correlation, lower, upper, *_estimate_explained_fraction(x, y, effective, confidence))
 
 
-def _share(
+def _estimate_explained_fraction(
     x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], effective: float, confidence: float
 ) -> tuple[float, float, float, float]:
-    """Share of variance between bins, its interval, and the p-value of the F-test."""
+    """Fraction of variance between bins, its interval, and the p-value of the F-test."""
     n = x.size
-    wanted = int(np.clip(n // _CASES_PER_BIN, 2, _MOST_BINS))
+    wanted = int(np.clip(n // _CASES_PER_BIN, 2, _MAX_BINS))
     edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, wanted + 1)))[1:-1]
     # values below the bins' edges, so that a condition of two kinds has a bin for each
     index = np.unique(np.searchsorted(edges, x, side="right"), return_inverse=True)[1]
-    bins = int(index.max()) + 1
-    if bins < 2:
+    if index.max() == 0:
         index = np.unique(x, return_inverse=True)[1] if np.unique(x).size <= wanted else (x > x.min()).astype(int)
-        bins = int(index.max()) + 1
+    bins = int(index.max()) + 1
     means = np.bincount(index, weights=y) / np.bincount(index)
     total = float(((y - y.mean()) ** 2).sum())
     between = float((np.bincount(index) * (means - y.mean()) ** 2).sum())
     if between >= (1.0 - 1e-9) * total:
         return 1.0, 1.0, 1.0, 0.0
-    free = max(effective - bins, 1.0)
+    freedom = max(effective - bins, 1.0)
     within = total - between
-    ratio = between / (bins - 1.0) / (within / free)
-    share = max(0.0, (between - (bins - 1.0) * within / free) / total)
+    ratio = between / (bins - 1.0) / (within / freedom)
+    fraction = max(0.0, (between - (bins - 1.0) * within / freedom) / total)
+
+    def excess(value: float, level: float) -> float:
+        """Distribution function of the F ratio at a noncentrality, above a level."""
+        law = stats.ncf.cdf(ratio, bins - 1.0, freedom, value) if value else stats.f.cdf(ratio, bins - 1.0, freedom)
+        return float(law) - level
+
+    bounds: list[float] = []
     tail = 0.5 * (1.0 - confidence)
-    bounds = [_noncentrality(ratio, bins - 1.0, free, level) / effective for level in (1.0 - tail, tail)]
-    lower, upper = (value / (1.0 + value) for value in bounds)
-    return share, lower, upper, float(stats.f.sf(ratio, bins - 1.0, free))
+    for level in (1.0 - tail, tail):
+        high = max(1.0, ratio * (bins - 1.0))
+        while excess(high, level) > 0.0:
+            high *= 2.0
+        found = 0.0
+        if excess(0.0, level) > 0.0:
+            found = float(optimize.brentq(excess, 0.0, high, args=(level,), xtol=1e-4 * high, rtol=1e-4)) / effective
+        bounds.append(found / (1.0 + found))
+    return fraction, bounds[0], bounds[1], float(stats.f.sf(ratio, bins - 1.0, freedom))
 
 
-def _noncentrality(ratio: float, first: float, second: float, level: float) -> float:
-    """The noncentrality at which an F ratio is at a level of its distribution; 0 where even none is too much."""
-
-    def excess(value: float) -> float:
-        return float(stats.ncf.cdf(ratio, first, second, value) if value else stats.f.cdf(ratio, first, second)) - level
-
-    if excess(0.0) <= 0.0:
-        return 0.0
-    high = max(1.0, ratio * first)
-    while excess(high) > 0.0:
-        high *= 2.0
-    return float(optimize.brentq(excess, 0.0, high, xtol=1e-4 * high, rtol=1e-4))
-
-
-def _design_effect(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"]) -> float:
-    _, index = np.unique(groups, return_inverse=True)
-    sizes = np.bincount(index).astype(np.float64)
-    size = float((sizes**2).sum() / sizes.sum())
-    return max(1.0, 1.0 + (size - 1.0) * _intraclass(x, index, sizes) * _intraclass(y, index, sizes))
-
-
-def _intraclass(
+def _estimate_intraclass_correlation(
     values: Float[np.ndarray, " n"], index: Int[np.ndarray, " n"], sizes: Float[np.ndarray, " groups"]
 ) -> float:
-    """The intraclass correlation by analysis of variance, 0 to 1; 0 where no group has two."""
+    """Intraclass correlation by analysis of variance, 0 to 1; 0 where no group has two."""
     n, groups = values.size, sizes.size
     if groups < 2 or groups == n:
         return 0.0

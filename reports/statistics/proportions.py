@@ -6,10 +6,11 @@ Biometrika 26, 1934.
 
 from __future__ import annotations
 
+import bisect
+
 from scipy import stats
 
 _LARGEST_SAMPLE_SIZE = 2**40
-
 #: A lower and an upper bound.
 Interval = tuple[float, float]
 
@@ -64,17 +65,17 @@ def minimum_sample_size(reliability: float, confidence: float, failures: int = 0
         raise ValueError(f"the reliability is {reliability}; it must lie between 0 and 1, both excluded")
     if failures < 0:
         raise ValueError(f"{failures} failures; there cannot be fewer than none")
-    enough = failures + 1
-    while proportion_lower(enough - failures, enough, confidence) < reliability:
-        enough *= 2
-        if enough > _LARGEST_SAMPLE_SIZE:
+
+    def is_shown(cases: int) -> bool:
+        return proportion_lower(cases - failures, cases, confidence) >= reliability
+
+    upper = failures + 1
+    while not is_shown(upper):
+        upper *= 2
+        if upper > _LARGEST_SAMPLE_SIZE:
             raise ValueError(f"no sample of practical size shows a reliability of {reliability}")
-    too_few = failures
-    while enough - too_few > 1:
-        middle = (enough + too_few) // 2
-        shown = proportion_lower(middle - failures, middle, confidence) >= reliability
-        enough, too_few = (middle, too_few) if shown else (enough, middle)
-    return enough
+    cases = range(failures + 1, upper)
+    return cases.start + bisect.bisect_left(cases, True, key=is_shown)
 
 
 def further_cases_needed(n: int, failures: int, reliability: float, confidence: float) -> int:

@@ -1,4 +1,4 @@
-"""Statistics of samples: quantiles, mean and spread, each with bounds.
+"""Statistics of samples: quantiles, mean and spread, each with bounds; prediction ellipses of errors in two dimensions.
 
 Quantiles are bounded by order statistics, for any distribution (Wilks, "Determination of sample sizes for setting
 tolerance limits", Ann. Math. Statist. 12, 1941; as Hanson & Beard use them for a stated consumer risk,
@@ -20,17 +20,19 @@ with Korn & Graubard's number), or whole terrains where too few of them lie on e
 
 from __future__ import annotations
 
+import bisect
 import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
 
-from marsyard.reports.statistics.clusters import ClusterMethod, clustered_evidence, terrain_index
+from marsyard.reports.statistics.clusters import ClusterMethod, clustered_evidence, number_terrains
 from marsyard.reports.statistics.proportions import Interval, check_confidence, proportion_lower
 
 #: Number of values (or terrains) above which the bootstrap's interval equals the large-sample one as printed.
@@ -38,10 +40,24 @@ _MAX_BOOTSTRAP = 2000
 _RESAMPLES = 2000
 #: Fixed seed: the same rows give the same page.
 _SEED = 19340401
+#: Minimum number of terrains, and of independent values, to estimate their spread.
+FEWEST_TERRAINS, _MIN_FOR_SPREAD = 5, 8
+#: Minimum number of points of an ellipse: its factor needs two degrees of freedom beyond the plane's.
+_MIN_FOR_ELLIPSE = 5
+#: Terrain number of each value; None where all are independent.
+Groups = Int[np.ndarray, " n"] | None
 
 
-def bca(data: Sequence[Float[np.ndarray, " n"]], statistic: Callable[..., Any], confidence: float) -> Interval:
-    """Two-sided interval of a statistic of one or more columns, resampled together; NaN where there is none."""
+def is_shared(groups: Groups) -> bool:
+    """Whether any two values are from one terrain."""
+    return groups is not None and groups.size > 0 and int(number_terrains(groups).max()) + 1 < groups.size
+
+
+def _bootstrap(data: Sequence[Float[np.ndarray, " n"]], statistic: Callable[..., Any], confidence: float) -> Interval:
+    """Two-sided BCa interval of a statistic of one or more columns, resampled together; NaN where there is none."""
+    n = data[0].size
+    # the level at which the normal quantile equals Student's times sqrt(n / (n - 1)): Hesterberg 2015, section 5
+    quantile = _student_quantile(confidence, n) * math.sqrt(n / (n - 1.0))
     with warnings.catch_warnings():
         # a degenerate bootstrap distribution (of two values, for example) gives NaN bounds
         warnings.simplefilter("ignore")
@@ -49,7 +65,8 @@ def bca(data: Sequence[Float[np.ndarray, " n"]], statistic: Callable[..., Any], 
             tuple(data),
             statistic,
             paired=True,
-            confidence_level=_widened(confidence, data[0].size),
+            # below 1, as SciPy requires
+            confidence_level=min(2.0 * float(stats.norm.cdf(quantile)) - 1.0, 1.0 - 1e-6),
             n_resamples=_RESAMPLES,
             batch=200,
             vectorized=True,
@@ -59,102 +76,9 @@ def bca(data: Sequence[Float[np.ndarray, " n"]], statistic: Callable[..., Any], 
     return float(result.confidence_interval.low), float(result.confidence_interval.high)
 
 
-def _widened(confidence: float, n: int) -> float:
-    """Level at which the normal quantile equals Student's times sqrt(n / (n - 1)): Hesterberg 2015, section 5."""
-    quantile = float(stats.t.ppf(0.5 * (1.0 + confidence), n - 1)) * math.sqrt(n / (n - 1.0))
-    # below 1, which the bootstrap does not accept
-    return min(2.0 * float(stats.norm.cdf(quantile)) - 1.0, 1.0 - 1e-6)
-
-
-#: Minimum number of terrains to estimate the spread between them.
-FEWEST_TERRAINS = 5
-
-
-def is_shared(groups: Int[np.ndarray, " n"] | None) -> bool:
-    """Whether any two values are from one terrain."""
-    return groups is not None and groups.size > 0 and int(terrain_index(groups).max()) + 1 < groups.size
-
-
-def shared_mean(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], confidence: float) -> Interval:
-    """Two-sided interval of the mean of finite values on shared terrains; NaN for fewer than five terrains."""
-    index = terrain_index(groups)
-    sizes, sums = np.bincount(index).astype(np.float64), np.bincount(index, weights=values)
-    terrains = sizes.size
-    if terrains < FEWEST_TERRAINS:
-        return math.nan, math.nan
-    mean = float(values.mean())
-    half = _student(confidence, terrains) * _deviation_of_mean(sums - mean * sizes, values.size)
-    plain = mean - half, mean + half
-    if terrains > _MAX_BOOTSTRAP:
-        return plain
-    return _union(plain, bca((sums, sizes), _ratio, confidence))
-
-
-def shared_spread(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], confidence: float) -> Interval:
-    """Two-sided interval of the standard deviation of values on shared terrains; NaN for fewer than five terrains."""
-    index = terrain_index(groups)
-    sizes = np.bincount(index).astype(np.float64)
-    terrains = sizes.size
-    if terrains < FEWEST_TERRAINS:
-        return math.nan, math.nan
-    centred = values - values.mean()
-    sums, squares = (np.bincount(index, weights=centred**power) for power in (1, 2))
-    variance = float((centred**2).mean())
-    # of the logarithm, which is less skewed, corrected for few terrains as Bonett's interval is for few values
-    quantile = _student(confidence, terrains)
-    correction = terrains / max(terrains - quantile, 1.0)
-    half = quantile * correction * _deviation_of_mean(squares - variance * sizes, values.size) / variance
-    middle = math.log(correction * variance)
-    plain = math.exp(0.5 * (middle - half)), math.exp(0.5 * (middle + half))
-    if terrains > _MAX_BOOTSTRAP:
-        return plain
-    return _union(plain, bca((squares, sums, sizes), _spread, confidence))
-
-
-def shared_quantile(
-    values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], quantile: float, confidence: float
-) -> Interval:
-    """One-sided bounds of a quantile of values on shared terrains; infinite where the sample is too small."""
-    lower = -_upper_bound(-values, groups, 1.0 - quantile, confidence)
-    return lower, _upper_bound(values, groups, quantile, confidence)
-
-
-def _upper_bound(
-    values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], quantile: float, confidence: float
-) -> float:
-    """Smallest value of the sample below which at least a fraction `quantile` of the population lies, at the
-    confidence.
-    """
-    ordered = np.sort(values)
-    n = ordered.size
-    below = values <= ordered[min(n - 1, max(0, math.ceil(quantile * n) - 1))]
-    shown = clustered_evidence(below, groups, confidence)
-    if shown.method is ClusterMethod.TERRAIN_COUNT:
-        # a bound for the maximum of a terrain also holds for its values
-        index = terrain_index(groups)
-        ordered = np.full(int(index.max()) + 1, -math.inf)
-        np.maximum.at(ordered, index, values)
-        ordered, worth = np.sort(ordered), 1.0
-    else:
-        worth = shown.effective_n / n
-    return _least_rank(ordered, worth, quantile, confidence)
-
-
-def _least_rank(ordered: Float[np.ndarray, " n"], worth: float, quantile: float, confidence: float) -> float:
-    """First of the ordered values whose rank shows the quantile, each counting as `worth` values; inf for none."""
-    n = ordered.size
-    if proportion_lower(n * worth, n * worth, confidence) < quantile:
-        return math.inf
-    low, high = 0, n
-    while high - low > 1:
-        middle = (low + high) // 2
-        shown = proportion_lower(middle * worth, n * worth, confidence) >= quantile
-        low, high = (low, middle) if shown else (middle, high)
-    return float(ordered[high - 1])
-
-
-def _student(confidence: float, terrains: int) -> float:
-    return float(stats.t.ppf(0.5 * (1.0 + confidence), terrains - 1))
+def _student_quantile(confidence: float, n: int) -> float:
+    """Student's two-sided quantile for a mean of n values."""
+    return float(stats.t.ppf(0.5 * (1.0 + confidence), n - 1))
 
 
 def _deviation_of_mean(residuals: Float[np.ndarray, " terrains"], n: int) -> float:
@@ -162,55 +86,8 @@ def _deviation_of_mean(residuals: Float[np.ndarray, " terrains"], n: int) -> flo
     return math.sqrt(terrains / (terrains - 1.0) * float((residuals**2).sum())) / n
 
 
-def _ratio(sums: Float[np.ndarray, "*n"], sizes: Float[np.ndarray, "*n"], axis: int = -1) -> np.ndarray:
-    return np.asarray(sums.sum(axis=axis) / sizes.sum(axis=axis))
-
-
-def _spread(
-    squares: Float[np.ndarray, "*n"], sums: Float[np.ndarray, "*n"], sizes: Float[np.ndarray, "*n"], axis: int = -1
-) -> np.ndarray:
-    n = sizes.sum(axis=axis)
-    excess = squares.sum(axis=axis) - sums.sum(axis=axis) ** 2 / n
-    return np.asarray(np.sqrt(np.maximum(excess, 0.0) / (n - 1.0)))
-
-
-def _union(first: Interval, second: Interval) -> Interval:
+def _unite(first: Interval, second: Interval) -> Interval:
     return float(np.fmin(first[0], second[0])), float(np.fmax(first[1], second[1]))
-
-
-#: Terrain number of each value; None where all are independent.
-Groups = Int[np.ndarray, " n"] | None
-#: Minimum number of values to estimate their spread.
-_MIN_FOR_SPREAD = 8
-
-
-def quantile_bounds(
-    sample: Float[np.ndarray, " n"], quantile: float, confidence: float, groups: Groups = None
-) -> Interval:
-    """One-sided lower and upper order-statistic bounds of a quantile, each at the confidence.
-
-    -inf or inf where the sample is too small (upper bound of the 99 % quantile at 95 % confidence: fewer than 299
-    values).
-    Wilks 1941: the r-th smallest of n values lies at or above the quantile q with probability P(Bin(n, q) <= r - 1);
-    the upper bound is the smallest such value with that probability at the confidence.
-    """
-    check_confidence(confidence)
-    if groups is not None and is_shared(groups):
-        return shared_quantile(np.asarray(sample, dtype=np.float64), groups, quantile, confidence)
-    ordered = np.sort(np.asarray(sample, dtype=np.float64))
-    n = ordered.size
-    if n == 0:
-        return -math.inf, math.inf
-    lower = -_upper_order_bound(-ordered[::-1], 1.0 - quantile, confidence)
-    return lower, _upper_order_bound(ordered, quantile, confidence)
-
-
-def _upper_order_bound(ordered: Float[np.ndarray, " n"], quantile: float, confidence: float) -> float:
-    """Smallest of the ordered values that bounds the quantile from above at the confidence."""
-    n = ordered.size
-    # `ppf` gives the smallest k with P(Bin <= k) >= confidence; the value of 1-based rank k + 1 is the bound.
-    rank = int(stats.binom.ppf(confidence, n, quantile))
-    return float(ordered[rank]) if rank < n else math.inf
 
 
 def mean_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Groups = None) -> Interval:
@@ -222,15 +99,27 @@ def mean_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Gr
     values = np.asarray(sample, dtype=np.float64)
     if values.size < 2:
         return math.nan, math.nan
-    mean, spread = float(values.mean()), float(values.std(ddof=1))
+    mean = float(values.mean())
     if np.ptp(values) == 0.0:
         return mean, mean
-    if groups is not None and is_shared(groups):
-        return shared_mean(values, groups, confidence)
-    if values.size > _MAX_BOOTSTRAP:
-        half = float(stats.norm.ppf(0.5 * (1.0 + confidence))) * spread / math.sqrt(values.size)
+    if groups is None or not is_shared(groups):
+        if values.size <= _MAX_BOOTSTRAP:
+            return _bootstrap((values,), np.mean, confidence)
+        quantile, spread = float(stats.norm.ppf(0.5 * (1.0 + confidence))), float(values.std(ddof=1))
+        half = quantile * spread / math.sqrt(values.size)
         return mean - half, mean + half
-    return bca((values,), np.mean, confidence)
+    index = number_terrains(groups)
+    sizes, sums = np.bincount(index).astype(np.float64), np.bincount(index, weights=values)
+    if sizes.size < FEWEST_TERRAINS:
+        return math.nan, math.nan
+    half = _student_quantile(confidence, sizes.size) * _deviation_of_mean(sums - mean * sizes, values.size)
+    if sizes.size > _MAX_BOOTSTRAP:
+        return mean - half, mean + half
+
+    def ratio(sums: Float[np.ndarray, "*n"], sizes: Float[np.ndarray, "*n"], axis: int = -1) -> np.ndarray:
+        return np.asarray(sums.sum(axis=axis) / sizes.sum(axis=axis))
+
+    return _unite((mean - half, mean + half), _bootstrap((sums, sizes), ratio, confidence))
 
 
 def spread_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Groups = None) -> Interval:
@@ -246,22 +135,43 @@ def spread_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: 
     if np.ptp(values) == 0.0:
         return 0.0, 0.0
     if groups is not None and is_shared(groups):
-        return shared_spread(values, groups, confidence)
-    lower, upper = _bonett(values, confidence)
+        return _shared_spread(values, groups, confidence)
+    interval = _bonett_interval(values, confidence)
     if values.size > _MAX_BOOTSTRAP:
-        return lower, upper
-    resampled = bca((values,), _deviation, confidence)
-    return float(np.fmin(lower, resampled[0])), float(np.fmax(upper, resampled[1]))
+        return interval
+    return _unite(interval, _bootstrap((values,), partial(np.std, ddof=1), confidence))
 
 
-def _deviation(values: Float[np.ndarray, " *n"], axis: int = -1) -> Any:
-    return np.std(values, axis=axis, ddof=1)
+def _shared_spread(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], confidence: float) -> Interval:
+    """Two-sided interval of the standard deviation of values on shared terrains; NaN for fewer than five terrains."""
+    index = number_terrains(groups)
+    sizes = np.bincount(index).astype(np.float64)
+    terrains = sizes.size
+    if terrains < FEWEST_TERRAINS:
+        return math.nan, math.nan
+    centred = values - values.mean()
+    sums, squares = (np.bincount(index, weights=centred**power) for power in (1, 2))
+    variance = float((centred**2).mean())
+    # of the logarithm, which is less skewed, corrected for few terrains as Bonett's interval is for few values
+    quantile = _student_quantile(confidence, terrains)
+    correction = terrains / max(terrains - quantile, 1.0)
+    half = quantile * correction * _deviation_of_mean(squares - variance * sizes, values.size) / variance
+    middle = math.log(correction * variance)
+    plain = math.exp(0.5 * (middle - half)), math.exp(0.5 * (middle + half))
+    if terrains > _MAX_BOOTSTRAP:
+        return plain
+
+    def spread(*columns: Float[np.ndarray, "*n"], axis: int = -1) -> np.ndarray:
+        squares, sums, n = (column.sum(axis=axis) for column in columns)
+        return np.asarray(np.sqrt(np.maximum(squares - sums**2 / n, 0.0) / (n - 1.0)))
+
+    return _unite(plain, _bootstrap((squares, sums, sizes), spread, confidence))
 
 
-def _bonett(values: Float[np.ndarray, " n"], confidence: float) -> Interval:
+def _bonett_interval(values: Float[np.ndarray, " n"], confidence: float) -> Interval:
     """Bonett 2006, equation 8, with Student's t for the normal quantile."""
     n = values.size
-    quantile = float(stats.t.ppf(0.5 * (1.0 + confidence), n - 1))
+    quantile = _student_quantile(confidence, n)
     trimmed = float(stats.trim_mean(values, min(0.49, 0.5 / math.sqrt(n - 4.0))))
     squares = float(((values - values.mean()) ** 2).sum())
     kurtosis = n * float(((values - trimmed) ** 4).sum()) / squares**2
@@ -269,6 +179,53 @@ def _bonett(values: Float[np.ndarray, " n"], confidence: float) -> Interval:
     error = correction * math.sqrt(max((kurtosis - (n - 3.0) / n) / (n - 1.0), 0.0))
     middle = math.log(correction * squares / (n - 1.0))
     return math.exp(0.5 * (middle - quantile * error)), math.exp(0.5 * (middle + quantile * error))
+
+
+def quantile_bounds(
+    sample: Float[np.ndarray, " n"], quantile: float, confidence: float, groups: Groups = None
+) -> Interval:
+    """One-sided lower and upper order-statistic bounds of a quantile, each at the confidence.
+
+    -inf or inf where the sample is too small (upper bound of the 99 % quantile at 95 % confidence: fewer than 299
+    values).
+    """
+    check_confidence(confidence)
+    values = np.asarray(sample, dtype=np.float64)
+    if values.size == 0:
+        return -math.inf, math.inf
+    lower = -_bound_quantile(-values, groups, 1.0 - quantile, confidence)
+    return lower, _bound_quantile(values, groups, quantile, confidence)
+
+
+def _bound_quantile(values: Float[np.ndarray, " n"], groups: Groups, quantile: float, confidence: float) -> float:
+    """Smallest value of the sample below which at least a fraction `quantile` of the population lies, at the
+    confidence.
+
+    Wilks 1941: the r-th smallest of n values lies at or above the quantile q with probability P(Bin(n, q) <= r - 1);
+    the bound is the smallest such value with that probability at the confidence.
+    """
+    ordered = np.sort(values)
+    n = ordered.size
+    if groups is None or not is_shared(groups):
+        # `ppf` gives the smallest k with P(Bin <= k) >= confidence; the value of 1-based rank k + 1 is the bound
+        rank = int(stats.binom.ppf(confidence, n, quantile))
+        return float(ordered[rank]) if rank < n else math.inf
+    below = values <= ordered[min(n - 1, max(0, math.ceil(quantile * n) - 1))]
+    shown = clustered_evidence(below, groups, confidence)
+    weight = shown.effective_n / n
+    if shown.method is ClusterMethod.TERRAIN_COUNT:
+        # a bound for the maximum of a terrain also holds for its values
+        index = number_terrains(groups)
+        ordered = np.full(int(index.max()) + 1, -math.inf)
+        np.maximum.at(ordered, index, values)
+        ordered, weight = np.sort(ordered), 1.0
+    # first rank that shows the quantile, each value counting as `weight` independent ones
+    ranks = range(1, ordered.size + 1)
+    total = ordered.size * weight
+    rank = bisect.bisect_left(
+        ranks, True, key=lambda rank: proportion_lower(rank * weight, total, confidence) >= quantile
+    )
+    return float(ordered[rank]) if rank < ordered.size else math.inf
 
 
 @dataclass(frozen=True)
@@ -326,6 +283,12 @@ def summarize(
     median = float(np.median(finite)) if n else math.nan
     mean_lower, mean_upper = mean_interval(finite, confidence, shared)
     sd_lower, sd_upper = spread_interval(finite, confidence, shared)
+    found = []
+    for probability in quantiles:
+        # a quantile beyond all but the last value is an extrapolation, not an estimate
+        is_estimate = n * min(probability, 1.0 - probability) >= 1.0 - 1e-9
+        estimate = float(np.quantile(finite, probability)) if is_estimate else math.nan
+        found.append(Quantile(probability, estimate, *quantile_bounds(finite, probability, confidence, shared)))
     return ErrorSummary(
         n=n,
         missing=missing,
@@ -339,13 +302,79 @@ def summarize(
         median=median,
         robust_sd=1.4826 * float(np.median(np.abs(finite - median))) if n else math.nan,
         largest=float(np.abs(finite).max()) if n else math.nan,
-        quantiles=tuple(_quantile(finite, probability, confidence, shared) for probability in quantiles),
+        quantiles=tuple(found),
         confidence=confidence,
     )
 
 
-def _quantile(finite: Float[np.ndarray, " n"], probability: float, confidence: float, groups: Groups) -> Quantile:
-    # A quantile beyond all but the last value is an extrapolation, not an estimate.
-    is_estimate = finite.size * min(probability, 1.0 - probability) >= 1.0 - 1e-9
-    estimate = float(np.quantile(finite, probability)) if is_estimate else math.nan
-    return Quantile(probability, estimate, *quantile_bounds(finite, probability, confidence, groups))
+@dataclass(frozen=True)
+class ErrorEllipse:
+    """Ellipse that contains the next error with a stated probability, for normal errors.
+
+    centre: mean error.
+    semi_major, semi_minor: half axes, in the errors' unit.
+    angle_deg: of the major axis from the first component towards the second, from -90 (excluded) to 90 degrees.
+    probability: probability that the next error lies inside.
+    inside: fraction of these errors that lie inside; differs from the probability where errors are not normal.
+    """
+
+    centre: tuple[float, float]
+    semi_major: float
+    semi_minor: float
+    angle_deg: float
+    probability: float
+    inside: float
+
+    @property
+    def reach(self) -> float:
+        """Half the side of the smallest square about zero error that contains the ellipse."""
+        angle = math.radians(self.angle_deg)
+        x = math.hypot(self.semi_major * math.cos(angle), self.semi_minor * math.sin(angle))
+        y = math.hypot(self.semi_major * math.sin(angle), self.semi_minor * math.cos(angle))
+        return max(abs(self.centre[0]) + x, abs(self.centre[1]) + y)
+
+
+def error_ellipse(errors: Float[np.ndarray, "n 2"], probability: float) -> ErrorEllipse | None:
+    """Prediction ellipse of two-dimensional errors; None for fewer than five or where all lie on a point.
+
+    For a new error e of the same normal distribution, (e - m)' S^-1 (e - m) with the sample's mean and covariance is
+    distributed as 2 (n - 1) (n + 1) / (n (n - 2)) times F with 2 and n - 2 degrees of freedom (Hotelling; Chew,
+    "Confidence, prediction and tolerance regions for the multivariate normal distribution", J. Amer. Statist. Assoc.
+    61, 1966): the fraction of future errors inside is the probability on average, however small n is.
+    """
+    known = errors[np.isfinite(errors).all(axis=1)]
+    n = len(known)
+    if n < _MIN_FOR_ELLIPSE:
+        return None
+    centre = known.mean(axis=0)
+    values, axes = np.linalg.eigh(np.cov(known.T))
+    if values[1] <= 0.0:
+        return None
+    factor = 2.0 * (n - 1.0) * (n + 1.0) / (n * (n - 2.0)) * float(stats.f.ppf(probability, 2, n - 2))
+    variances = np.maximum(values, 0.0)
+    principal = (known - centre) @ axes
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distances = np.where(variances > 0.0, principal**2 / variances, 0.0).sum(axis=1)
+    angle = math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
+    return ErrorEllipse(
+        centre=(float(centre[0]), float(centre[1])),
+        semi_major=math.sqrt(factor * variances[1]),
+        semi_minor=math.sqrt(factor * variances[0]),
+        angle_deg=angle - 180.0 * math.ceil((angle - 90.0) / 180.0),
+        probability=probability,
+        inside=float((distances <= factor).mean()),
+    )
+
+
+def circular_error(
+    errors: Float[np.ndarray, "n 2"], probability: float, confidence: float, groups: Groups = None
+) -> Quantile:
+    """Radius about the truth that holds a fraction of the errors (0.5: the circular error probable), with bounds.
+
+    The bounds are order statistics, one-sided each at the confidence: nothing is assumed of the distribution.
+    """
+    finite = np.isfinite(errors).all(axis=1)
+    radii = np.hypot(*errors[finite].T)
+    estimate = float(np.quantile(radii, probability)) if radii.size else math.nan
+    bounds = quantile_bounds(radii, probability, confidence, None if groups is None else groups[finite])
+    return Quantile(probability, estimate, *bounds)

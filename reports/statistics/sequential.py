@@ -19,9 +19,11 @@ approximately as that method.
 
 from __future__ import annotations
 
+import bisect
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float64
@@ -45,12 +47,10 @@ def planned_looks(cases: int) -> tuple[Look, ...]:
     """Looks of a campaign of at most `cases` cases: at the last case, at half of them, a quarter, and so on."""
     if cases < 1:
         raise ValueError(f"{cases} cases; a campaign has at least one")
-    places = [cases]
-    while len(places) < _MAX_LOOKS and places[-1] // 2 >= _MIN_FIRST_CASES:
-        places.append(places[-1] // 2)
-    places.reverse()
-    before = [0, *places[:-1]]
-    return tuple(Look(place, (place - last) / cases) for place, last in zip(places, before, strict=True))
+    sizes = [cases]
+    while len(sizes) < _MAX_LOOKS and sizes[0] // 2 >= _MIN_FIRST_CASES:
+        sizes.insert(0, sizes[0] // 2)
+    return tuple(Look(size, (size - before) / cases) for before, size in pairwise([0, *sizes]))
 
 
 def spent_fraction(looks: tuple[Look, ...], cases: int) -> float:
@@ -71,10 +71,10 @@ class LaterLook:
     """Test at a look at a campaign that was judged before: one verdict, PASS or FAIL, of a requirement.
 
     Events are failures for PASS, successes for FAIL: few of them show it. Under `rate`, the rate at the requirement's
-    limit, the likelihood ratio of `_log_ratio` is a martingale, and under any higher rate a supermartingale. By Ville's
-    inequality it ever reaches c with probability at most its value at the first look over c, for any stopping rule. The
-    threshold c is chosen so that the probabilities of a verdict at the first look, by the ordinary bound, and at any
-    later look add up to `risk`.
+    limit, the likelihood ratio (`_log_likelihood_ratio`) is a martingale, and under any higher rate a supermartingale.
+    By Ville's inequality it ever reaches c with probability at most its value at the first look over c, for any
+    stopping rule. The threshold c is chosen so that the probabilities of a verdict at the first look, by the ordinary
+    bound, and at any later look add up to `risk`.
 
     rate: probability of an event in a case at the limit: 1 - probability for PASS, probability for FAIL.
     risk: probability of a false verdict of all looks together: 1 - confidence.
@@ -93,35 +93,36 @@ class LaterLook:
         chance = stats.binom.logpmf(decided, self.first, self.rate)
         spent = float(np.exp(chance).sum())
         # rest of the martingale's mean of 1 where the first look does not decide
-        remaining = 1.0 - float(np.exp(chance + _log_ratio(decided, self.first, self.rate)).sum())
+        remaining = 1.0 - float(np.exp(chance + _log_likelihood_ratio(decided, self.first, self.rate)).sum())
         return math.log(max(_MIN_RISK, remaining) / max(_MIN_RISK, self.risk - spent))
 
     def risk_of_bound(self, n: float | int) -> float:
         """Risk at which the one-sided Clopper-Pearson bound of n cases shows the verdict at this look."""
-        log_ratio = float(_log_ratio(0.0, n, self.rate))
+        log_ratio = float(_log_likelihood_ratio(0.0, n, self.rate))
         if log_ratio < self.log_threshold:
             level = n * math.log1p(-self.rate) + log_ratio - self.log_threshold
             return max(_MIN_RISK, min(self.risk, math.exp(level)))
         few, many = 0.0, float(n)
         while many - few > 1e-9 * max(1.0, n):
             middle = 0.5 * (few + many)
-            few, many = (middle, many) if _log_ratio(middle, n, self.rate) >= self.log_threshold else (few, middle)
+            few, many = (
+                (middle, many) if _log_likelihood_ratio(middle, n, self.rate) >= self.log_threshold else (few, middle)
+            )
         return max(_MIN_RISK, min(self.risk, float(stats.beta.cdf(1.0 - self.rate, n - few, few + 1.0))))
 
     def cases_needed(self, n: int, events: int) -> int:
         """Total number of cases, at least n, that shows the verdict if no further event happens."""
-        enough = max(n, 1)
-        while _log_ratio(events, enough, self.rate) < self.log_threshold:
-            enough *= 2
-        too_few = n - 1
-        while enough - too_few > 1:
-            middle = (enough + too_few) // 2
-            shown = _log_ratio(events, middle, self.rate) >= self.log_threshold
-            too_few, enough = (too_few, middle) if shown else (middle, enough)
-        return enough
+
+        def is_shown(cases: int) -> bool:
+            return bool(_log_likelihood_ratio(events, cases, self.rate) >= self.log_threshold)
+
+        upper = max(n, 1)
+        while not is_shown(upper):
+            upper *= 2
+        return n + bisect.bisect_left(range(n, upper), True, key=is_shown)
 
 
-def _log_ratio(
+def _log_likelihood_ratio(
     events: Float64[np.ndarray, "*n"] | float | int, n: float | int, rate: float
 ) -> Float64[np.ndarray, "*n"]:
     """Logarithm of the likelihood ratio of a lower rate to `rate`, for a number of events in n cases.
@@ -131,7 +132,6 @@ def _log_ratio(
     """
     events = np.asarray(events, dtype=np.float64)
     likelihood = special.betaln(events + 0.5, n - events + 0.5) - special.betaln(0.5, 0.5)
-    below = special.betainc(events + 0.5, n - events + 0.5, rate) / special.betainc(0.5, 0.5, rate)
     with np.errstate(divide="ignore"):
-        weight = np.log(below)
+        weight = np.log(special.betainc(events + 0.5, n - events + 0.5, rate) / special.betainc(0.5, 0.5, rate))
     return np.asarray(likelihood + weight - events * math.log(rate) - (n - events) * math.log1p(-rate))

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from marsyard.campaigns.running import compilation
-from marsyard.campaigns.running.compilation import compilation_reported
+from marsyard.campaigns.running import preparation
+from marsyard.campaigns.running.preparation import report_compilation
 from marsyard.cli.progress import BarProgress, LineProgress
 from marsyard.sim.kernel_cache import mark_ready
 from tests.campaigns.fake_campaign import Silence
@@ -89,9 +89,9 @@ def test_compilation_is_reported_until_the_first_case_has_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(compilation, "REPORT_INTERVAL_S", 0.01)
+    monkeypatch.setattr(preparation, "REPORT_INTERVAL_S", 0.01)
     watch = Silence()
-    with compilation_reported("descent", watch.note) as first_case_ended:
+    with report_compilation("descent", watch.note) as first_case_ended:
         assert watch.notes[0].startswith("compiling numeric kernels once on this machine, about two minutes")
         assert "marsyard compile" in watch.notes[0]
         for number in range(3):
@@ -105,6 +105,6 @@ def test_compilation_is_reported_until_the_first_case_has_ended(
     # the next run finds them
     mark_ready("descent")
     again = Silence()
-    with compilation_reported("descent", again.note) as first_case_ended:
+    with report_compilation("descent", again.note) as first_case_ended:
         first_case_ended()
     assert again.notes == []

@@ -1,4 +1,4 @@
-"""Whatever is wrong with a campaign is said by file or option, key, and what is allowed; all of it at once."""
+"""All problems of a campaign are reported at once, by file or option, key and allowed values."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def test_requirements(campaign_file: CampaignFile, change: str, said: str) -> No
     assert said in refusal(path)
 
 
-def test_requirements_are_told_apart(campaign_file: CampaignFile) -> None:
+def test_requirements_have_distinct_ids(campaign_file: CampaignFile) -> None:
     one = "[[requirements]]\nid='a'\nmetric='m'\nbound=1\nprobability=0.9\nconfidence=0.9\n"
     assert "requirements share an id: a" in refusal(campaign_file(requirement=one + one))
 
@@ -198,7 +198,7 @@ def test_every_problem_is_listed(campaign_file: CampaignFile) -> None:
     assert keys == {"cases", "parameters.altitude_m", "parameters.wnd", "retain.showcase", "dispersions.kind"}
 
 
-def test_files_that_are_not_there(tmp_path: Path) -> None:
+def test_missing_files_are_reported(tmp_path: Path) -> None:
     assert refusal(tmp_path / "no.toml") == f"{tmp_path / 'no.toml'}: no such file"
     assert refusal(tmp_path) == f"{tmp_path}: is a folder"
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
@@ -207,7 +207,7 @@ def test_files_that_are_not_there(tmp_path: Path) -> None:
     assert "not valid TOML" in refusal(tmp_path / "deep.toml")
 
 
-def test_unknown_campaigns_are_answered_with_the_known_ones() -> None:
+def test_unknown_campaigns_are_reported_with_the_known_ones() -> None:
     text = refusal("dimes-smok")
     assert "unknown campaign 'dimes-smok'" in text
     assert "path of a TOML file" in text
@@ -263,7 +263,7 @@ def test_overrides(campaign_file: CampaignFile) -> None:
         ("dispersions.terrain.high=99", "dispersions.terrain: integer(low=0, high=99) reaches 99"),
     ],
 )
-def test_overrides_are_named_where_they_are_wrong(campaign_file: CampaignFile, override: str, said: str) -> None:
+def test_invalid_overrides_are_reported_by_option(campaign_file: CampaignFile, override: str, said: str) -> None:
     text = refusal(campaign_file(), override)
     assert text.startswith(f"--set {override}: ".replace("\n", "\\n"))
     assert said in text
@@ -329,7 +329,9 @@ _WHOLE: dict[str, dict[str, object]] = {
     gone=st.booleans(),
 )
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_spoilt_value_is_named_by_its_key(tmp_path: Path, place: tuple[str, str], value: object, gone: bool) -> None:
+def test_an_invalid_value_is_reported_by_its_key(
+    tmp_path: Path, place: tuple[str, str], value: object, gone: bool
+) -> None:
     table, key = place
     tables = {name: dict(inner) for name, inner in _WHOLE.items()}
     tables[table].pop(key) if gone else tables[table].update({key: value})
@@ -371,7 +373,9 @@ def test_a_choice_between_tables_draws_whole_tables(campaign_file: CampaignFile)
         ("wind.east_m_s.x", "wind.east_m_s, wind.north_m_s"),
     ],
 )
-def test_unknown_parameters_are_told_their_neighbours(campaign_file: CampaignFile, path: str, allowed: str) -> None:
+def test_unknown_parameters_are_reported_with_their_neighbours(
+    campaign_file: CampaignFile, path: str, allowed: str
+) -> None:
     """Of a scenario's hundreds only those of the innermost table that there is."""
     dispersion = f'[dispersions]\n"{path}" = {{distribution="uniform", low=1, high=2}}'
     text = refusal(campaign_file(dispersions=dispersion))

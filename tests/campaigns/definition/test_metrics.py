@@ -1,4 +1,4 @@
-"""Requirements are held against the scenario's columns before any terrain is built."""
+"""Columns of requirements are checked against the scenario before any terrain is built."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_misspelt_columns_are_found_before_terrains_are_built(
     assert not (tmp_path / "run").exists()
 
 
-def test_columns_of_own_scores_parts_and_further_algorithms_are_accepted(
+def test_columns_of_custom_scores_parts_and_compared_algorithms_are_accepted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "my_scores.py").write_text(SCORE)

@@ -8,11 +8,7 @@ import pytest
 
 from marsyard.campaigns.definition.catalogue import catalogue
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.definition.requirements import (
-    applicable,
-    read_requirements,
-    shipped_requirements,
-)
+from marsyard.campaigns.definition.requirements import read_requirements, select_applicable, shipped_requirements
 from marsyard.campaigns.errors import ConfigurationError
 from tests.campaigns.fake_campaign import write_campaign
 
@@ -22,7 +18,7 @@ NAMED = {
 }  # fmt: skip
 
 
-def test_shipped_requirements_say_whose_they_are() -> None:
+def test_shipped_requirements_state_their_source() -> None:
     # Issue 8 names these, and their bounds.
     shipped = shipped_requirements()
     assert {name: one.bound for name, one in shipped.items()} == NAMED
@@ -35,7 +31,7 @@ def test_every_campaign_that_a_requirement_names_is_there() -> None:
 
 
 @pytest.mark.parametrize("name", catalogue())
-def test_campaigns_ask_every_requirement_that_names_them(name: str) -> None:
+def test_campaigns_state_every_requirement_that_names_them(name: str) -> None:
     """Both ways: a requirement's list of campaigns, and the campaigns' lists of requirements."""
     shipped = shipped_requirements()
     asked = {one.id for one in load_campaign(name).configuration.requirements if one.id in shipped}
@@ -43,7 +39,7 @@ def test_campaigns_ask_every_requirement_that_names_them(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", catalogue())
-def test_campaigns_ask_what_is_stated(name: str) -> None:
+def test_campaigns_state_known_requirements(name: str) -> None:
     for asked in load_campaign(name).configuration.requirements:
         stated = shipped_requirements().get(asked.id)
         if stated is not None:
@@ -51,7 +47,7 @@ def test_campaigns_ask_what_is_stated(name: str) -> None:
             assert stated.applies_to(name)
 
 
-def test_a_campaign_may_restate_of_whom_and_how_surely(tmp_path: Path) -> None:
+def test_a_campaign_may_change_population_and_confidence(tmp_path: Path) -> None:
     path = write_campaign(
         tmp_path, requirement='[[requirements]]\nid = "DIMES-VEL"\npopulation = "valid and clear"\nprobability = 0.9\n'
     )
@@ -64,7 +60,7 @@ def test_a_campaign_may_restate_of_whom_and_how_surely(tmp_path: Path) -> None:
     ("entry", "said"),
     [('id = "DIMES-VEE"', "did you mean 'DIMES-VEL'"), ('id = "DIMES-VEL"\nbound = 9.0', "requirements[0].bound")],
 )
-def test_what_is_wrong_with_a_name_is_said(tmp_path: Path, entry: str, said: str) -> None:
+def test_unknown_requirement_names_are_reported(tmp_path: Path, entry: str, said: str) -> None:
     path = write_campaign(tmp_path, requirement=f"[[requirements]]\n{entry}\n")
     with pytest.raises(ConfigurationError) as raised:
         load_campaign(str(path))
@@ -77,9 +73,9 @@ ONE = '[[requirements]]\nid = "A"\nmetric = "answered"\nprobability = 0.9\nconfi
 def test_requirements_apply_by_patterns(tmp_path: Path) -> None:
     path = tmp_path / "asked.toml"
     path.write_text(ONE)
-    (asked,) = applicable(read_requirements(path), "dimes-gusev")
+    (asked,) = select_applicable(read_requirements(path), "dimes-gusev")
     assert (asked["id"], "campaigns" in asked) == ("A", False)
-    assert applicable(read_requirements(path), "vtt-roll") == []
+    assert select_applicable(read_requirements(path), "vtt-roll") == []
 
 
 @pytest.mark.parametrize(
@@ -99,7 +95,7 @@ def test_a_file_that_states_no_requirements_is_refused(tmp_path: Path, text: str
     assert said in str(raised.value)
 
 
-def test_a_missing_file_is_said(tmp_path: Path) -> None:
+def test_a_missing_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="cannot be read"):
         read_requirements(tmp_path / "none.toml")
 

@@ -1,4 +1,4 @@
-"""A Dask cluster runs cases as one machine does, and is as hard to bring down."""
+"""A Dask cluster gives the rows of one machine, with the same isolation."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_cluster_gives_the_rows_of_one_machine(
 
 
 @pytest.mark.parametrize("address", ["local:0", "local:x"])
-def test_numbers_of_workers_that_are_none(
+def test_invalid_numbers_of_workers_are_refused(
     campaign_file: Callable[..., Path], tmp_path: Path, watch: Silence, address: str
 ) -> None:
     with pytest.raises(CampaignError, match="expected local:N, with N at least 1"):
@@ -60,7 +60,7 @@ def test_addresses_where_no_scheduler_answers(monkeypatch: pytest.MonkeyPatch, a
         ClusterExecutor(address)
 
 
-def test_an_address_that_is_none_does_not_hold_up_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_invalid_address_does_not_delay_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
     """A client that is left is closed where garbage is collected: at worst where the next client's loop starts."""
     monkeypatch.setattr("marsyard.campaigns.execution.cluster._REACH_S", 1)
     with pytest.raises(CampaignError, match="missing port number"):

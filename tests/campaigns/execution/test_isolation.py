@@ -24,9 +24,8 @@ import numpy as np
 import pytest
 
 from marsyard.campaigns.execution import worker_process
-from marsyard.campaigns.execution.cases import unfinished_row
-from marsyard.campaigns.execution.work import Work, WorkLimits
-from marsyard.campaigns.execution.worker_process import TaskResult, request_fresh_worker
+from marsyard.campaigns.execution.cases import make_unfinished_row
+from marsyard.campaigns.execution.worker_process import TaskResult, Work, WorkLimits, request_fresh_worker
 from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.outcomes import CRASHED, TIMED_OUT, CaseEndedError
 
@@ -97,7 +96,7 @@ def forked() -> int:
 
 
 @pytest.mark.parametrize("kind", ["thread", "pool", "fork", "session", "orphan"])
-def test_what_a_case_leaves_running_neither_holds_the_end_up_nor_outlives_it(kind: str, tmp_path: Path) -> None:
+def test_processes_left_by_a_case_neither_delay_its_end_nor_outlive_it(kind: str, tmp_path: Path) -> None:
     began = time.monotonic()
     done = run(partial(leave_running, kind, str(tmp_path)), range(3))
     assert time.monotonic() - began < GUARD_S
@@ -318,11 +317,11 @@ def test_memory_that_forked_children_share_counts_once() -> None:
 
 
 def test_long_texts_of_errors_keep_their_beginning_and_their_end() -> None:
-    row = unfinished_row(0, CRASHED, "begin" + "x" * 200_000 + "end", "first" + "y" * 200_000 + "last")
+    row = make_unfinished_row(0, CRASHED, "begin" + "x" * 200_000 + "end", "first" + "y" * 200_000 + "last")
     for column, head, tail in (("error", "begin", "end"), ("traceback", "first", "last")):
         text = str(row[column])
         assert len(text) < 8_100
         assert text.startswith(head)
         assert text.endswith(tail)
         assert "characters left out" in text
-    assert unfinished_row(0, CRASHED, "short", "")["error"] == "short"
+    assert make_unfinished_row(0, CRASHED, "short", "")["error"] == "short"

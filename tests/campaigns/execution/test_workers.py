@@ -20,9 +20,8 @@ import pytest
 
 from marsyard.algorithms.processes import used_memory
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.work import MAX_BATCH, Batches, Work, WorkLimits
-from marsyard.campaigns.execution.worker_process import StatusBoard, TaskResult, WorkerStatus
-from marsyard.campaigns.execution.workers import LocalExecutor
+from marsyard.campaigns.execution.worker_process import StatusBoard, TaskResult, Work, WorkLimits
+from marsyard.campaigns.execution.workers import MAX_BATCH, Batches, LocalExecutor
 from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CaseEndedError
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
@@ -65,7 +64,7 @@ def test_tasks_run_in_as_many_processes_as_asked_for() -> None:
         assert len({done.result for done in run(workers, process_number, range(20))}) == 2
 
 
-def test_a_task_that_lost_its_worker_by_no_fault_of_its_own_is_run_again(tmp_path: Path) -> None:
+def test_a_task_whose_worker_was_killed_is_run_again(tmp_path: Path) -> None:
     with LocalExecutor(2) as workers:
         done = list(run(workers, partial(abort_once, str(tmp_path / "marker")), range(6)))
     assert sorted(ended.item for ended in done if ended.result == ended.item) == list(range(6))
@@ -89,14 +88,14 @@ def interrupted() -> None:
             raise KeyboardInterrupt
 
 
-def test_leaving_by_an_exception_waits_for_nobody() -> None:
+def test_exit_by_an_exception_does_not_wait() -> None:
     began = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert time.monotonic() - began < 20.0
 
 
-def test_memory_of_what_is_to_do_is_flat() -> None:
+def test_memory_of_pending_items_is_constant() -> None:
     taken = 0
 
     def items() -> object:
@@ -130,7 +129,7 @@ def hurt(folder: str, item: int) -> int:
     return item
 
 
-def test_what_is_over_a_limit_is_ended_and_nothing_else(tmp_path: Path) -> None:
+def test_only_tasks_over_a_limit_are_ended(tmp_path: Path) -> None:
     limits = WorkLimits(time_s=3.0, memory_bytes=0.2e9, output_bytes=1e5)
     # With one worker the items run in their order; the first batches are small, the later ones hold several.
     with LocalExecutor(1) as workers:
@@ -169,7 +168,7 @@ def fill(item: int, kept: list[object] = []) -> int:  # noqa: B006  (kept on pur
     return item
 
 
-def test_a_leak_is_not_laid_to_the_task_that_meets_the_limit() -> None:
+def test_a_leak_is_not_attributed_to_the_task_that_reaches_the_limit() -> None:
     limits = WorkLimits(memory_bytes=0.2e9)
     with LocalExecutor(1) as workers:
         ended = list(run(workers, slow_fill, range(12), limits))
@@ -189,7 +188,7 @@ def spawn(item: int) -> int:
     return item
 
 
-def test_what_a_task_started_ends_with_it() -> None:
+def test_processes_started_by_a_task_end_with_it() -> None:
     with LocalExecutor(1) as workers:
         (done,) = run(workers, spawn, [0], WorkLimits(time_s=1.0))
         assert isinstance(done.error, CaseEndedError)
@@ -204,12 +203,12 @@ def leave(*_: object) -> None:
 
 def test_a_worker_that_cannot_begin_is_an_error_of_the_campaign(monkeypatch: pytest.MonkeyPatch) -> None:
     with LocalExecutor(1) as workers:
-        monkeypatch.setattr("marsyard.campaigns.execution.watched.run_batch", leave)
+        monkeypatch.setattr("marsyard.campaigns.execution.workers.run_batch", leave)
         with pytest.raises(CampaignError, match="worker processes die before they begin a case"):
             list(workers.run(Work(process_number, range(3))))
 
 
-def test_memory_counts_what_is_the_processs_own(tmp_path: Path) -> None:
+def test_memory_counts_private_pages(tmp_path: Path) -> None:
     size = 40_000_000
     # what earlier tests have left in this process may be released meanwhile
     gc.collect()
@@ -248,9 +247,9 @@ def test_batches_grow_to_a_second_and_shrink_to_the_end() -> None:
     assert slow.next() == []
 
 
-def test_the_board_shows_where_a_worker_stands(tmp_path: Path) -> None:
+def test_the_status_board_shows_item_and_start(tmp_path: Path) -> None:
     board = StatusBoard.create(tmp_path / "board")
-    assert board.read().item is None
-    StatusBoard(tmp_path / "board").write(WorkerStatus(2**40, 1.5))
-    assert board.read() == WorkerStatus(2**40, 1.5)
+    assert board.read()[0] is None
+    StatusBoard(tmp_path / "board").write(2**40, 1.5)
+    assert board.read() == (2**40, 1.5)
     board.close()

@@ -1,4 +1,4 @@
-"""Campaigns run to their end whatever their cases do, and give the same rows however they are run."""
+"""Campaigns finish although cases fail, and give the same rows with any executor."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CampaignFile = Callable[..., Path]
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
 
-def test_a_troubled_campaign_comes_to_its_end(
+def test_a_campaign_with_failing_cases_finishes(
     troubled: Path, campaign_file: CampaignFile, tmp_path: Path, watch: Silence
 ) -> None:
     rows = rows_of(troubled)
@@ -64,7 +64,7 @@ def test_the_table_keeps_types_and_nan(troubled: Path) -> None:
     assert frame["error"][0] == ""
 
 
-def test_the_record_says_what_was_run(troubled: Path) -> None:
+def test_the_record_describes_the_run(troubled: Path) -> None:
     stored = record.read(troubled)
     assert (stored["schema"], stored["state"], stored["exit_code"]) == (1, "finished", None)
     assert (stored["cases_finished"], stored["cases_crashed"], stored["seed"]) == (12, 3, 5)
@@ -134,7 +134,7 @@ def test_a_metric_that_no_case_has_stops_the_campaign_early(
         ("metric='answered'\npopulation='valid and rom'", "[0].population: unknown column of true and false 'rom'"),
     ],
 )
-def test_requirements_ask_for_columns_of_their_kind(campaign_file: CampaignFile, change: str, said: str) -> None:
+def test_requirements_need_columns_of_their_kind(campaign_file: CampaignFile, change: str, said: str) -> None:
     requirement = f"[[requirements]]\nid='a'\nprobability=0.9\nconfidence=0.9\n{change}"
     configuration = load_campaign(str(campaign_file(requirement=requirement))).configuration
     row = {"case": 0, "answered": True, "velocity_error_m_s": 1.0}
@@ -142,7 +142,7 @@ def test_requirements_ask_for_columns_of_their_kind(campaign_file: CampaignFile,
         check_metrics(configuration, row, Path("runs"))
 
 
-def test_requirements_may_ask_for_sums_and_for_times(campaign_file: CampaignFile) -> None:
+def test_requirements_may_name_sums_and_times(campaign_file: CampaignFile) -> None:
     asked = "metric='matching_time_s + search_time_s'\nbound=1"
     requirement = f"[[requirements]]\nid='a'\nprobability=0.9\nconfidence=0.9\n{asked}"
     configuration = load_campaign(str(campaign_file(requirement=requirement))).configuration

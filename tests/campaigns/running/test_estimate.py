@@ -1,4 +1,4 @@
-"""What a campaign would take is told from a few of its cases."""
+"""Time and disk space of a campaign are estimated from a few of its cases."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.running.estimate import estimate
+from marsyard.campaigns.running.preparation import estimate
 
 CampaignFile = Callable[..., Path]
 
 
-def test_a_trial_says_what_a_campaign_would_take(campaign_file: CampaignFile) -> None:
+def test_trial_cases_estimate_time_and_disk_space(campaign_file: CampaignFile) -> None:
     campaign = load_campaign(str(campaign_file("sleep_s = 0.05")), ["cases=1000", "retain.products=all"])
     found = estimate(campaign, jobs=2)
     assert (found.trials, found.unfinished) == (9, 0)

@@ -56,7 +56,7 @@ def rows(hostile: Path) -> list[Any]:
     return list(rows_of(hostile))
 
 
-def test_the_campaign_goes_on_and_says_why(rows: list[Any]) -> None:
+def test_the_campaign_continues_and_reports_the_reason(rows: list[Any]) -> None:
     assert len(rows) == 2 * len(DEEDS)
     for row in rows:
         reason = REASONS.get(DEEDS[row["case"] % len(DEEDS)])

@@ -69,9 +69,7 @@ def test_a_changed_file_is_noticed_by_resume_and_append(done: Path, table: Path,
     append_cases(done, 1, ExecutorConfig(1), watch)
 
 
-def test_campaigns_of_earlier_versions_go_on_and_keep_hashes_from_then_on(
-    done: Path, table: Path, watch: Silence
-) -> None:
+def test_campaigns_of_earlier_versions_resume_and_store_hashes(done: Path, table: Path, watch: Silence) -> None:
     stored = json.loads((done / "campaign.json").read_text())
     del stored["identity"]["inputs"]
     (done / "campaign.json").write_text(json.dumps(stored))

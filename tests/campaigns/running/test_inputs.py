@@ -12,8 +12,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import append_cases
-from marsyard.campaigns.running.estimate import estimate
-from marsyard.campaigns.running.inputs import plan_inputs, used_inputs
+from marsyard.campaigns.running.preparation import estimate, find_used_inputs, plan_inputs
 from marsyard.scenarios.interface import SelectsInputs
 from marsyard.scenarios.registry import scenario, scenario_names
 from tests.campaigns.fake_campaign import HEAD, Silence, rows_of, run
@@ -45,9 +44,7 @@ def test_only_inputs_that_cases_draw_are_built(selecting: Path, tmp_path: Path, 
     assert _built(tmp_path / "inputs") == {f"shared-{row['terrain']}" for row in rows_of(directory)}
 
 
-def test_what_the_cache_warns_of_while_inputs_are_prepared_becomes_a_note(
-    selecting: Path, tmp_path: Path, watch: Silence
-) -> None:
+def test_warnings_of_the_cache_while_preparing_become_notes(selecting: Path, tmp_path: Path, watch: Silence) -> None:
     run(selecting, tmp_path / "run", watch)
     assert {note for note in watch.notes if "was damaged" in note} == {
         f"input {name.removeprefix('shared-')} was damaged" for name in _built(tmp_path / "inputs")
@@ -56,7 +53,7 @@ def test_what_the_cache_warns_of_while_inputs_are_prepared_becomes_a_note(
 
 def test_a_trial_counts_the_inputs_to_be_built_and_their_size(selecting: Path, tmp_path: Path) -> None:
     campaign = load_campaign(str(selecting))
-    drawn = len(used_inputs(campaign, range(3)))
+    drawn = len(find_used_inputs(campaign, range(3)))
     found = estimate(campaign, jobs=1)
     assert (found.inputs, found.inputs_bytes) == (drawn, drawn * 1e6)
     assert found.input_s > 0.0
@@ -96,9 +93,9 @@ def test_a_scenario_that_states_nothing_has_all_of_its_inputs_built(
 
 def test_eight_descents_over_gusev_need_eight_terrains() -> None:
     campaign = load_campaign("dimes-gusev", [], 8)
-    assert len(used_inputs(campaign, range(8))) == 8
+    assert len(find_used_inputs(campaign, range(8))) == 8
     parameters: list[Any] = [campaign.parameters(case) for case in range(8)]
-    assert {one.place.terrain for one in parameters} == set(used_inputs(campaign, range(8)))
+    assert {one.place.terrain for one in parameters} == set(find_used_inputs(campaign, range(8)))
 
 
 @pytest.mark.parametrize("name", ["hda-hazardous", "vtt-montecarlo", "vtt-accuracy", "dimes-fieldtest", "dimes-smoke"])
@@ -106,7 +103,7 @@ def test_cases_use_terrains_of_their_campaign(name: str) -> None:
     campaign = load_campaign(name)
     every = campaign.scenario.shared_inputs(campaign.base_parameters())
     assert isinstance(campaign.scenario, SelectsInputs)
-    used = used_inputs(campaign, range(3))
+    used = find_used_inputs(campaign, range(3))
     assert set(used) <= set(every)
     assert not every or used
     assert all(campaign.scenario.missing_bytes(campaign.base_parameters(), one) >= 0 for one in used)

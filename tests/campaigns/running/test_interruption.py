@@ -1,4 +1,4 @@
-"""Whatever ends a runner, and whatever its cases do, nothing is lost and no other case is touched."""
+"""Interrupted and killed runners, and hostile cases, lose no rows and affect no other case."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_an_interrupted_campaign_keeps_its_rows(campaign_file: CampaignFile, tmp
     assert all(map(_gone, workers))
 
 
-def test_workers_go_with_a_killed_parent(campaign_file: CampaignFile, tmp_path: Path) -> None:
+def test_workers_end_with_a_killed_parent(campaign_file: CampaignFile, tmp_path: Path) -> None:
     process = _started(campaign_file(dispersions=""), tmp_path / "run")
     workers = _children(process)
     os.kill(process.pid, signal.SIGKILL)
@@ -105,7 +105,7 @@ def _marked(mark: str) -> list[int]:
         (signal.SIGKILL, "stopping_cases = [0, 1, 2, 3, 4, 5]"),
     ],
 )
-def test_whatever_ends_the_runner_nothing_of_its_cases_is_left(
+def test_no_process_outlives_a_killed_or_interrupted_runner(
     campaign_file: CampaignFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: int, also: str
 ) -> None:
     """Neither processes in sessions of their own that hold the worker's files, nor temporary files.
@@ -171,7 +171,7 @@ def test_a_case_that_changes_its_process_is_named_and_changes_no_other(
         assert row["case"] in (3, 5, 6) or differing_columns(row, other) == ()
 
 
-def test_hostile_cases_come_to_the_right_outcomes_and_touch_no_other(
+def test_hostile_cases_have_the_right_outcomes_and_affect_no_other(
     troubled: Path, campaign_file: CampaignFile, tmp_path: Path, watch: Silence
 ) -> None:
     hostile = {

@@ -1,4 +1,4 @@
-"""Cases are written for others to answer, and their answers are scored as a run's own."""
+"""Exported cases are answered elsewhere, and the answers are scored as in a run."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_truth_stays_in_its_own_folder(exported: Exported) -> None:
         )
 
 
-def test_an_export_goes_on_and_is_not_mixed_with_another(exported: Exported) -> None:
+def test_an_export_resumes_and_is_not_mixed_with_another(exported: Exported) -> None:
     times = {path: path.stat().st_mtime_ns for path in (exported.directory / "cases").rglob("*")}
     export_campaign(campaign(exported), exported, ExecutorConfig(1), Silence())
     assert {path: path.stat().st_mtime_ns for path in times} == times

@@ -1,4 +1,4 @@
-"""A case run again is held against its stored row."""
+"""A replayed case is compared with its stored row."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from marsyard.campaigns.running.replay import replay
 CampaignFile = Callable[..., Path]
 
 
-def test_replay_says_what_differs(troubled: Path, tmp_path: Path) -> None:
+def test_replay_reports_differing_columns(troubled: Path, tmp_path: Path) -> None:
     troubled = shutil.copytree(troubled, tmp_path / "copy")
     frame = pd.read_parquet(troubled / "cases.parquet")
     altitudes = frame["altitude_m"].to_numpy(copy=True)

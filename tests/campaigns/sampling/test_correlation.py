@@ -13,7 +13,7 @@ from scipy import stats
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
-from marsyard.campaigns.sampling.correlation import Correlation
+from marsyard.campaigns.sampling.design import Correlation
 
 CampaignFile = Callable[..., Path]
 CASES = 4000
@@ -60,9 +60,7 @@ def rank_error(rank: float, cases: int) -> float:
 
 
 @pytest.mark.parametrize(("design", "cases"), [("random", CASES), ("latin-hypercube", CASES), ("sobol", 4096)])
-def test_ranks_correlate_as_stated_whatever_the_distributions(
-    campaign_file: CampaignFile, design: str, cases: int
-) -> None:
+def test_rank_correlation_holds_for_any_distribution(campaign_file: CampaignFile, design: str, cases: int) -> None:
     group = campaign(campaign_file, SKEWED, design, cases)
     drawn = table(group, cases)
     found = np.atleast_2d(stats.spearmanr(drawn).statistic)
@@ -156,7 +154,7 @@ def test_a_member_that_is_set_leaves_its_group(campaign_file: CampaignFile) -> N
         ({"covariance": [[1, float("nan")], [0, 1]]}, "finite number"),
     ],
 )
-def test_what_is_no_correlation(stated: dict[str, object], said: str) -> None:
+def test_invalid_correlations_are_refused(stated: dict[str, object], said: str) -> None:
     with pytest.raises(ValidationError) as caught:
         Correlation.model_validate({"parameters": ["a", "b"], **stated})
     assert said in str(caught.value)
@@ -177,7 +175,7 @@ def test_what_is_no_correlation(stated: dict[str, object], said: str) -> None:
         ("[correlations]\nx = 1", "correlations: input should be a valid tuple"),
     ],
 )
-def test_groups_that_cannot_be(campaign_file: CampaignFile, dispersions: str, said: str) -> None:
+def test_impossible_groups_are_refused(campaign_file: CampaignFile, dispersions: str, said: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         load_campaign(str(campaign_file(dispersions=dispersions)))
     assert said in str(caught.value)

@@ -1,4 +1,4 @@
-"""Designs lay cases out as they say, any case is drawn alone; a block or a dispersion more changes no others."""
+"""Sampling designs: stratification, cases drawn alone, appended blocks and added dispersions."""
 
 from __future__ import annotations
 
@@ -118,7 +118,9 @@ def test_any_case_is_drawn_alone(campaign_file: CampaignFile, kind: str, nominal
 @pytest.mark.parametrize("kind", ["random", "latin-hypercube", "sobol"])
 @given(name=st.sampled_from(["wind.east_m_s", "heights_m.0", "lowest_altitude_m"]), case=st.integers(0, 63))
 @settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_dispersion_more_changes_no_other_draw(campaign_file: CampaignFile, kind: str, name: str, case: int) -> None:
+def test_an_added_dispersion_changes_no_other_draw(
+    campaign_file: CampaignFile, kind: str, name: str, case: int
+) -> None:
     """Wherever it stands in the file; of a Sobol design's dimensions only if it stands behind the others."""
     others = DISPERSIONS.replace('"wind.east_m_s" = {distribution = "uniform", low = 0, high = 1}', "")
     one = f'"{name}" = {{distribution = "uniform", low = 0, high = 1}}\n'
@@ -133,7 +135,7 @@ def test_a_dispersion_more_changes_no_other_draw(campaign_file: CampaignFile, ki
 
 
 @pytest.mark.parametrize("kind", ["random", "latin-hypercube", "sobol"])
-def test_a_block_more_leaves_the_cases_that_are_there(campaign_file: CampaignFile, kind: str) -> None:
+def test_an_appended_block_keeps_the_earlier_cases(campaign_file: CampaignFile, kind: str) -> None:
     before = load(campaign_file, kind, 33, nominal=True)
     after = load(campaign_file, kind, 33, nominal=True, more="appended = [16, 8]")
     assert after.configuration.total_cases == 57
@@ -190,7 +192,7 @@ def test_the_nominal_case_draws_nothing(campaign_file: CampaignFile) -> None:
         ("halton", 8, {}, "design.kind: input should be 'random', 'latin-hypercube' or 'sobol', got 'halton'"),
     ],
 )
-def test_designs_that_cannot_be(
+def test_impossible_designs_are_refused(
     campaign_file: CampaignFile, kind: str, cases: int, more: dict[str, object], said: str
 ) -> None:
     with pytest.raises(ConfigurationError) as caught:

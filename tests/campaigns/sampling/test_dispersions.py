@@ -15,9 +15,8 @@ from pydantic import TypeAdapter, ValidationError
 from scipy import stats
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.sampling.dispersion import TAIL, Dispersion
+from marsyard.campaigns.sampling.dispersion import TAIL, Dispersion, scipy_distributions, scipy_parameters
 from marsyard.campaigns.sampling.dispersions import AnyDispersion
-from marsyard.campaigns.sampling.shapes import scipy_distributions, scipy_parameters
 from marsyard.sim.streams import Streams
 
 CampaignFile = Callable[..., Path]
@@ -157,7 +156,12 @@ def test_numbers_may_depend_on_drawn_ones(campaign_file: CampaignFile) -> None:
     assert stats.kstest(values["heights_m.1"], stats.gamma(3, scale=3).cdf).pvalue > LEAST_P
     # what is set on the command line is what the formulas see
     fixed = load_campaign(str(campaign_file("shared = 4", dispersions=text)), ["terrain=2"])
-    assert fixed.configuration.dispersions["altitude_m"].given({"terrain": 2}).describe().startswith("normal(mean=1700")
+    assert (
+        fixed.configuration.dispersions["altitude_m"]
+        .insert_values({"terrain": 2})
+        .describe()
+        .startswith("normal(mean=1700")
+    )
 
 
 def test_truncation_far_out_keeps_its_digits() -> None:

@@ -73,7 +73,7 @@ def test_names_are_paths() -> None:
         "[" * 200 + "1" + "]" * 200,
     ],
 )
-def test_what_is_no_arithmetic_is_refused(text: str) -> None:
+def test_other_syntax_than_arithmetic_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r"is neither a number nor a formula|has at most"):
         formula(text)
 
@@ -90,13 +90,13 @@ def test_what_is_no_arithmetic_is_refused(text: str) -> None:
         ("on + 1", "uses on, which is True and not a number"),
     ],
 )
-def test_formulas_without_a_value_say_where(text: str, said: str) -> None:
+def test_formulas_without_a_value_report_their_numbers(text: str, said: str) -> None:
     with pytest.raises(ValueError, match=re.escape(said)):
         formula(text).value(VALUES)
 
 
 @given(text=st.text(max_size=40) | st.text("ab.[]()+-*/0123456789e ,", max_size=40))
-def test_no_text_does_anything_else_than_be_read_or_refused(text: str) -> None:
+def test_any_text_is_parsed_or_refused(text: str) -> None:
     try:
         read = formula(text)
         value = read.value(dict.fromkeys(read.names, 1.5))
@@ -110,7 +110,7 @@ def test_no_text_does_anything_else_than_be_read_or_refused(text: str) -> None:
     lambda inner: st.builds("({} {} {})".format, inner, st.sampled_from("+-*"), inner) | inner.map("(-{})".format),
     max_leaves=8,
 ))  # fmt: skip
-def test_formulas_are_worked_out_as_python_does(text: str) -> None:
+def test_formulas_evaluate_as_in_python(text: str) -> None:
     if len(text) > MAX_LENGTH:
         return
     there = type("Table", (), {"b": -0.75})

@@ -1,4 +1,4 @@
-"""Products are kept of the cases that were asked for, and of the one that is shown."""
+"""Products are kept of the configured cases and of the showcase."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.products import load_products
-from marsyard.campaigns.store.retention import fails
+from marsyard.campaigns.store.products import fails, load_products
 from marsyard.campaigns.store.rows import RowStore, create_store
-from marsyard.campaigns.store.table import showcase_case, worst_cases, write_table
+from marsyard.campaigns.store.table import find_showcase, find_worst_cases, write_table
 from tests.campaigns.fake_campaign import Silence, rows_of, run
 
 CampaignFile = Callable[..., Path]
@@ -26,7 +25,7 @@ CampaignFile = Callable[..., Path]
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
 
-def test_the_worst_answered_case_is_kept_for_show(troubled: Path) -> None:
+def test_the_worst_answered_case_is_the_showcase(troubled: Path) -> None:
     rows = rows_of(troubled)
     worst = max((row for row in rows if row["answered"]), key=lambda row: row["velocity_error_m_s"])["case"]
     assert record.read(troubled)["showcase"] == worst
@@ -39,7 +38,7 @@ def test_the_worst_answered_case_is_kept_for_show(troubled: Path) -> None:
     assert products["title"] == "a"
 
 
-def test_which_case_is_shown(campaign_file: CampaignFile, tmp_path: Path) -> None:
+def test_showcase_case(campaign_file: CampaignFile, tmp_path: Path) -> None:
     rows: list[dict[str, Any]] = [
         {"case": 0, "outcome": "CRASHED", "answered": False},
         {"case": 1, "outcome": "SILENT", "answered": False, "velocity_error_m_s": math.nan},
@@ -55,18 +54,18 @@ def test_which_case_is_shown(campaign_file: CampaignFile, tmp_path: Path) -> Non
         first = load_campaign(str(campaign_file()), ["retain.showcase=first"]).configuration
         none = load_campaign(str(campaign_file()), ["retain.showcase=none"]).configuration
         unasked = load_campaign(str(campaign_file(requirement=""))).configuration
-        assert showcase_case(worst, table, store) is None
+        assert find_showcase(worst, table, store) is None
         store.add(rows[1:2])
         write_table(table, store)
-        assert showcase_case(worst, table, store) == 1
+        assert find_showcase(worst, table, store) == 1
         store.add(rows[2:])
         write_table(table, store)
-        assert [showcase_case(asked, table, store) for asked in (worst, first, none, unasked)] == [3, 1, None, 1]
-    assert [worst_cases(asked, table) for asked in (worst, unasked)] == [[3, 2], []]
+        assert [find_showcase(asked, table, store) for asked in (worst, first, none, unasked)] == [3, 1, None, 1]
+    assert [find_worst_cases(asked, table, asked.retain.worst) for asked in (worst, unasked)] == [[3, 2], []]
     # a requirement on a sum of columns, which are times, makes no case the worst
     summed = 'id = "T"\nmetric = "a_time_s + b_time_s"\nbound = 2.0\nprobability = 0.9\nconfidence = 0.9\n'
     times = load_campaign(str(campaign_file(requirement=f"[[requirements]]\n{summed}"))).configuration
-    assert worst_cases(times, table) == []
+    assert find_worst_cases(times, table, 2) == []
 
 
 def test_products_that_cannot_be_kept_stop_nothing(campaign_file: CampaignFile, tmp_path: Path, watch: Silence) -> None:
@@ -85,7 +84,7 @@ def test_products_that_cannot_be_kept_stop_nothing(campaign_file: CampaignFile, 
         (["retain.products=all", "retain.budget_gb=1e-6"], [0]),
     ],
 )
-def test_products_are_kept_as_asked(
+def test_products_are_kept_as_configured(
     campaign_file: CampaignFile, tmp_path: Path, watch: Silence, kept: list[str], cases: list[int] | None
 ) -> None:
     path = campaign_file("silent_cases = [1]\nraising_cases = [2]")

@@ -80,7 +80,7 @@ def test_terrains_that_differ_are_no_change() -> None:
 
 
 @pytest.mark.parametrize("rates", [True, False])
-def test_terrains_of_their_own_are_compared_whole(rates: bool) -> None:
+def test_separate_terrains_are_compared_whole(rates: bool) -> None:
     # Every night has new terrains, whose cases are much alike: cases taken as independent alarm falsely most nights.
     rng = np.random.default_rng(3)
 
@@ -96,7 +96,7 @@ def test_terrains_of_their_own_are_compared_whole(rates: bool) -> None:
     assert np.mean([difference_p(_one(a.values), _one(b.values)) < 0.05 for a, b in found[:40]]) > 0.2
 
 
-def test_nothing_can_be_said_of_next_to_nothing() -> None:
+def test_too_few_values_give_nan() -> None:
     empty, few = _sample(np.full(5, math.nan)), _sample(np.array([0.3, 1.2, 4.0]))
     assert math.isnan(difference_p(empty, few))
     assert math.isnan(difference_p(few, few))

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from marsyard.reports.statistics.clusters import ClusterMethod, clustered_evidence, terrain_index
+from marsyard.reports.statistics.clusters import ClusterMethod, clustered_evidence, number_terrains
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
 
 SIZE = 8
@@ -111,7 +111,7 @@ def test_effective_sample_size_never_exceeds_the_cases() -> None:
 def test_terrains_are_counted_without_gaps() -> None:
     for terrain in ([7, 3, 7, 5], [-2, 10**15, -2], [4]):
         numbered = np.array(terrain, dtype=np.int64)
-        np.testing.assert_array_equal(terrain_index(numbered), np.unique(numbered, return_inverse=True)[1])
+        np.testing.assert_array_equal(number_terrains(numbered), np.unique(numbered, return_inverse=True)[1])
 
 
 @pytest.mark.parametrize(("terrains", "failing", "estimated"), [(50, 10, True), (49, 10, False), (50, 9, False)])

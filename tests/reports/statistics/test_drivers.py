@@ -25,7 +25,7 @@ def test_a_straight_driver() -> None:
     assert found.p_value < 1e-9
 
 
-def test_a_valley_has_no_rank_correlation_but_a_share() -> None:
+def test_a_valley_explains_variance_without_rank_correlation() -> None:
     rng = np.random.default_rng(2)
     x = rng.uniform(-1.0, 1.0, 2000)
     found = _driver(x, x**2 + rng.normal(0.0, 0.05, 2000))
@@ -34,7 +34,7 @@ def test_a_valley_has_no_rank_correlation_but_a_share() -> None:
 
 
 @pytest.mark.parametrize("n", [60, 600])
-def test_intervals_cover_what_explains_nothing(n: int) -> None:
+def test_intervals_of_an_unrelated_condition_contain_zero(n: int) -> None:
     # 200 samples: one standard deviation of a coverage of 90 % is 2.1 %, of 95 % 1.5 %.
     rng = np.random.default_rng(3)
     found = [_driver(rng.normal(size=n), rng.exponential(size=n)) for _ in range(200)]
@@ -67,7 +67,7 @@ def test_two_kinds() -> None:
     assert found.p_value < 1e-4
 
 
-def test_what_does_not_vary_drives_nothing() -> None:
+def test_constants_have_no_effect() -> None:
     assert driver(np.ones(50), np.arange(50.0), None, 0.9) is None
     assert driver(np.arange(19.0), np.arange(19.0), None, 0.9) is None
 

@@ -43,7 +43,7 @@ def test_the_interval_of_a_paired_mean_covers_it_on_shared_terrains() -> None:
     assert np.mean((found[:, 1] <= 0.3) & (found[:, 2] >= 0.3)) >= 0.9 - 3 * 0.021
 
 
-def test_no_pairs_say_nothing() -> None:
+def test_no_pairs_give_nan() -> None:
     assert all(math.isnan(one) for one in compare_errors(np.zeros(0), None, 0.9))
     mean, lower, upper, p = compare_errors(np.zeros(1), None, 0.9)
     assert (mean, p) == (0.0, 1.0)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from marsyard.reports.statistics.plane import ErrorEllipse, circular_error, error_ellipse
+from marsyard.reports.statistics.samples import ErrorEllipse, circular_error, error_ellipse
 
 
 def _turned(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -40,7 +40,7 @@ def test_the_next_error_lies_inside_as_often_as_stated() -> None:
     assert inside / 4000 == pytest.approx(0.95, abs=3 * 0.0034)
 
 
-def test_ellipse_of_next_to_nothing() -> None:
+def test_too_few_points_have_no_ellipse() -> None:
     assert error_ellipse(np.ones((4, 2)), 0.95) is None
     assert error_ellipse(np.ones((50, 2)), 0.95) is None
     line = error_ellipse(np.column_stack([np.arange(50.0), np.zeros(50)]), 0.95)

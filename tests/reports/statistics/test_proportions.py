@@ -123,7 +123,7 @@ def test_negative_failures_are_refused() -> None:
         minimum_sample_size(0.9, 0.9, -1)
 
 
-def test_further_cases() -> None:
+def test_additional_cases_needed() -> None:
     assert further_cases_needed(24, 0, 0.99, 0.9) == 230 - 24
     assert further_cases_needed(24, 1, 0.99, 0.9) == 388 - 24
     assert further_cases_needed(500, 0, 0.99, 0.9) == 0

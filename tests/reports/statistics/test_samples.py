@@ -56,7 +56,7 @@ def test_summary_of_known_values() -> None:
 
 
 @pytest.mark.parametrize("sample", [[], [math.nan], [2.0]])
-def test_summary_of_next_to_nothing(sample: list[float]) -> None:
+def test_summary_of_too_few_values(sample: list[float]) -> None:
     summary = summarize(np.array(sample, dtype=np.float64))
     assert summary.n == (sample == [2.0])
     assert math.isnan(summary.sd)

@@ -26,7 +26,7 @@ def test_the_whole_risk_is_spent_and_no_more(cases: int) -> None:
     assert looks[-1].cases == cases
 
 
-def test_share_of_a_judgement() -> None:
+def test_spent_fraction_of_a_look() -> None:
     looks = planned_looks(64)
     assert [spent_fraction(looks, cases) for cases in (1, 16, 17, 64, 900)] == [0.25, 0.25, 0.25, 0.5, 0.5]
     assert confidence_at(0.9, 0.25) == pytest.approx(0.975)
@@ -60,7 +60,7 @@ def test_false_verdicts_are_no_more_than_the_confidence_leaves(asked: float) -> 
         assert 0.0 < decided <= risk
 
 
-def test_peeking_without_a_share_passes_falsely() -> None:
+def test_repeated_looks_without_spending_pass_falsely() -> None:
     # The reason for all this: judged at full risk at every look, a rate just below the one asked passes far too often.
     rng = np.random.default_rng(4)
     looks = planned_looks(1000)
@@ -124,7 +124,7 @@ def test_a_look_at_any_time_keeps_the_risk_exactly(first: int, rate: float, conf
 
 
 @given(st.integers(0, 400), st.integers(0, 5), st.sampled_from([0.5, 0.9, 0.99]))
-def test_the_cases_that_are_advised_are_the_fewest_that_pass(first: int, failures: int, asked: float) -> None:
+def test_the_advised_number_of_cases_is_the_minimum(first: int, failures: int, asked: float) -> None:
     look = LaterLook(1.0 - asked, 0.1, first)
     needed = look.cases_needed(max(first, failures), failures)
 

@@ -62,7 +62,7 @@ def test_a_quantile_takes_as_many_terrains_as_independent_values() -> None:
         assert math.isfinite(quantile_bounds(groups.astype(np.float64), 0.95, 0.95, groups)[1]) is bounded
 
 
-def test_values_that_go_together_are_worth_one() -> None:
+def test_identical_values_of_a_terrain_count_once() -> None:
     # A terrain's value ten times over tells as much as once.
     values = np.random.default_rng(3).normal(size=100)
     groups = np.repeat(np.arange(100), 10)
@@ -77,13 +77,13 @@ def test_terrains_of_one_value_each_change_nothing() -> None:
     assert summarize(values, groups=np.arange(40)) == summarize(values)
 
 
-def test_few_terrains_say_nothing_of_the_mean() -> None:
+def test_few_terrains_give_no_interval() -> None:
     values, groups = np.random.default_rng(5).normal(size=40), np.repeat(np.arange(FEWEST_TERRAINS - 1), 10)
     assert all(math.isnan(bound) for bound in mean_interval(values, 0.9, groups))
     assert all(math.isnan(bound) for bound in spread_interval(values, 0.9, groups))
 
 
-def test_missing_values_take_their_terrains_along() -> None:
+def test_missing_values_are_removed_with_their_terrains() -> None:
     values, groups = np.random.default_rng(6).normal(size=60), np.repeat(np.arange(20), 3)
     with_gaps = np.concatenate([[math.nan], values, [math.inf]])
     summary = summarize(with_gaps, groups=np.concatenate([[7], groups, [99]]))

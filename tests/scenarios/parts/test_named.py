@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, problems_of
-from marsyard.campaigns.definition.identity import custom_sources, selected_parts
+from marsyard.campaigns.definition.identity import custom_sources, list_parts
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.parts import named
 from marsyard.scenarios.parts.motions import CustomMotion
@@ -173,7 +173,7 @@ def test_the_identity_covers_the_modules_of_parts() -> None:
             },
         }
     )
-    assert selected_parts(configuration) == (
+    assert list_parts(configuration) == (
         "custom_parts:Glider",
         "mine.scores:energy",
         "other:Falling",

@@ -1,4 +1,4 @@
-"""A finished campaign is added to and run again in part, and only by the program that ran it, unless told."""
+"""Cases are appended to a finished campaign, or run again; a changed program needs permission."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.campaigns.definition.identity import package_versions
+from marsyard.campaigns.definition.identity import read_versions
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import append_cases, resume_campaign
@@ -27,7 +27,7 @@ def done(campaign_file: CampaignFile, tmp_path: Path, watch: Silence) -> Path:
     return run(campaign_file("raising_cases = [2]"), tmp_path / "done", watch, "cases=4", jobs=1)
 
 
-def test_cases_are_added_behind_those_there_are(
+def test_appended_cases_follow_the_existing_ones(
     done: Path, campaign_file: CampaignFile, tmp_path: Path, watch: Silence
 ) -> None:
     before = [str(row) for row in rows_of(done)]
@@ -72,9 +72,9 @@ def test_crashed_cases_are_run_again_on_request(done: Path, watch: Silence) -> N
     assert [case for case in times if again[case] != times[case]] == [2]
 
 
-def test_other_programs_do_not_go_on_unasked(done: Path, watch: Silence, monkeypatch: pytest.MonkeyPatch) -> None:
-    real = package_versions()
-    monkeypatch.setattr("marsyard.campaigns.definition.identity.package_versions", lambda: {**real, "numpy": "0.9"})
+def test_changed_programs_resume_only_if_allowed(done: Path, watch: Silence, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = read_versions()
+    monkeypatch.setattr("marsyard.campaigns.definition.identity.read_versions", lambda: {**real, "numpy": "0.9"})
     before = {path: path.read_bytes() for path in done.glob("c*.*")}
     said = rf"Changed:\n  numpy \({np.__version__}, now 0.9\)\nTo continue nevertheless.*--allow-changed"
     acts: tuple[Callable[[], None], ...] = (
@@ -94,7 +94,7 @@ def test_other_programs_do_not_go_on_unasked(done: Path, watch: Silence, monkeyp
     assert record.read(done)["identity"]["versions"]["numpy"] == "0.9"
 
 
-def test_a_changed_configuration_is_no_longer_the_campaigns(done: Path, watch: Silence) -> None:
+def test_a_changed_configuration_is_refused(done: Path, watch: Silence) -> None:
     text = (done / "campaign.json").read_text()
     (done / "campaign.json").write_text(text.replace('"altitude_m": 2000.0', '"altitude_m": 2001.0'))
     with pytest.raises(CampaignError, match="configuration \\("):
