@@ -9,8 +9,8 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 from marsyard.algorithms.exchange import ProgramDetails
 from marsyard.algorithms.faults import AlgorithmError, Fault, describe_error
@@ -86,26 +86,14 @@ def answer_time_s(answer: object, taken_s: float) -> float:
     return details.time_s if isinstance(details, ProgramDetails) else taken_s
 
 
-@dataclass(frozen=True)
-class Judged:
-    """Scored result of one algorithm; see `CaseResult`."""
-
-    outcome: str
-    answered: bool
-    row: Mapping[str, Scalar]
-    products: Mapping[str, Any] = field(default_factory=dict)
-    failure: Failure | None = None
+#: Scored result of one algorithm.
+Judged = CaseResult
 
 
 def case_result(
-    algorithms: Sequence[str], judge: Callable[[str], Judged], conditions: Mapping[str, Scalar]
+    algorithms: Sequence[str], judge: Callable[[str], CaseResult], conditions: Mapping[str, Scalar]
 ) -> CaseResult:
-    """Run all algorithms, the first under test, and combine their results; record the conditions before.
-
-    - algorithms: names of the algorithms
-    - judge: runs one of them and scores its answer
-    - conditions: columns that do not depend on any algorithm
-    """
+    """Record the conditions, run and score each algorithm by `judge`, the first under test, and combine the results."""
     record_conditions(conditions)
     names = labels(algorithms)
     first, *others = [judge(spec) for spec in algorithms]
@@ -114,6 +102,4 @@ def case_result(
         own: dict[str, Scalar] = {"outcome": other.outcome, "answered": other.answered, **other.row}
         own["error"] = "" if other.failure is None else other.failure.error
         row |= {f"{name}.{column}": value for column, value in own.items()}
-    return CaseResult(
-        outcome=first.outcome, answered=first.answered, row=row, products=first.products, failure=first.failure
-    )
+    return replace(first, row=row)

@@ -9,8 +9,8 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel
 
-from marsyard.scenarios.algorithm_run import AlgorithmRun, Judged
-from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.algorithm_run import AlgorithmRun
+from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.terrain import Site, TerrainBank, TerrainParameters
 
@@ -57,12 +57,7 @@ class TerrainScenario(BaseScenario[ParametersType], ABC):
 
 def algorithm_result(
     attempt: AlgorithmRun[Any], answered: bool, row: Mapping[str, Scalar], products: Mapping[str, Any]
-) -> Judged:
+) -> CaseResult:
     """Combine an algorithm's answer or failure with its columns and products."""
-    return Judged(
-        outcome=attempt.outcome(lambda answer: str(answer.outcome.name)),
-        answered=answered,
-        row=row,
-        products=products,
-        failure=attempt.failure,
-    )
+    outcome = attempt.outcome(lambda answer: str(answer.outcome.name))
+    return CaseResult(outcome, answered, row, products, attempt.failure)

@@ -33,7 +33,7 @@ def attitude_rate_deg_s(state: State) -> float:
     return float(np.degrees(np.linalg.norm(state.body_rate_rad_s)))
 
 
-def rendered(backend: Backend, pictures: Iterable[UInt16[np.ndarray, "rows columns"]]) -> dict[str, Scalar]:
+def picture_columns(backend: Backend, pictures: Iterable[UInt16[np.ndarray, "rows columns"]]) -> dict[str, Scalar]:
     """Return the columns of pictures that a backend rendered."""
     digest = hashlib.sha256()
     for counts in pictures:

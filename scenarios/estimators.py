@@ -224,9 +224,9 @@ def algorithm_sources(spec: str) -> list[tuple[str, Path]]:
 
 def check_algorithms(task: Task[Any, Any], specs: Sequence[str]) -> None:
     """Raise ValueError where an algorithm does not exist or is named twice."""
-    for place, spec in enumerate(specs):
+    for index, spec in enumerate(specs):
         task.check(spec)
-        if spec in specs[:place]:
+        if spec in specs[:index]:
             raise ValueError(f"the algorithm '{spec}' is named twice")
 
 

@@ -26,7 +26,7 @@ from marsyard.sim.render import Objects, Scene
 from marsyard.sim.terrain import Surface
 
 #: Maximum size of a file, and maximum number of triangles.
-MOST_BYTES, MOST_FACES = 1 << 28, 1_000_000
+MAX_BYTES, MAX_FACES = 1 << 28, 1_000_000
 #: Archives, which are not read; and formats that are zip archives themselves.
 _ARCHIVES = frozenset({"zip", "bz2", "gz", "tar.gz", "tar.bz2"})
 _ZIPPED = frozenset({"3mf", "3dxml", "zae"})
@@ -36,6 +36,14 @@ _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 
 FIRST_NAME = 1 << 30
 #: Default albedo: rock, painted structure, bright target.
 _ALBEDO = {"rock": 0.15, "lander": 0.5, "landmark": 0.6}
+
+
+#: Rotations that make an axis of the file point up.
+_UPRIGHT = {
+    "x": Rotation.from_euler("y", -90.0, degrees=True),
+    "y": Rotation.from_euler("x", 90.0, degrees=True),
+    "z": Rotation.identity(),
+}
 
 
 class MeshFileError(ValueError):
@@ -67,19 +75,22 @@ class MeshParameters(UserFile):
     def standing(self, surface: Surface, near: tuple[float, float]) -> Objects:
         """Place the mesh on the ground, at its repetition nearest to a point (x, y)."""
         mesh = read_mesh(self.file)
-        corners = _upright(self.up).apply(mesh.triangles.reshape(-1, 3))
+        corners = _UPRIGHT[self.up].apply(mesh.triangles.reshape(-1, 3))
         extent = float(np.ptp(corners[:, :2], axis=0).max())
         corners = corners * (self.scale if self.size_m is None else self.size_m / extent)
         heading = Rotation.from_rotvec(np.radians(-self.heading_deg) * np.array([0.0, 0.0, 1.0]))
         corners = heading.apply(corners)
-        normals = heading.apply(_upright(self.up).apply(mesh.normals.reshape(-1, 3)))
+        normals = heading.apply(_UPRIGHT[self.up].apply(mesh.normals.reshape(-1, 3)))
         period = surface.levels[0].shape[0] * surface.spacing_m
         position = np.array([self.east_m, self.north_m])
         position = position + period * np.round((np.array(near) - position) / period)
         ground = float(surface.height(position[0], position[1]))
         corners = corners + np.array([*position, ground - self.sink_m - float(corners[:, 2].min())])
-        if self.kind != "rock":
-            normals = np.repeat(_face_normals(corners.reshape(-1, 3, 3)), 3, axis=0)
+        if self.kind != "rock":  # normals of the faces
+            first, second, third = np.moveaxis(corners.reshape(-1, 3, 3), 1, 0)
+            normals = np.cross(second - first, third - first)
+            lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+            normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0).repeat(3, axis=0)
         faces = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
         name = np.full(len(faces), FIRST_NAME, dtype=np.int32)
         return Objects.of_mesh(corners, normals, faces, name, self.albedo or _ALBEDO[self.kind])
@@ -116,8 +127,8 @@ def read_mesh(path: str) -> Mesh:
         status = check_regular(path)
     except OSError as fault:
         raise MeshFileError(f"{path}: cannot be read ({fault.strerror})") from fault
-    if status.st_size > MOST_BYTES:
-        raise MeshFileError(f"{path}: is larger than {MOST_BYTES >> 20} MiB; make the mesh coarser")
+    if status.st_size > MAX_BYTES:
+        raise MeshFileError(f"{path}: is larger than {MAX_BYTES >> 20} MiB; make the mesh coarser")
     return _read(path, status.st_mtime_ns)
 
 
@@ -126,8 +137,9 @@ def _read(path: str, _changed_ns: int) -> Mesh:
     import trimesh
 
     kind = Path(path).suffix.lower().lstrip(".")
-    if kind not in _formats():
-        raise MeshFileError(f"{path}: '.{kind}' is no format of meshes; allowed: {', '.join(_formats())}")
+    formats = sorted(set(trimesh.available_formats()) - _ARCHIVES)
+    if kind not in formats:
+        raise MeshFileError(f"{path}: '.{kind}' is no format of meshes; allowed: {', '.join(formats)}")
     _check_expanded(path, kind)
     try:
         loaded = trimesh.load(path, force="mesh", process=False)
@@ -139,8 +151,8 @@ def _read(path: str, _changed_ns: int) -> Mesh:
     triangles = np.array(getattr(loaded, "triangles", np.zeros((0, 3, 3))), dtype=np.float64)
     if len(triangles) == 0:
         raise MeshFileError(f"{path}: holds no triangle")
-    if len(triangles) > MOST_FACES:
-        raise MeshFileError(f"{path}: holds {len(triangles)} triangles; allowed: up to {MOST_FACES}")
+    if len(triangles) > MAX_FACES:
+        raise MeshFileError(f"{path}: holds {len(triangles)} triangles; allowed: up to {MAX_FACES}")
     if not np.all(np.isfinite(triangles)):
         raise MeshFileError(f"{path}: holds a corner that is not finite")
     if not np.ptp(triangles.reshape(-1, 3), axis=0).all():
@@ -149,12 +161,6 @@ def _read(path: str, _changed_ns: int) -> Mesh:
     vertices, numbers = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
     merged = trimesh.Trimesh(vertices, numbers.reshape(-1, 3), process=False)
     return Mesh(digest, triangles, np.array(merged.vertex_normals, dtype=np.float64)[np.array(merged.faces)])
-
-
-def _formats() -> list[str]:
-    import trimesh
-
-    return sorted(set(trimesh.available_formats()) - _ARCHIVES)
 
 
 def _check_expanded(path: str, kind: str) -> None:
@@ -168,8 +174,8 @@ def _check_expanded(path: str, kind: str) -> None:
             return
     except (*ARCHIVE_ERRORS, struct.error, AttributeError, RecursionError) as fault:
         raise MeshFileError(f"{path}: cannot be read as a mesh ({fault})") from fault
-    if size > MOST_BYTES:
-        raise MeshFileError(f"{path}: expands to {size} bytes; allowed: up to {MOST_BYTES >> 20} MiB")
+    if size > MAX_BYTES:
+        raise MeshFileError(f"{path}: expands to {size} bytes; allowed: up to {MAX_BYTES >> 20} MiB")
 
 
 def _accessor_bytes(contents: bytes, kind: str) -> int:
@@ -180,18 +186,3 @@ def _accessor_bytes(contents: bytes, kind: str) -> int:
     accessors = json.loads(contents).get("accessors", [])
     # a component has up to 4 bytes, an element (a matrix) up to 16 components
     return sum(4 * _COMPONENTS.get(one.get("type"), 16) * int(one.get("count", 0)) for one in accessors)
-
-
-def _upright(up: str) -> Rotation:
-    """Return the rotation that makes an axis of the file point up."""
-    return {
-        "x": Rotation.from_euler("y", -90.0, degrees=True),
-        "y": Rotation.from_euler("x", 90.0, degrees=True),
-        "z": Rotation.identity(),
-    }[up]
-
-
-def _face_normals(triangles: Float64[np.ndarray, "faces 3 3"]) -> Float64[np.ndarray, "faces 3"]:
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.asarray(np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0))

@@ -215,25 +215,17 @@ def _parse_line(header: Sequence[str], cells: Sequence[str], form: OfflineForm[A
     stated = {name: cell.strip() for name, cell in cells_by_column(header, cells).items()}
     if not stated["case"].isdecimal():
         raise ValueError(f"case is '{stated['case']}'; allowed: a whole number from 0")
-    numbers = {name: _parse_number(name, text) for name, text in stated.items() if name in form.columns[2:] and text}
+    numbers = {}
+    for name, text in ((name, text) for name, text in stated.items() if name in form.columns[2:] and text):
+        numbers[name] = value = finite_number(name, text, ", or nothing where the outcome is a failure")
+        unit, limit = next((unit, limit) for unit, limit in _MAX_MAGNITUDE.items() if name.endswith(unit))
+        if abs(value) > limit:
+            raise ValueError(f"{name} is {text}, beyond {limit:g}; is it in the unit that the name ends with ({unit})?")
     check_together((form.required, *form.optional), numbers)
-    return int(stated["case"]), form.answer(_parse_outcome(stated.get("outcome", ""), numbers, form), numbers)
-
-
-def _parse_number(name: str, text: str) -> float:
-    """Parse a finite number of plausible magnitude."""
-    value = finite_number(name, text, ", or nothing where the outcome is a failure")
-    unit, limit = next((unit, limit) for unit, limit in _MAX_MAGNITUDE.items() if name.endswith(unit))
-    if abs(value) > limit:
-        raise ValueError(f"{name} is {text}, beyond {limit:g}; is it in the unit that the name ends with ({unit})?")
-    return value
-
-
-def _parse_outcome(text: str, numbers: Mapping[str, float], form: OfflineForm[Any]) -> Enum:
-    """Parse the outcome; empty with numbers is the first one."""
-    if not text and not numbers:
+    outcome, outcomes = stated.get("outcome", ""), form.outcomes.__members__
+    if not outcome and not numbers:
         raise ValueError("neither an outcome nor numbers are given")
-    outcomes = form.outcomes.__members__
-    if text and text not in outcomes:
-        raise ValueError(f"outcome is '{text}'; allowed: {', '.join(outcomes)}")
-    return outcomes[text] if text else next(iter(outcomes.values()))
+    if outcome and outcome not in outcomes:
+        raise ValueError(f"outcome is '{outcome}'; allowed: {', '.join(outcomes)}")
+    # an empty outcome with numbers is the first one
+    return int(stated["case"]), form.answer(outcomes[outcome or next(iter(outcomes))], numbers)

@@ -8,10 +8,9 @@ from typing import Annotated, cast
 
 import numpy as np
 from jaxtyping import Float32
-from pydantic import Field
 
 from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
-from marsyard.sim.parameters import Parameters
+from marsyard.sim.parameters import Parameters, bounded
 from marsyard.sim.render import PixelRays
 from marsyard.sim.sensor import natural_fall_off
 
@@ -24,16 +23,11 @@ class Optics:
     rays: PixelRays
     fall_off: Float32[np.ndarray, "rows columns"]
 
-    @classmethod
-    def of(cls, camera: CameraModel) -> Optics:
-        """Compute the optics of a camera."""
-        return cls(camera, PixelRays.of(camera), natural_fall_off(camera))
-
 
 @lru_cache(maxsize=8)
 def camera_optics(camera: CameraModel) -> Optics:
     """Return the cached optics of a camera in the body frame."""
-    return Optics.of(camera)
+    return Optics(camera, PixelRays.of(camera), natural_fall_off(camera))
 
 
 class CalibrationParameters(Parameters):
@@ -42,22 +36,15 @@ class CalibrationParameters(Parameters):
     Assumed: those of the descent camera's calibration, in pixels and as a fraction of the focal length.
     """
 
-    focal_error: Annotated[
-        float, Field(ge=0.0, le=0.05, description="RMS relative error of the calibrated focal length")
-    ] = 0.0002
-    centre_error_px: Annotated[
-        float, Field(ge=0.0, le=50.0, description="RMS error of the calibrated image centre per axis, px")
-    ] = 0.5
+    focal_error: Annotated[float, bounded(0.0, 0.05, "RMS relative error of the calibrated focal length")] = 0.0002
+    centre_error_px: Annotated[float, bounded(0.0, 50.0, "RMS error of the calibrated image centre per axis, px")] = 0.5
     distortion_error_px: Annotated[
-        float, Field(ge=0.0, le=50.0, description="RMS error of the calibrated distortion in the picture's corners, px")
+        float, bounded(0.0, 50.0, "RMS error of the calibrated distortion in the picture's corners, px")
     ] = 0.3
 
 
-def calibrated(
-    camera: CameraModel,
-    focal_error: float,
-    centre_error_px: tuple[float, float],
-    distortion_error_px: float,
+def add_calibration_error(
+    camera: CameraModel, focal_error: float, centre_error_px: tuple[float, float], distortion_error_px: float
 ) -> CameraModel:
     """Return a camera with errors of its calibration.
 
@@ -65,18 +52,18 @@ def calibrated(
     - centre_error_px: error of the image centre, (columns, rows)
     - distortion_error_px: outward displacement of the corners
     """
-    moved = camera.magnified(1.0 + focal_error).recentred(*centre_error_px)
-    if isinstance(moved, Cahv):
-        moved = Cahvor.from_cahv(moved, r=np.zeros(3))
+    shifted = camera.magnified(1.0 + focal_error).recentred(*centre_error_px)
+    if isinstance(shifted, Cahv):
+        shifted = Cahvor.from_cahv(shifted, r=np.zeros(3))
     # R1 moves a point outwards by the cube of its angle
-    corner = float(np.hypot(0.5 * (moved.size[0] - 1), 0.5 * (moved.size[1] - 1)))
-    radial = cast(Cahvor | Cahvore, moved)
-    chi = corner / (moved.focal_lengths[0] * (1.0 + float(radial.r[0])))
-    return replace(radial, r=radial.r + np.array([0.0, distortion_error_px / moved.focal_lengths[0] / chi**3, 0.0]))
+    corner = float(np.hypot(0.5 * (shifted.size[0] - 1), 0.5 * (shifted.size[1] - 1)))
+    radial = cast(Cahvor | Cahvore, shifted)
+    chi = corner / (shifted.focal_lengths[0] * (1.0 + float(radial.r[0])))
+    return replace(radial, r=radial.r + np.array([0.0, distortion_error_px / shifted.focal_lengths[0] / chi**3, 0.0]))
 
 
 def draw_calibrated(camera: CameraModel, p: CalibrationParameters, rng: np.random.Generator) -> CameraModel:
     """Draw a calibrated camera with normally distributed errors."""
     focal, column, row, distortion = rng.standard_normal(4)
     centre = (p.centre_error_px * float(column), p.centre_error_px * float(row))
-    return calibrated(camera, p.focal_error * focal, centre, p.distortion_error_px * distortion)
+    return add_calibration_error(camera, p.focal_error * focal, centre, p.distortion_error_px * distortion)

@@ -11,7 +11,7 @@ An unusable system is left out, with one message in `problems`.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache
@@ -93,20 +93,13 @@ def _load(point: EntryPoint, others: list[System]) -> System:
     if missing:
         raise ValueError(f"it names what is not there: {', '.join(missing)}")
     for other in others:
-        shared = next(_shared_names(system, other), None)
-        if shared is not None:
-            raise ValueError(f"the system '{other.name}' already has the {shared}")
+        shared = [f"name '{system.name}'"] if system.name == other.name else []
+        for kind in ("scenarios", "campaigns", "templates"):
+            names = getattr(other, kind)
+            shared += [f"{kind.removesuffix('s')} '{name}'" for name in getattr(system, kind) if name in names]
+        if shared:
+            raise ValueError(f"the system '{other.name}' already has the {shared[0]}")
     return system
-
-
-def _shared_names(system: System, other: System) -> Iterator[str]:
-    """Yield the names that two systems share."""
-    if system.name == other.name:
-        yield f"name '{system.name}'"
-    for kind in ("scenarios", "campaigns", "templates"):
-        for name in getattr(system, kind):
-            if name in getattr(other, kind):
-                yield f"{kind.removesuffix('s')} '{name}'"
 
 
 @dataclass(frozen=True)

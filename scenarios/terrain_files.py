@@ -11,12 +11,12 @@ import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from jaxtyping import Float64
+from pydantic import AfterValidator
 
-from marsyard.sim.files import ARCHIVE_ERRORS, ArrayHeader, check_regular, npz_headers
+from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, npz_headers
 from marsyard.sim.terrain import TerrainParameters
 from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, check_holes, read_rasters
 
@@ -31,10 +31,14 @@ _METRES = ("", "m", "metre", "metres", "meter", "meters")
 _ARRAYS = {"dem": 2, "dem_gsd": 0, "ortho": 2, "ortho_gsd": 0, "ortho_valid": 2}
 
 
-def check_terrain(terrain: TerrainParameters) -> None:
-    """Raise TerrainFileError where a terrain's files are unusable."""
+def _check_terrain(terrain: TerrainParameters) -> TerrainParameters:
     if terrain.source is not None:
         check_source(terrain.source)
+    return terrain
+
+
+#: A terrain whose files are checked: raises TerrainFileError where they are unusable.
+CheckedTerrain = Annotated[TerrainParameters, AfterValidator(_check_terrain)]
 
 
 def check_source(source: RealTerrain) -> None:
@@ -86,8 +90,18 @@ def _check_npz(source: RealTerrain) -> None:
     if "ortho" in headers and "ortho_gsd" not in headers:
         raise TerrainFileError(f"{path}: has an ortho, but lacks ortho_gsd (m between its pixels)")
     for name, header in headers.items():
-        if name in _ARRAYS:
-            _check_array(path, name, header)
+        if name not in _ARRAYS:
+            continue
+        shape, dtype = header
+        limit = _MAX_POSTS if name == "dem" else _MAX_PIXELS
+        if dtype.kind not in "biuf":
+            raise TerrainFileError(f"{path}: {name} holds values of type {dtype}; allowed: real numbers")
+        if _ARRAYS[name] == 0 and np.prod(shape, dtype=np.float64) != 1:
+            raise TerrainFileError(f"{path}: {name} has the shape {shape}; one number is needed")
+        if _ARRAYS[name] == 2 and (len(shape) != 2 or min(shape) < 4 or max(shape) > limit):
+            raise TerrainFileError(
+                f"{path}: {name} has a grid of shape {shape}; two dimensions of 4 to {limit} values are needed"
+            )
     if "ortho_valid" in headers and headers["ortho_valid"][0] != headers.get("ortho", headers["ortho_valid"])[0]:
         raise TerrainFileError(f"{path}: ortho_valid has another shape than ortho")
     with np.load(path, allow_pickle=False) as file:
@@ -98,29 +112,43 @@ def _check_npz(source: RealTerrain) -> None:
     _check_values(path, read_rasters(source)[0].values, source, "mark posts without height with NaN")
 
 
-def _check_array(path: Path, name: str, header: ArrayHeader) -> None:
-    """Check the header of an archive's array before the array is expanded."""
-    shape, dtype = header
-    if dtype.kind not in "biuf":
-        raise TerrainFileError(f"{path}: {name} holds values of type {dtype}; allowed: real numbers")
-    if _ARRAYS[name] == 0:
-        if np.prod(shape, dtype=np.float64) != 1:
-            raise TerrainFileError(f"{path}: {name} has the shape {shape}; one number is needed")
-        return
-    limit = _MAX_POSTS if name == "dem" else _MAX_PIXELS
-    if len(shape) != 2 or min(shape) < 4 or max(shape) > limit:
-        raise TerrainFileError(
-            f"{path}: {name} has a grid of shape {shape}; two dimensions of 4 to {limit} values are needed"
-        )
-
-
 def _check_geotiff(path: Path, max_side: int, *, heights_of: RealTerrain | None = None) -> Any:
     """Check the header and, of a DTM, the heights; return the projection."""
     with _open(path) as file:
-        _check_grid(path, file, max_side)
+        if min(file.width, file.height) < 4:
+            raise TerrainFileError(f"{path}: has {file.width} x {file.height} values; at least 4 x 4 are needed")
+        if max(file.width, file.height) > max_side:
+            raise TerrainFileError(
+                f"{path}: has {file.width} x {file.height} values; at most {max_side} along a side are used: cut a "
+                "part out with rio clip --bounds, or make it coarser with rio warp --res"
+            )
+        cell = file.transform
+        if not (np.isfinite(cell.a) and cell.a > 0.0):
+            raise TerrainFileError(
+                f"{path}: its cells are {cell.a:g} wide; north up and east right are needed (rio warp)"
+            )
+        if cell.b or cell.d or abs(cell.a + cell.e) > 1e-6 * abs(cell.a):
+            raise TerrainFileError(
+                f"{path}: has rotated or oblong cells; square ones, north up, are needed (rio warp --res)"
+            )
         _check_projection(path, file)
-        if heights_of is not None:
-            _check_heights(path, file, heights_of)
+        if heights_of is None:
+            return file.crs
+        if file.dtypes[0] == "uint8":
+            raise TerrainFileError(f"{path}: holds 8-bit values, which are a picture's; heights in metres are needed")
+        unit = (file.units[0] or "").strip().lower()
+        if unit not in _METRES:
+            raise TerrainFileError(f"{path}: its heights are in {file.units[0]!r}; metres are needed (rio calc)")
+        if file.scales[0] != 1.0 or file.offsets[0] != 0.0:
+            raise TerrainFileError(
+                f"{path}: states scale {file.scales[0]:g} and offset {file.offsets[0]:g}; apply them with rio calc"
+            )
+        values = file.read(1, masked=True)
+        if values.dtype.kind not in "iuf":
+            raise TerrainFileError(f"{path}: holds values of type {values.dtype}; heights in metres are needed")
+        stated = "states no nodata value" if file.nodata is None else f"states nodata {file.nodata:g}"
+        advice = f"it {stated}; state the value that means no data with rio edit-info --nodata"
+        _check_values(path, values.astype(np.float64).filled(np.nan), heights_of, advice)
         return file.crs
 
 
@@ -137,23 +165,6 @@ def _open(path: Path) -> Any:
             return rasterio.open(path)
         except rasterio.errors.RasterioError as fault:
             raise TerrainFileError(f"{path}: is no GeoTIFF ({fault})") from fault
-
-
-def _check_grid(path: Path, file: Any, max_side: int) -> None:
-    if min(file.width, file.height) < 4:
-        raise TerrainFileError(f"{path}: has {file.width} x {file.height} values; at least 4 x 4 are needed")
-    if max(file.width, file.height) > max_side:
-        raise TerrainFileError(
-            f"{path}: has {file.width} x {file.height} values; at most {max_side} along a side are used: cut a part "
-            "out with rio clip --bounds, or make it coarser with rio warp --res"
-        )
-    cell = file.transform
-    if not (np.isfinite(cell.a) and cell.a > 0.0):
-        raise TerrainFileError(f"{path}: its cells are {cell.a:g} wide; north up and east right are needed (rio warp)")
-    if cell.b or cell.d or abs(cell.a + cell.e) > 1e-6 * abs(cell.a):
-        raise TerrainFileError(
-            f"{path}: has rotated or oblong cells; square ones, north up, are needed (rio warp --res)"
-        )
 
 
 def _check_projection(path: Path, file: Any) -> None:
@@ -185,24 +196,6 @@ def grid_north_deg(path: Path) -> float | None:
     with _open(path) as file:
         scale = map_scale(file)
     return None if scale is None else scale.grid_north_deg
-
-
-def _check_heights(path: Path, file: Any, source: RealTerrain) -> None:
-    if file.dtypes[0] == "uint8":
-        raise TerrainFileError(f"{path}: holds 8-bit values, which are a picture's; heights in metres are needed")
-    unit = (file.units[0] or "").strip().lower()
-    if unit not in _METRES:
-        raise TerrainFileError(f"{path}: its heights are in {file.units[0]!r}; metres are needed (rio calc)")
-    if file.scales[0] != 1.0 or file.offsets[0] != 0.0:
-        raise TerrainFileError(
-            f"{path}: states scale {file.scales[0]:g} and offset {file.offsets[0]:g}; apply them with rio calc"
-        )
-    values = file.read(1, masked=True)
-    if values.dtype.kind not in "iuf":
-        raise TerrainFileError(f"{path}: holds values of type {values.dtype}; heights in metres are needed")
-    stated = "states no nodata value" if file.nodata is None else f"states nodata {file.nodata:g}"
-    advice = f"it {stated}; state the value that means no data with rio edit-info --nodata"
-    _check_values(path, values.astype(np.float64).filled(np.nan), source, advice)
 
 
 def _check_values(path: Path, values: np.ndarray, source: RealTerrain, advice: str) -> None:
@@ -238,51 +231,35 @@ class MapScale:
 
 def map_scale(file: Any) -> MapScale | None:
     """Compute the scale of a rasterio dataset's projection in its middle; None without a known inverse."""
+    from rasterio.crs import CRS
     from rasterio.errors import RasterioError
+    from rasterio.warp import transform
 
+    cell = file.transform
+    x, y = cell.c + 0.5 * file.width * cell.a, cell.f + 0.5 * file.height * cell.e
+    # central differences of positions in body-fixed axes, which have no singularity at the poles, over a step that is
+    # large compared with rounding and small compared with the projection's curvature
+    step = max(abs(cell.a), 1.0)
+    xs, ys = [x - step, x + step, x, x], [y, y, y - step, y + step]
     try:
-        east, north, normal, radius = _derivative(file)
+        terms, unit_m = file.crs.to_dict(), float(file.crs.linear_units_factor[1])
+        body = {name: terms[name] for name in ("a", "b", "R", "ellps", "datum", "rf") if name in terms}
+        centred = CRS.from_dict({"proj": "geocent", **body, "units": "m", "no_defs": True})
+        positions = np.array(transform(file.crs, centred, xs, ys, [0.0] * 4), dtype=np.float64).T
     except (RasterioError, ValueError):
         return None
+    # ground lengths per map length along x and y
+    length = 2.0 * step * unit_m
+    east, north = (positions[1] - positions[0]) / length, (positions[3] - positions[2]) / length
     gram = np.array([[east @ east, east @ north], [east @ north, north @ north]])
     if not np.all(np.isfinite(gram)) or np.linalg.det(gram) <= 0.0:
         return None
     ground = np.sqrt(np.linalg.eigvalsh(gram))
-    return MapScale(1.0 / float(ground[1]), 1.0 / float(ground[0]), _azimuth_deg(north, normal, radius, file))
-
-
-def _derivative(
-    file: Any,
-) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]:
-    """Compute ground lengths per map length along x and y, the body's unit normal, and the distance from its axis.
-
-    Central differences of body-centred positions, which have no singularity at the poles; body-fixed axes.
-    """
-    from rasterio.crs import CRS
-    from rasterio.warp import transform
-
-    terms = file.crs.to_dict()
-    body = {name: terms[name] for name in ("a", "b", "R", "ellps", "datum", "rf") if name in terms}
-    centred = CRS.from_dict({"proj": "geocent", **body, "units": "m", "no_defs": True})
-    cell = file.transform
-    x, y = cell.c + 0.5 * file.width * cell.a, cell.f + 0.5 * file.height * cell.e
-    # large compared with rounding, small compared with the projection's curvature
-    step = max(abs(cell.a), 1.0)
-    xs, ys = [x - step, x + step, x, x], [y, y, y - step, y + step]
-    positions = np.array(transform(file.crs, centred, xs, ys, [0.0] * 4), dtype=np.float64).T
-    length = 2.0 * step * float(file.crs.linear_units_factor[1])
-    east, north = (positions[1] - positions[0]) / length, (positions[3] - positions[2]) / length
-    normal = np.cross(east, north)
-    radius = float(np.hypot(*positions.mean(axis=0)[:2]))
-    return east, north, normal / max(float(np.linalg.norm(normal)), 1e-300), radius
-
-
-def _azimuth_deg(
-    along: Float64[np.ndarray, "3"], normal: Float64[np.ndarray, "3"], radius_m: float, file: Any
-) -> float | None:
-    """Return the azimuth of a direction on the ground, clockwise from true north; None at a pole."""
-    if radius_m < _POLE_CELLS * abs(file.transform.a) * float(file.crs.linear_units_factor[1]):
-        return None
-    true_east = np.cross([0.0, 0.0, 1.0], normal)
-    true_north = np.cross(normal, true_east)
-    return float(np.degrees(np.arctan2(along @ true_east, along @ true_north)))
+    azimuth_deg = None
+    if float(np.hypot(*positions.mean(axis=0)[:2])) >= _POLE_CELLS * abs(cell.a) * unit_m:
+        normal = np.cross(east, north)
+        normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
+        true_east = np.cross([0.0, 0.0, 1.0], normal)
+        true_north = np.cross(normal, true_east)
+        azimuth_deg = float(np.degrees(np.arctan2(north @ true_east, north @ true_north)))
+    return MapScale(1.0 / float(ground[1]), 1.0 / float(ground[0]), azimuth_deg)

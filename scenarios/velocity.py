@@ -26,7 +26,7 @@ Triple = tuple[int, int, int]
 _THREE: Triple = (0, 1, 2)
 
 
-def asked(
+def run_estimator(
     make: Callable[[], VelocityEstimator], measurements: DescentMeasurements, triple: Triple | None = _THREE
 ) -> AlgorithmRun[VelocityEstimate]:
     """Run an estimator on a descent; the answer states its span.
@@ -65,23 +65,30 @@ def check_last_interval(answer: object, measurements: DescentMeasurements) -> Ve
     return estimate
 
 
+def _answers_after_pictures(
+    estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]
+) -> list[tuple[Span, Horizontal, Horizontal]]:
+    """Return span, velocity and truth after each picture, NaN without a velocity; empty for other estimators."""
+    missing = ((np.nan, np.nan), np.full(2, np.nan), np.full(2, np.nan))
+    return [
+        missing
+        if one is None or one.velocity_m_s is None or one.span_s is None
+        else (one.span_s, one.velocity_m_s, truth(one.span_s))
+        for one in (estimate.after_pictures if estimate is not None else ())
+    ]
+
+
 def stream_row(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]) -> dict[str, Scalar]:
     """Return the errors of a stream after each picture, NaN without a velocity; empty for other estimators.
 
     `answered_after` is the number of pictures before the first velocity, 0 if there is none.
     """
-    if estimate is None or not estimate.after_pictures:
+    errors = [float(np.hypot(*(velocity - true))) for _, velocity, true in _answers_after_pictures(estimate, truth)]
+    if not errors:
         return {}
-    errors = [_error_m_s(one, truth) for one in estimate.after_pictures]
     first = next((number for number, error in enumerate(errors, start=1) if not np.isnan(error)), 0)
     row: dict[str, Scalar] = {"stream_pictures": len(errors), "answered_after": first}
     return row | {f"velocity_error_after_{number}_m_s": error for number, error in enumerate(errors, start=1)}
-
-
-def _error_m_s(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]) -> float:
-    if estimate is None or estimate.velocity_m_s is None or estimate.span_s is None:
-        return float("nan")
-    return float(np.hypot(*(estimate.velocity_m_s - truth(estimate.span_s))))
 
 
 def velocity_row(name: str, estimated: Horizontal | None, true: Horizontal) -> dict[str, Scalar]:
@@ -131,18 +138,6 @@ def velocity_products(
 
 def stream_products(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]) -> dict[str, object]:
     """Return a stream's answers after each picture with the truth, NaN without an answer; empty for others."""
-    if estimate is None or not estimate.after_pictures:
-        return {}
-    missing = (np.nan, np.nan)
-    answers = [
-        (missing, missing, missing)
-        if one is None or one.velocity_m_s is None or one.span_s is None
-        else (one.span_s, one.velocity_m_s, truth(one.span_s))
-        for one in estimate.after_pictures
-    ]
-    spans, velocities, true = zip(*answers, strict=True)
-    return {
-        "after_spans_s": np.array(spans),
-        "after_velocities_m_s": np.array(velocities),
-        "after_true_m_s": np.array(true),
-    }
+    names = ("after_spans_s", "after_velocities_m_s", "after_true_m_s")
+    columns = zip(*_answers_after_pictures(estimate, truth), strict=True)
+    return {name: np.array(values) for name, values in zip(names, columns, strict=False)}

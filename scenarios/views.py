@@ -6,7 +6,7 @@ combines both into the scene for the renderer. One scene serves all pictures nea
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from types import MappingProxyType
@@ -164,34 +164,33 @@ def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Ob
         return Objects.none()
     smallest_rad, pixel_rad = smallest_rock_rad(field, eye), _pixel_of_detail_rad(field, eye)
     reach = min(farthest_m, eye.reach_m)
+    smallest_m = float(field.diameter_m.min())
+    size_class = np.floor(np.log(field.diameter_m / smallest_m) / np.log(_CLASS_RATIO) + 1e-9).astype(int)
+    arrays = ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up")
     meshes = []
-    for low, members in _size_classes(field):
+    for number in np.unique(size_class):
+        members, low = np.flatnonzero(size_class == number), smallest_m * _CLASS_RATIO ** int(number)
         # the height of the eye is part of the distance
         horizontal = np.sqrt(max((low * np.sqrt(_CLASS_RATIO) / smallest_rad) ** 2 - eye.height_m**2, 0.0))
         radius = float(min(horizontal, reach))
         selected = members[_near_sector(field, members, eye, radius)]
         if selected.size:
-            mesh = _subset(field, selected).near(
-                eye.east_m, eye.north_m, radius, above_m=eye.height_m, pixel_rad=pixel_rad
-            )
+            subset = replace(field, names={}, **{name: getattr(field, name)[selected] for name in arrays})
+            mesh = subset.near(eye.east_m, eye.north_m, radius, above_m=eye.height_m, pixel_rad=pixel_rad)
             meshes.append(replace(mesh, rock_of_face=selected[mesh.rock_of_face].astype(np.int32)))
-    return _join_visible(meshes, eye, ground.site.photometry.rock_albedo)
-
-
-def _join_visible(meshes: Sequence[RockMesh], eye: Eye, albedo: float) -> Objects:
-    """Join the triangles of meshes that lie in the eye's sector or near the eye."""
     if not meshes:
         return Objects.none()
-    seen = [_in_sector(mesh, eye) for mesh in meshes]
+    # the triangles that lie in the eye's sector or near the eye
+    visible = [_in_sector(mesh, eye) for mesh in meshes]
     vertices = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
     bodies = np.cumsum([0] + [int(mesh.body_of_face.max(initial=-1)) + 1 for mesh in meshes])
-    kept = list(zip(meshes, seen, vertices.astype(np.int32), bodies.astype(np.int32), strict=False))
+    kept = list(zip(meshes, visible, vertices.astype(np.int32), bodies.astype(np.int32), strict=False))
     return Objects.of_mesh(
         np.concatenate([mesh.vertices for mesh in meshes]),
         np.concatenate([mesh.vertex_normals for mesh in meshes]),
         np.concatenate([mesh.faces[some] + first for mesh, some, first, _ in kept]),
         np.concatenate([mesh.rock_of_face[some] for mesh, some, _, _ in kept]),
-        albedo,
+        ground.site.photometry.rock_albedo,
         np.concatenate([mesh.body_of_face[some] + first for mesh, some, _, first in kept]),
     )
 
@@ -281,19 +280,6 @@ def nadir_pose(
 
 def _above(surface: Surface, east_m: float, north_m: float, height_m: float) -> Float64[np.ndarray, "3"]:
     return np.array([east_m, north_m, float(surface.height(east_m, north_m)) + height_m])
-
-
-def _size_classes(field: RockField) -> list[tuple[float, Int64[np.ndarray, "members"]]]:
-    """Return the smallest diameter and the rocks' numbers of each size class."""
-    smallest = float(field.diameter_m.min())
-    number = np.floor(np.log(field.diameter_m / smallest) / np.log(_CLASS_RATIO) + 1e-9).astype(int)
-    return [(smallest * _CLASS_RATIO ** int(one), np.flatnonzero(number == one)) for one in np.unique(number)]
-
-
-def _subset(field: RockField, members: Int64[np.ndarray, "members"]) -> RockField:
-    """Return the field of some rocks, numbered from 0."""
-    arrays = ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up")
-    return replace(field, names={}, **{name: getattr(field, name)[members] for name in arrays})
 
 
 def _near_sector(

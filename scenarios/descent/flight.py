@@ -56,11 +56,23 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
     """
     ground = float(surface.height(p.place.east_m, p.place.north_m))
     below = np.array([p.place.east_m, p.place.north_m, ground])
+    times = faulty_times(p.faults, p.picture_times_s)
     if isinstance(p.flight, CustomMotion):
-        return _own_motion(p, p.flight, below, surface, streams)
+        place = DescentPlace(
+            ground_height=lambda east, north: float(surface.height(below[0] + east, below[1] + north) - below[2]),
+            gravity_m_s2=gravity_m_s2(p),
+            pictures_s=tuple(times),
+            from_s=-p.flight.lead_s,
+            until_s=max(times) + AFTER_S,
+            firing_height_m=p.descent.thruster_firing_m,
+        )
+        motion, row = p.flight.compute(place, below, streams.generator("own motion"))
+        check_looks_down(p.flight.motion, motion, times)
+        check_clearance(p.flight.motion, motion, times, surface)
+        return DescentFlight(motion, p.flight.lead_s, _firing_s(p, motion, surface), row)
     if p.flight is not None:
         recorded = p.flight.motion(below, gravity_m_s2(p))
-        check_clearance(p.flight.file, recorded, faulty_times(p.faults, p.picture_times_s), surface)
+        check_clearance(p.flight.file, recorded, times, surface)
         columns: dict[str, Scalar] = {"flight_file": p.flight.file, "flight_first_picture_s": p.flight.start_s}
         return DescentFlight(recorded, p.flight.lead_s, _firing_s(p, recorded, surface), columns)
     descent = SwingDescent.simulate(
@@ -71,30 +83,8 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
         gravity_m_s2=gravity_m_s2(p),
         lead_s=LEAD_S,
     )
-    row = {f"descent_{name}": value for name, value in descent.parameters.model_dump().items()}
-    return DescentFlight(descent, LEAD_S, descent.thruster_firing_s, row)
-
-
-def _own_motion(
-    p: DescentScenarioParameters,
-    flight: CustomMotion,
-    below: Float64[np.ndarray, "3"],
-    surface: Surface,
-    streams: Streams,
-) -> DescentFlight:
-    times = faulty_times(p.faults, p.picture_times_s)
-    place = DescentPlace(
-        ground_height=lambda east, north: float(surface.height(below[0] + east, below[1] + north) - below[2]),
-        gravity_m_s2=gravity_m_s2(p),
-        pictures_s=tuple(times),
-        from_s=-flight.lead_s,
-        until_s=max(times) + AFTER_S,
-        firing_height_m=p.descent.thruster_firing_m,
-    )
-    motion, row = flight.compute(place, below, streams.generator("own motion"))
-    check_looks_down(flight.motion, motion, times)
-    check_clearance(flight.motion, motion, times, surface)
-    return DescentFlight(motion, flight.lead_s, _firing_s(p, motion, surface), row)
+    columns = {f"descent_{name}": value for name, value in descent.parameters.model_dump().items()}
+    return DescentFlight(descent, LEAD_S, descent.thruster_firing_s, columns)
 
 
 def _firing_s(p: DescentScenarioParameters, motion: Trajectory, surface: Surface) -> float:
@@ -110,7 +100,7 @@ def _firing_s(p: DescentScenarioParameters, motion: Trajectory, surface: Surface
 
 
 def check_clearance(name: str, motion: Trajectory, times_s: Sequence[float], surface: Surface) -> None:
-    """Raises TrajectoryFileError where the named flight is below the ground at a picture."""
+    """Raise TrajectoryFileError where the named flight is below the ground at a picture."""
     positions = motion.motion(np.array(times_s)).positions_m
     heights = positions[:, 2] - surface.height(positions[:, 0], positions[:, 1])
     buried = np.flatnonzero(heights <= 0.0)

@@ -56,11 +56,30 @@ class Instruments:
         unit = Imu.drawn(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
         imu = approach.calibrate(unit, streams.generator("inertial unit's calibration"))
         clock = Clock.drawn(p.clock, streams.generator("image clock"))
-        own = _read_own_instruments(p, world, flight.motion, _time_tags(p, clock, streams), streams)
+        surface, motion = world.surface, flight.motion
+        # readings and columns of the user's own instruments, by parameter table
+        own: dict[str, tuple[InstrumentReadings, Mapping[str, Scalar]]] = {}
+        tags = _time_tags(p, clock, streams)
+        for table, times in (("altimeter", np.array(p.picture_times_s)), ("attitude_source", tags)):
+            instrument = getattr(p, table)
+            if isinstance(instrument, CustomAltimeter | CustomAttitudeSource):
+                truth = InstrumentTruth(
+                    times_s=times,
+                    motion=motion,
+                    ground_height=lambda x, y: float(surface.height(x, y)),
+                    nearest_ground=lambda apex, axis, half, far: first_return(surface, apex, axis, half, far),
+                )
+                readings = instrument.read(truth, streams.generator(f"own {table}"))
+                own[table] = readings, instrument.columns(table, readings.columns)
+        # inertial navigation from the last star reference, before entry, to the thrusters' firing
+        errors = approach.errors(imu, streams.generator("approach"))
+        increments = imu.increments(motion, approach.end_s, end, streams.generator("inertial noise"))
+        state = motion.state(approach.end_s)
+        attitude, velocity = errors.apply(state.attitude, state.velocity_m_s)
         return cls(
             approach=approach,
             imu=imu,
-            navigation=_propagate_navigation(p, approach, imu, flight, streams),
+            navigation=InertialSolution.propagate(increments, attitude, velocity, gravity_m_s2(p)),
             altimeter=own["altimeter"][0]
             if isinstance(p.altimeter, CustomAltimeter)
             else RadarAltimeter.drawn(p.altimeter, world.surface, streams.generator("altimeter")),
@@ -72,42 +91,6 @@ class Instruments:
 
 def _time_tags(p: DescentScenarioParameters, clock: Clock, streams: Streams) -> Float64[np.ndarray, "n"]:
     return clock.tags(np.array(p.picture_times_s), streams.generator("image time tags"))
-
-
-def _read_own_instruments(
-    p: DescentScenarioParameters,
-    world: World,
-    motion: Trajectory,
-    tags_s: Float64[np.ndarray, "n"],
-    streams: Streams,
-) -> dict[str, tuple[InstrumentReadings, Mapping[str, Scalar]]]:
-    """Readings and columns of the user's own instruments, by parameter table."""
-    surface = world.surface
-    results: dict[str, tuple[InstrumentReadings, Mapping[str, Scalar]]] = {}
-    for table, times in (("altimeter", np.array(p.picture_times_s)), ("attitude_source", tags_s)):
-        own = getattr(p, table)
-        if isinstance(own, CustomAltimeter | CustomAttitudeSource):
-            truth = InstrumentTruth(
-                times_s=times,
-                motion=motion,
-                ground_height=lambda x, y: float(surface.height(x, y)),
-                nearest_ground=lambda apex, axis, half, far: first_return(surface, apex, axis, half, far),
-            )
-            readings = own.read(truth, streams.generator(f"own {table}"))
-            results[table] = readings, own.columns(table, readings.columns)
-    return results
-
-
-def _propagate_navigation(
-    p: DescentScenarioParameters, approach: Approach, imu: Imu, flight: DescentFlight, streams: Streams
-) -> InertialSolution:
-    """Inertial navigation from the last star reference, before entry, to the thrusters' firing."""
-    start, end = approach.end_s, flight.firing_s + MARGIN_S
-    errors = approach.errors(imu, streams.generator("approach"))
-    increments = imu.increments(flight.motion, start, end, streams.generator("inertial noise"))
-    state = flight.motion.state(start)
-    attitude, velocity = errors.apply(state.attitude, state.velocity_m_s)
-    return InertialSolution.propagate(increments, attitude, velocity, gravity_m_s2(p))
 
 
 def measure(

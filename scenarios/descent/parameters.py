@@ -17,7 +17,7 @@ from marsyard.scenarios.parts.instruments import CustomAltimeter, CustomAttitude
 from marsyard.scenarios.parts.motions import CustomMotion
 from marsyard.scenarios.parts.named import default_or_custom
 from marsyard.scenarios.parts.scores import CustomScores, ScoredDescent
-from marsyard.scenarios.terrain_files import check_terrain
+from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.dynamics import SwingParameters
 from marsyard.sim.parameters import Parameters, bounded
 from marsyard.sim.render.backend import Backend, default_backend
@@ -47,7 +47,7 @@ class Place(Parameters):
     north_m: Annotated[float, Field(description="position of the first picture on the periodic terrain")] = 0.0
 
     @model_validator(mode="after")
-    def _terrain_is_in_bank(self) -> Place:
+    def _check_terrain(self) -> Place:
         if self.terrain >= self.bank:
             raise ValueError(f"terrain {self.terrain} is not in the bank; allowed: 0 to {self.bank - 1}")
         return self
@@ -134,7 +134,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     site: Annotated[str | None, Field(description="preset of terrain, light and gravity; none: a plain terrain")] = None
     terrain_site: Annotated[str | None, Field(description="site of the terrain; filled in with `site`, not set")] = None
     place: Place = Place()
-    terrain: TerrainParameters = TerrainParameters()
+    terrain: CheckedTerrain = TerrainParameters()
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="own bodies on the ground")] = ()
     sun: SunParameters = SunParameters()
     descent: SwingParameters = SwingParameters()
@@ -160,20 +160,14 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
 
     @field_validator("site")
     @classmethod
-    def _site_has_a_terrain(cls, name: str | None) -> str | None:
+    def _check_site(cls, name: str | None) -> str | None:
         if name is not None and name not in descent_sites():
             raise ValueError(f"no site for a descent is called '{name}'; allowed: {', '.join(descent_sites())}")
         return name
 
-    @field_validator("terrain")
-    @classmethod
-    def _terrain_files_can_be_used(cls, terrain: TerrainParameters) -> TerrainParameters:
-        check_terrain(terrain)
-        return terrain
-
     @model_validator(mode="before")
     @classmethod
-    def _terrain_of_the_site(cls, stated: Any) -> Any:
+    def _complete_terrain(cls, stated: Any) -> Any:
         if not isinstance(stated, Mapping) or stated.get("site") not in descent_sites():
             return stated
         changes = stated.get("terrain", {})
@@ -183,15 +177,14 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
         return {"terrain_site": stated["site"], **stated, "terrain": _merge(of_site, changes)}
 
     @model_validator(mode="after")
-    def _terrain_is_the_sites(self) -> DescentScenarioParameters:
-        """A terrain merged for one site must not be lit as another's."""
+    def _check_consistency(self) -> DescentScenarioParameters:
+        """Check terrain, binning, selected pictures and flight.
+
+        A terrain merged for one site must not be lit as another's. Pictures are binned to DIMES' size, as each case
+        reports DIMES' feasible overlap.
+        """
         if self.terrain_site != self.site:
             raise ValueError(f"site is {self.site}, but the terrain is of {self.terrain_site}; a site is not dispersed")
-        return self
-
-    @model_validator(mode="after")
-    def _pictures_can_be_binned(self) -> DescentScenarioParameters:
-        """By the detector's rows, and to DIMES' size, as each case reports DIMES' feasible overlap."""
         camera: CameraParameters | CustomCamera = self.camera if self.camera.model is None else self.camera.model
         columns, rows = camera.columns, camera.rows
         if rows % self.detector.rows_summed:
@@ -199,10 +192,6 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
                 f"detector.rows_summed {self.detector.rows_summed} does not divide the camera's {rows} rows"
             )
         check_binning(self.dimes.binned_size, (columns, rows // self.detector.rows_summed))
-        return self
-
-    @model_validator(mode="after")
-    def _three_are_among_the_pictures(self) -> DescentScenarioParameters:
         if self.triple is not None and not 1 <= self.triple[0] < self.triple[1] < self.triple[2] <= self.pictures:
             raise ValueError(f"triple is {list(self.triple)}; allowed: three in ascending order, 1 to {self.pictures}")
         if self.pictures < PICTURES:
@@ -214,10 +203,6 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
         affected = max(self.faults.repeated_picture, self.faults.black_picture)
         if affected > self.pictures:
             raise ValueError(f"a fault strikes picture {affected}, but pictures is {self.pictures}")
-        return self
-
-    @model_validator(mode="after")
-    def _flight_is_over_the_ground(self) -> DescentScenarioParameters:
         if isinstance(self.flight, FlightFile):
             self.flight.check(faulty_times(self.faults, self.picture_times_s))
         return self
@@ -244,7 +229,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
 
 
 def check_binning(binned: tuple[int, int], delivered: tuple[int, int]) -> None:
-    """Raises ValueError where DIMES cannot bin a delivered picture (columns, rows) to a size."""
+    """Raise ValueError where DIMES cannot bin a delivered picture (columns, rows) to a size."""
     if delivered[0] % binned[0] or delivered[1] % binned[1]:
         raise ValueError(
             f"dimes.binned_size {list(binned)} does not divide the delivered picture of {delivered[0]} x "

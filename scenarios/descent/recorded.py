@@ -54,7 +54,7 @@ class FlightFile(UserFile, RecordedAxes):
         return float(self.poses.times_s[0]) + self.lead_s
 
     def check(self, pictures_s: Sequence[float]) -> None:
-        """Raises ValueError where the flight does not cover the pictures, looks up, or is below the ground at one."""
+        """Raise ValueError where the flight does not cover the pictures, looks up, or is below the ground at one."""
         motion = self.motion(np.zeros(3), 0.0)
         first, last = motion.span_s
         if first > -self.lead_s + 1e-9 or last < max(pictures_s) + AFTER_S:
@@ -84,7 +84,7 @@ class FlightFile(UserFile, RecordedAxes):
 
 
 def check_looks_down(name: str, motion: RecordedMotion, pictures_s: Sequence[float]) -> None:
-    """Raises TrajectoryFileError where the camera of the named flight looks up at a picture."""
+    """Raise TrajectoryFileError where the camera of the named flight looks up at a picture."""
     for number, attitude in enumerate(motion.motion(np.array(pictures_s)).attitudes, start=1):
         axis = attitude.apply(np.array([0.0, 0.0, -1.0]))
         if axis[2] >= 0.0:

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from marsyard.scenarios.algorithm_run import Judged, case_result
+from marsyard.algorithms.dimes import DimesDetails
+from marsyard.scenarios.algorithm_run import case_result
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
-from marsyard.scenarios.conditions import rendered
+from marsyard.scenarios.conditions import picture_columns
 from marsyard.scenarios.descent.exposure import take_exposures
 from marsyard.scenarios.descent.faults import faulty_terrain
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, picture_states, true_velocity
@@ -26,7 +27,6 @@ from marsyard.scenarios.descent.score import (
     instrument_conditions,
     instrument_errors,
     landing_row,
-    pictures_of_figures,
     propagate_to_firing,
     touchdown,
 )
@@ -41,8 +41,8 @@ from marsyard.scenarios.parts.scores import ScoredDescent, scored
 from marsyard.scenarios.velocity import (
     Horizontal,
     Span,
-    asked,
     consistency_row,
+    run_estimator,
     stream_products,
     stream_row,
     velocity_products,
@@ -167,7 +167,7 @@ class Descent:
             **instrument_conditions(self.instruments),
             **instrument_errors(self.world, self.states, self.measurements),
             **self.flight.row,
-            **rendered(self.p.render.backend, self.pictures),
+            **picture_columns(self.p.render.backend, self.pictures),
         }
 
     def truth(self, span_s: Span) -> Horizontal:
@@ -175,10 +175,10 @@ class Descent:
         return true_velocity(self.flight.motion, self.states, self.measurements.tags_s, span_s)
 
 
-def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scalar]) -> Judged:
+def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scalar]) -> CaseResult:
     p, firing, measurements = descent.p, descent.at_firing, descent.measurements
     make = partial(VELOCITY.make, algorithm, p.dimes, p.executable, descent.streams.case)
-    attempt = asked(make, measurements, p.triple_indices)
+    attempt = run_estimator(make, measurements, p.triple_indices)
     estimate = attempt.answer
     velocity = None if estimate is None else estimate.velocity_m_s
     true = descent.truth((estimate and estimate.span_s) or measurements.last_interval_s)
@@ -204,6 +204,9 @@ def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scal
             touchdown_m_s=landed.with_answer,
         )
         row |= scored(p.scores, case, {*row, *shared})
-    pictures = pictures_of_figures(descent.pictures, estimate, p.triple_indices)
+    # figures show the three pictures of DIMES' input, or all of other algorithms
+    is_dimes = estimate is not None and isinstance(estimate.details, DimesDetails)
+    shown = p.triple_indices if is_dimes and p.triple_indices is not None else range(len(descent.pictures))
+    pictures = [descent.pictures[index] for index in shown]
     products = {**velocity_products(pictures, estimate, true), **stream_products(estimate, descent.truth)}
     return algorithm_result(attempt, velocity is not None, row, products)

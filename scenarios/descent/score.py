@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float64, UInt16
 
-from marsyard.algorithms.dimes import DimesDetails, DimesOptions, propagated
+from marsyard.algorithms.dimes import DimesOptions, propagated
 from marsyard.algorithms.dimes.binning import View, altitudes_at_images, bin_factors, place_camera
 from marsyard.algorithms.dimes.overlap import search_geometry, template_candidates
 from marsyard.algorithms.interface import VelocityEstimate
@@ -197,11 +197,3 @@ def feasible_overlap_row(
         for one, other in pairwise(views)
     )
     return {"room": min(first, second) > 0, "room_first_pair": first, "room_second_pair": second}
-
-
-def pictures_of_figures(
-    pictures: Pictures, estimate: VelocityEstimate | None, triple: tuple[int, int, int] | None
-) -> Pictures:
-    """Pictures in a case's figures: for DIMES the three of its input, else all."""
-    is_dimes = estimate is not None and isinstance(estimate.details, DimesDetails)
-    return [pictures[index] for index in triple] if is_dimes and triple is not None else pictures

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.scenarios.algorithm_run import Judged, case_result, run_algorithm_on_copy
 from marsyard.scenarios.base import LoadGround, TerrainScenario, algorithm_result
-from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, rendered, sun_columns
+from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, picture_columns, sun_columns
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import render_state, sunlight_ratio
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
@@ -99,7 +99,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         conditions = {
             **_conditions(p, case, measurements, ground.surface),
             **_cloud_conditions(case, taken[1].ground_m),
-            **rendered(p.backend, pictures),
+            **picture_columns(p.backend, pictures),
         }
 
         def judge(algorithm: str) -> Judged:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 
 from marsyard.algorithms.hda import Ground, Safety
@@ -38,7 +38,9 @@ class SampledMap:
     @classmethod
     def of(cls, ground: Ground, flight: Flight, truth: GroundTruth, limits_rad_m: tuple[float, float]) -> SampledMap:
         """The map at the truth's positions; `limits_rad_m`: the algorithm's own limits of slope and roughness."""
-        cells = _cells_at(ground, flight, truth)
+        away = truth.places - flight.states[0].position_m[:2]
+        local = np.asarray(away @ ground.world_from_surface.as_matrix()[:2, :2])
+        cells = np.rint(ground.elevation.cells(local)).astype(np.int64)
         shape = np.array(ground.elevation.elevation_m.shape)
         inside = np.all((cells >= 0) & (cells < shape), axis=-1) & truth.covered
         rows, columns = np.moveaxis(np.clip(cells, 0, shape - 1), -1, 0)
@@ -51,13 +53,6 @@ class SampledMap:
         known = inside & np.isfinite(slope) & np.isfinite(hazards.roughness_m[rows, columns])
         safe = known & (hazards.safety[rows, columns] == Safety.SAFE)
         return cls(known, safe, known & near[rows, columns], slope)
-
-
-def _cells_at(ground: Ground, flight: Flight, truth: GroundTruth) -> Int[np.ndarray, "rows columns 2"]:
-    """The map's cells (row, column) at the truth's positions."""
-    away = truth.places - flight.states[0].position_m[:2]
-    world_from_surface = ground.world_from_surface.as_matrix()[:2, :2]
-    return np.asarray(np.rint(ground.elevation.cells(np.asarray(away @ world_from_surface))).astype(np.int64))
 
 
 def hazard_counts(ground: Ground, at: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:

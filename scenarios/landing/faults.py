@@ -7,42 +7,31 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from pydantic import Field
 
 from marsyard.scenarios.faults import Pictures, SizedFaults, deliver
 from marsyard.scenarios.landing.helicopter import HelicopterParameters
-from marsyard.sim.parameters import NonNegative
+from marsyard.sim.parameters import bounded
 from marsyard.sim.sensor.satellite_navigation import Outage
 
 
 class Faults(SizedFaults):
     """Faults of a flight; lost pictures and receiver outages need a helicopter flight."""
 
-    black_picture: Annotated[int, Field(ge=0, le=2, description="number of the black picture, 1 or 2; 0: none")] = 0
-    repeated_picture: int = Field(default=0, ge=0, le=1, description="1: the second picture is the first again")
-    lost_rows: NonNegative = Field(
-        default=0.0, le=1.0, description="part of the second picture's rows lost, from below"
-    )
-    lost_pictures: float = Field(default=0.0, ge=0.0, le=1.0, description="part of the pictures; two always arrive")
-    laser_silent: Annotated[int, Field(ge=0, le=1, description="1: the altimeter gives no range, to the ground")] = 0
-    laser_stuck: NonNegative = Field(
-        default=0.0, le=5.0, description="excess of the stuck range over the height, as a fraction"
-    )
-    gps_outage_s: NonNegative = Field(
-        default=0.0, le=300.0, description="silence before the first picture; it lasts to the end"
-    )
-    listed_bad_pixels: NonNegative = Field(
-        default=0.0, le=0.5, description="`bad_pixels` that the camera lists and fills"
-    )
-    own_shadow_m: NonNegative = Field(
-        default=0.0, le=100.0, description="diameter of the shadow's disc; raises the sun"
-    )
+    black_picture: Annotated[int, bounded(0, 2, "number of the black picture, 1 or 2; 0: none")] = 0
+    repeated_picture: Annotated[int, bounded(0, 1, "1: the second picture is the first again")] = 0
+    lost_rows: Annotated[float, bounded(0.0, 1.0, "part of the second picture's rows lost, from below")] = 0.0
+    lost_pictures: Annotated[float, bounded(0.0, 1.0, "part of the pictures; two always arrive")] = 0.0
+    laser_silent: Annotated[int, bounded(0, 1, "1: the altimeter gives no range, to the ground")] = 0
+    laser_stuck: Annotated[float, bounded(0.0, 5.0, "excess of the stuck range over the height, as a fraction")] = 0.0
+    gps_outage_s: Annotated[float, bounded(0.0, 300.0, "silence before the first picture; it lasts to the end")] = 0.0
+    listed_bad_pixels: Annotated[float, bounded(0.0, 0.5, "`bad_pixels` that the camera lists and fills")] = 0.0
+    own_shadow_m: Annotated[float, bounded(0.0, 100.0, "diameter of the shadow's disc; raises the sun")] = 0.0
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
         """Bad pixels are filled where the camera has a list of them."""
-        share = max(self.bad_pixels, self.listed_bad_pixels)
-        listed = share == self.listed_bad_pixels
-        defects = {"dead_share": share, "hot_share": share, "listed": listed} if share else {}
+        fraction = max(self.bad_pixels, self.listed_bad_pixels)
+        listed = fraction == self.listed_bad_pixels
+        defects = {"dead_share": fraction, "hot_share": fraction, "listed": listed} if fraction else {}
         return {**super().detector_changes(), "defects": defects}
 
 
@@ -77,7 +66,7 @@ def arrived_numbers(faults: Faults, count: int, rng: np.random.Generator) -> Int
     return np.sort(rng.permutation(count)[:kept]).astype(np.int64)
 
 
-def delivered(faults: Faults, pictures: Pictures) -> list[np.ndarray]:
+def deliver_pictures(faults: Faults, pictures: Pictures) -> list[np.ndarray]:
     """The pictures as they arrive."""
     return deliver(pictures, 2 * faults.repeated_picture, faults.black_picture, faults.lost_rows)
 

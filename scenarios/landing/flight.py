@@ -1,17 +1,18 @@
-"""True states and on-board poses at the two pictures of a case."""
+"""True states and on-board poses at the two pictures of a case, and their choice on a helicopter's flight."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.landing.faults import arrived_numbers, faulty_helicopter, faulty_ranges
-from marsyard.scenarios.landing.helicopter import HelicopterParameters, Transit
-from marsyard.scenarios.landing.pair_choice import choose_pair
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.helicopter import Transit
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters, PairParameters
 from marsyard.scenarios.optics import draw_calibrated
 from marsyard.scenarios.views import nadir_pose
 from marsyard.sim.camera import CameraModel
@@ -37,14 +38,37 @@ class Flight:
 
     @classmethod
     def of(cls, p: LandingScenarioParameters, surface: Surface, streams: Streams) -> Flight:
-        """The flight of a case."""
-        if p.helicopter is not None:
-            return _helicopter_flight(p, p.helicopter, surface, streams)
-        states = true_states(p, surface, streams)
-        poses = believed_poses(p, states, streams)
-        upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
-        tilt = np.radians(p.navigation.inclinometer_deg) * streams.generator("inclinometers").standard_normal(3)
-        return cls(states, poses, Rotation.from_rotvec(tilt).apply(upright))
+        """The flight of a case: the chosen pair of a helicopter's flight, or the pair as stated."""
+        if p.helicopter is None:
+            stated = true_states(p, surface, streams)
+            upright = stated[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
+            tilt = np.radians(p.navigation.inclinometer_deg) * streams.generator("inclinometers").standard_normal(3)
+            up_body = Rotation.from_rotvec(tilt).apply(upright)
+            return cls(stated, believed_poses(p, stated, streams), up_body)
+        helicopter = faulty_helicopter(p.faults, p.helicopter)
+        ground = float(surface.height(p.place.east_m, p.place.north_m))
+        height = helicopter.transit.height_m
+        over = np.array([p.place.east_m, p.place.north_m, ground + height])
+        heading = -np.radians(p.flown.heading_deg)
+        course = np.pi / 2 - np.radians(p.flown.heading_deg + p.flown.course_deg)
+        gravity = p.preset.environment.gravity_m_s2
+        transit = Transit.flown(helicopter, over, float(course), float(heading), gravity, streams)
+        numbers = arrived_numbers(p.faults, transit.times_s.size, streams.generator("lost pictures"))
+        # the laser's ranges to the ground at all pictures, without rocks
+        states = [transit.state(number) for number in range(transit.times_s.size)]
+        axes = [np.asarray(state.attitude.apply(DOWN)) for state in states]
+        true = [
+            range_along(surface, state.position_m, axis, 5.0 * height) for state, axis in zip(states, axes, strict=True)
+        ]
+        unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
+        readings = unit.readings(transit.times_s, np.array(true), streams.generator("laser noise, transit"))
+        ranges = faulty_ranges(p.faults, readings.values, height)[numbers]
+        choice = choose_pair(
+            [transit.pose(int(n)) for n in numbers], ranges, calibrated_camera(p, streams), p.pair, height
+        )
+        first, second = int(numbers[choice.first]), int(numbers[choice.second])
+        poses = (transit.pose(first), transit.pose(second))
+        return cls((states[first], states[second]), poses, transit.up_body(first), transit)
 
     @property
     def position_error_m(self) -> Float64[np.ndarray, "3"]:
@@ -55,43 +79,6 @@ class Flight:
 def calibrated_camera(p: LandingScenarioParameters, streams: Streams) -> CameraModel:
     """The calibrated camera in the body frame: the true one with calibration errors."""
     return draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
-
-
-def _helicopter_flight(
-    p: LandingScenarioParameters, helicopter: HelicopterParameters, surface: Surface, streams: Streams
-) -> Flight:
-    """The chosen pair of a helicopter's flight."""
-    helicopter = faulty_helicopter(p.faults, helicopter)
-    ground = float(surface.height(p.place.east_m, p.place.north_m))
-    over = np.array([p.place.east_m, p.place.north_m, ground + helicopter.transit.height_m])
-    heading = -np.radians(p.flown.heading_deg)
-    course = np.pi / 2 - np.radians(p.flown.heading_deg + p.flown.course_deg)
-    gravity = p.preset.environment.gravity_m_s2
-    transit = Transit.flown(helicopter, over, float(course), float(heading), gravity, streams)
-    numbers = arrived_numbers(p.faults, transit.times_s.size, streams.generator("lost pictures"))
-    poses, height = transit.poses(), helicopter.transit.height_m
-    ranges = faulty_ranges(p.faults, _laser_ranges(p, transit, surface, streams), height)
-    choice = choose_pair(
-        [poses[number] for number in numbers], ranges[numbers], calibrated_camera(p, streams), p.pair, height
-    )
-    first, second = int(numbers[choice.first]), int(numbers[choice.second])
-    return Flight(
-        (transit.state(first), transit.state(second)),
-        (transit.pose(first), transit.pose(second)),
-        transit.up_body(first),
-        transit,
-    )
-
-
-def _laser_ranges(
-    p: LandingScenarioParameters, transit: Transit, surface: Surface, streams: Streams
-) -> Float64[np.ndarray, "pictures"]:
-    """The laser's ranges to the ground at all pictures, without rocks."""
-    states = [transit.state(number) for number in range(transit.times_s.size)]
-    longest = 5.0 * transit.parameters.transit.height_m
-    true = [range_along(surface, state.position_m, np.asarray(state.attitude.apply(DOWN)), longest) for state in states]
-    unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
-    return unit.readings(transit.times_s, np.array(true), streams.generator("laser noise, transit")).values
 
 
 def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams) -> tuple[State, State]:
@@ -128,9 +115,82 @@ def believed_poses(
     turn = np.radians(n.turn_deg) * rng.standard_normal(3)
     common = Rotation.from_rotvec(np.array([tilt[0], tilt[1], azimuth]))
     positions = (position, position + motion)
-    turns = (common, Rotation.from_rotvec(turn) * common)
+    rotations = (common, Rotation.from_rotvec(turn) * common)
     first, second = (
-        PoseMeasurement(rigid(turned * state.attitude, state.position_m + off), state.time_s)
-        for state, off, turned in zip(states, positions, turns, strict=True)
+        PoseMeasurement(rigid(rotation * state.attitude, state.position_m + offset), state.time_s)
+        for state, offset, rotation in zip(states, positions, rotations, strict=True)
     )
     return first, second
+
+
+@dataclass(frozen=True)
+class PairChoice:
+    """Numbers of the chosen pictures, their baseline across the first optical axis, and their overlap."""
+
+    first: int
+    second: int
+    baseline_m: float
+    overlap: float
+
+
+def choose_pair(
+    poses: Sequence[PoseMeasurement],
+    ranges_m: Float64[np.ndarray, "n"],
+    camera: CameraModel,
+    parameters: PairParameters,
+    height_m: float,
+) -> PairChoice:
+    """Choose the pair of the highest worth, the earliest of equal ones (landing paper, section V).
+
+    Uses on-board data: poses of the filter, ranges of the laser, the calibrated camera, over ground assumed level. The
+    commanded height replaces a missing range. Pairs with too little overlap are chosen only if there are no others.
+
+    Raises ValueError if there are fewer than two pictures.
+    """
+    if len(poses) < 2:
+        raise ValueError(f"a pair is to be chosen from {len(poses)} pictures; at least 2 are needed")
+    views = [_PictureView.of(camera, pose) for pose in poses]
+    best, best_worth = None, (False, -np.inf)
+    for i, first in enumerate(views[:-1]):
+        distance = float(ranges_m[i]) if np.isfinite(ranges_m[i]) else height_m
+        level = float(first.centre_m[2] + distance * first.axis[2])
+        own = first.footprint(level, first.centre_m)
+        for j, second in enumerate(views[i + 1 :], start=i + 1):
+            step = second.centre_m - first.centre_m
+            baseline = float(np.linalg.norm(step - (step @ first.axis) * first.axis))
+            other = second.footprint(level, first.centre_m)
+            overlap = 0.0
+            if own is not None and other is not None:
+                overlap = float(cv2.intersectConvexConvex(own, other)[0] / cv2.contourArea(own))
+            worth = overlap * min(baseline / (parameters.wanted_share * distance), 1.0)
+            if (overlap >= parameters.least_overlap, worth) > best_worth:
+                best_worth = (overlap >= parameters.least_overlap, worth)
+                best = PairChoice(i, j, baseline, overlap)
+    if best is None:
+        raise ValueError("no pair of pictures has poses that are numbers")
+    return best
+
+
+@dataclass(frozen=True)
+class _PictureView:
+    """A picture's centre of projection, optical axis, and rays of its corners, world axes."""
+
+    centre_m: Float64[np.ndarray, "3"]
+    axis: Float64[np.ndarray, "3"]
+    corners: Float64[np.ndarray, "4 3"]
+
+    @classmethod
+    def of(cls, camera: CameraModel, pose: PoseMeasurement) -> _PictureView:
+        turn = pose.world_from_body.rotation
+        columns, rows = camera.size
+        rays = camera.rays(np.array([[0.0, 0.0], [columns, 0.0], [columns, rows], [0.0, rows]]) - 0.5)[1]
+        centre = np.asarray(pose.world_from_body.apply(np.array(camera.c)))
+        return cls(centre, np.asarray(turn.apply(np.array(camera.a))), np.asarray(turn.apply(rays)))
+
+    def footprint(self, level_m: float, origin_m: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "4 2"] | None:
+        """Corners of the picture on a level plane, relative to a point; None if it looks at or above the horizon."""
+        if not np.all(self.corners[:, 2] < 0.0):
+            return None
+        reach = (level_m - self.centre_m[2]) / self.corners[:, 2]
+        corners = self.centre_m[:2] - origin_m[:2] + reach[:, None] * self.corners[:, :2]
+        return np.asarray(corners, dtype=np.float32)

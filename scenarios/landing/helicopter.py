@@ -192,10 +192,6 @@ class Transit:
         tag = float(self.tags_s[number])
         return PoseMeasurement(self.navigated.solution.pose(tag), tag)
 
-    def poses(self) -> list[PoseMeasurement]:
-        """The filter's poses at all pictures."""
-        return [self.pose(number) for number in range(self.times_s.size)]
-
     def up_body(self, number: int) -> Float64[np.ndarray, "3"]:
         """Up vector in body axes by the inclinometers' last reading before a picture."""
         readings = self.navigated.readings
@@ -217,8 +213,8 @@ class Touchdown:
     gps_m: Float64[np.ndarray, "3"]
     gps_deviation_m: Float64[np.ndarray, "3"]
     gps_solutions: int  #: number averaged
-    turns: int  #: iterations until flight and filter agreed
-    moved_m: float  #: change of the path in the last iteration
+    iterations: int  #: until flight and filter agreed
+    change_m: float  #: change of the path in the last iteration
 
 
 def horizontal_distance_m(first_m: Float64[np.ndarray, "3"], second_m: Float64[np.ndarray, "3"]) -> float:
@@ -239,12 +235,14 @@ def land(
     `ground` holds the true heights about the site, rocks included.
     """
     p, before = transit.parameters, transit.flight.path
-    altimeter = _landing_laser(p, laser, len(transit.air.gusts_m_s), laser_stuck_m, streams)
+    noise = np.hypot(laser.parameters.noise_m, laser.parameters.noise * p.guidance.flare_range_m)
+    errors_m = noise * streams.generator("laser noise, landing").standard_normal(len(transit.air.gusts_m_s))
+    altimeter = LandingLaser(laser.scale, errors_m, laser_stuck_m)
     start = float(transit.navigated.boundaries_s[-1])
     errors = _at_knots(before, transit.navigated.boundaries_s, transit.navigated.errors(before))
     held, flown, end = errors, None, None
-    turns, moved = 0, np.inf
-    while turns < MAX_ITERATIONS and moved > CONVERGED_M:
+    iterations, change_m = 0, np.inf
+    while iterations < MAX_ITERATIONS and change_m > CONVERGED_M:
         flight = landing_flight(transit.flight, p.guidance, site_m[:2], held, transit.air, ground, altimeter, end)
         path = flight.path
         end = path.span_s[1] if end is None else end
@@ -253,19 +251,12 @@ def land(
         )
         later = _at_knots(path, navigated.boundaries_s, navigated.errors(path))
         held = np.concatenate([errors, later[len(errors) :]])
-        moved = np.inf if flown is None else float(np.abs(path.rows[:, :3] - flown.rows[:, :3]).max())
-        flown, turns = path, turns + 1
+        change_m = np.inf if flown is None else float(np.abs(path.rows[:, :3] - flown.rows[:, :3]).max())
+        flown, iterations = path, iterations + 1
     time = flight.first(Phase.ON_GROUND)
     if time is None:
         return None
-    return _touchdown(transit, flight, navigated, time, turns, moved, streams)
-
-
-def _landing_laser(
-    p: HelicopterParameters, unit: RangingUnit, knots: int, stuck_m: float | None, streams: Streams
-) -> LandingLaser:
-    noise = np.hypot(unit.parameters.noise_m, unit.parameters.noise * p.guidance.flare_range_m)
-    return LandingLaser(unit.scale, noise * streams.generator("laser noise, landing").standard_normal(knots), stuck_m)
+    return _touchdown(transit, flight, navigated, time, iterations, change_m, streams)
 
 
 def _at_knots(
@@ -280,11 +271,17 @@ def _touchdown(
     flight: RotorcraftFlight,
     navigated: NavigatedPart,
     time: float,
-    turns: int,
-    moved: float,
+    iterations: int,
+    change_m: float,
     streams: Streams,
 ) -> Touchdown:
-    solutions = _solutions_at_rest(transit, flight, time, streams)
+    # the receiver's averaged solutions, with the helicopter at rest
+    p, receiver, path = transit.parameters, transit.instruments.receiver, flight.path
+    end = path.state(path.span_s[1])
+    standing = Resting(end.position_m, end.attitude, path.gravity_m_s2)
+    first = time + p.averaging_after_s
+    times = receiver.sampling.within(first, first + p.averaging_s)
+    solutions = receiver.measure(standing, times, streams.generator("receiver's noise, standing"))
     valid = np.isfinite(solutions.positions_m[:, 0])
     count = int(np.count_nonzero(valid))
     nothing = np.full(3, np.nan)
@@ -298,16 +295,6 @@ def _touchdown(
         gps_m=solutions.positions_m[valid].mean(axis=0) if count else nothing,
         gps_deviation_m=solutions.reported_m[valid].mean(axis=0) if count else nothing,
         gps_solutions=count,
-        turns=turns,
-        moved_m=moved,
+        iterations=iterations,
+        change_m=change_m,
     )
-
-
-def _solutions_at_rest(transit: Transit, flight: RotorcraftFlight, time: float, streams: Streams) -> RtkSolutions:
-    """The receiver's averaged solutions, with the helicopter at rest."""
-    p, receiver, path = transit.parameters, transit.instruments.receiver, flight.path
-    end = path.state(path.span_s[1])
-    standing = Resting(end.position_m, end.attitude, path.gravity_m_s2)
-    first = time + p.averaging_after_s
-    times = receiver.sampling.within(first, first + p.averaging_s)
-    return receiver.measure(standing, times, streams.generator("receiver's noise, standing"))

@@ -14,12 +14,11 @@ from marsyard.scenarios.descent.parameters import Place, RenderParameters, SunPa
 from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.landing.faults import Faults
 from marsyard.scenarios.landing.helicopter import HelicopterParameters
-from marsyard.scenarios.landing.pair_choice import PairParameters
 from marsyard.scenarios.landing.relief import Limits
 from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.optics import CalibrationParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredLanding
-from marsyard.scenarios.terrain_files import check_terrain
+from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.parameters import NonNegative, Parameters
 from marsyard.sim.sensor import (
@@ -68,6 +67,16 @@ class NavigationParameters(Parameters):
     inclinometer_deg: NonNegative = Field(default=0.2, le=30.0, description="of the inclinometers' roll and pitch, deg")
 
 
+class PairParameters(Parameters):
+    """The criterion: overlap times baseline, which counts up to `wanted_share` of the range.
+
+    The paper names baseline and overlap; their weighting is assumed.
+    """
+
+    wanted_share: float = Field(default=0.2, gt=0.0, le=2.0, description="maximum of baseline over range that counts")
+    least_overlap: float = Field(default=0.5, ge=0.0, le=1.0, description="of the first picture's ground in the second")
+
+
 class LanderParameters(Parameters):
     """Limits of the lander, and its shadow."""
 
@@ -93,7 +102,7 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     site: Annotated[str, Field(description="preset of terrain, light, texture and rocks")] = "heli-hazardous"
     scale: Annotated[Literal["ground", "descent"], Field(description="which of the site's terrains")] = "ground"
     terrain_of: str | None = Field(default=None, description="site of the terrain; filled in, not to be set")
-    terrain: TerrainParameters = TerrainParameters()
+    terrain: CheckedTerrain = TerrainParameters()
     place: Place = Place()
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="custom meshes on the ground")] = ()
     texture: NonNegative = Field(default=1.0, le=10.0, description="contrast of the fine texture, over the site's own")
@@ -105,8 +114,8 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     flown: PassParameters = Field(
         default=PassParameters(), description="poses at the pictures; a helicopter's flight uses the azimuths"
     )
-    navigation: NavigationParameters = Field(
-        default=NavigationParameters(), description="pose errors without helicopter"
+    navigation: Annotated[NavigationParameters, Field(description="pose errors without helicopter")] = (
+        NavigationParameters()
     )
     helicopter: HelicopterParameters | None = Field(default=None, description="flown for pictures and landing")
     pair: PairParameters = Field(default=PairParameters(), description="which two of a helicopter's pictures are used")
@@ -129,18 +138,10 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     @field_validator("camera")
     @classmethod
     def _check_camera(cls, name: str | CustomCamera) -> str | CustomCamera:
-        if isinstance(name, CustomCamera):
-            return name
         down = [known for known in PRESETS if preset(known).design.down]
-        if name not in down:
+        if not isinstance(name, CustomCamera) and name not in down:
             raise ValueError(f"no camera preset that looks down is called '{name}'; allowed: {', '.join(down)}")
         return name
-
-    @field_validator("terrain")
-    @classmethod
-    def _check_terrain_files(cls, terrain: TerrainParameters) -> TerrainParameters:
-        check_terrain(terrain)
-        return terrain
 
     @model_validator(mode="before")
     @classmethod
@@ -149,21 +150,15 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
         if not isinstance(stated, Mapping):
             return stated
         name, scale = stated.get("site", "heli-hazardous"), stated.get("scale", "ground")
-        if (
-            not isinstance(name, str)
-            or name not in sites()
-            or getattr(sites()[name], str(scale), None) is None
-            or "terrain_of" in stated
-        ):
-            return stated
         changes = stated.get("terrain", {})
-        if not isinstance(changes, Mapping):
+        known = sites().get(name) if isinstance(name, str) else None
+        if "terrain_of" in stated or getattr(known, str(scale), None) is None or not isinstance(changes, Mapping):
             return stated
         return {**stated, "terrain_of": name, "terrain": site(name).terrain(scale).changed(changes).model_dump()}
 
     @model_validator(mode="after")
-    def _check_terrain(self) -> LandingScenarioParameters:
-        """A terrain that was completed for one site must not have another's light."""
+    def _check_consistency(self) -> LandingScenarioParameters:
+        """Check terrain (one completed for a site must not have another's light), row binning, and faults."""
         if getattr(self.preset, self.scale) is None:
             raise ValueError(f"site {self.site} has no terrain at the scale '{self.scale}'")
         rows = self.optics.size[1]
@@ -173,19 +168,15 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
             )
         if self.terrain_of != self.site:
             raise ValueError(f"site is {self.site}, but the terrain is of {self.terrain_of}; a site is not dispersed")
+        for name in ("lost_pictures", "gps_outage_s"):
+            if getattr(self.faults, name) and self.helicopter is None:
+                raise ValueError(f"faults.{name} is that of a helicopter's flight; state the table helicopter")
         return self
 
     @property
     def optics(self) -> CameraModel:
         """The camera in the body frame."""
         return self.camera.camera() if isinstance(self.camera, CustomCamera) else preset(self.camera).cameras()[0]
-
-    @model_validator(mode="after")
-    def _check_faults(self) -> LandingScenarioParameters:
-        for name in ("lost_pictures", "gps_outage_s"):
-            if getattr(self.faults, name) and self.helicopter is None:
-                raise ValueError(f"faults.{name} is that of a helicopter's flight; state the table helicopter")
-        return self
 
     @property
     def height_m(self) -> float:

@@ -10,7 +10,7 @@ from jaxtyping import Float64, UInt16
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.exposure import render_state, sunlight_ratio
 from marsyard.scenarios.faults import faulty_detector
-from marsyard.scenarios.landing.faults import delivered, faulty_ranges, faulty_sun_deg
+from marsyard.scenarios.landing.faults import deliver_pictures, faulty_ranges, faulty_sun_deg
 from marsyard.scenarios.landing.flight import Flight, calibrated_camera
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.meshes import MeshParameters, add_meshes
@@ -18,7 +18,7 @@ from marsyard.scenarios.optics import Optics
 from marsyard.scenarios.views import Eye, SiteGround, site_scene
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import DetectorImage, LandingMeasurements
-from marsyard.sim.render import Frame, Scene, Sun
+from marsyard.sim.render import Frame, Sun
 from marsyard.sim.sensor import Detector, auto_expose
 from marsyard.sim.sensor.ranging import RangingUnit
 from marsyard.sim.streams import Streams
@@ -52,12 +52,6 @@ class World:
         sun = Sun(direction(np.radians(p.sun.azimuth_deg), elevation), air.sun_radius_rad)
         return cls(ground, sun, p.meshes, sunlight_ratio(air, elevation, p.detector))
 
-    def scene(self, eye: Eye, caster_diameter_m: float) -> Scene:
-        """One scene for both pictures, as detailed as the lower one needs."""
-        scene = site_scene(self.ground, eye, self.sun)
-        scene = add_meshes(scene, self.meshes, (eye.east_m, eye.north_m))
-        return replace(scene, caster_diameter_m=caster_diameter_m)
-
 
 @dataclass(frozen=True)
 class Pair:
@@ -88,30 +82,33 @@ def take_pictures(p: LandingScenarioParameters, world: World, flight: Flight, op
     )
     caster = max(p.lander.caster_diameter_m, p.faults.own_shadow_m)
     lower = min(flight.states, key=lambda state: float(state.position_m[2]))
-    scene = world.scene(Eye.of(optics.rays, lower.world_from_body, world.ground.surface), caster)
+    # one scene for both pictures, as detailed as the lower one needs
+    eye = Eye.of(optics.rays, lower.world_from_body, world.ground.surface)
+    scene = add_meshes(site_scene(world.ground, eye, world.sun), world.meshes, (eye.east_m, eye.north_m))
+    scene = replace(scene, caster_diameter_m=caster)
     noise = streams.generator("detector noise")
-    seen = [render_state(p.render.backend, scene, optics, state) for state in flight.states]
-    frames, motions = zip(*seen, strict=True)
+    rendered = [render_state(p.render.backend, scene, optics, state) for state in flight.states]
+    frames, motions = zip(*rendered, strict=True)
     light = [frame.radiance * np.float32(world.brightness) for frame in frames]
     detector = auto_expose(detector, light[0], p.exposure, streams.generator("test pictures")).detector
     counts = [detector.expose(one, noise, motion) for one, motion in zip(light, motions, strict=True)]
     camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
     first, second = (
         DetectorImage(one, state.time_s, camera, detector.calibration)
-        for one, state in zip(delivered(p.faults, counts), flight.states, strict=True)
+        for one, state in zip(deliver_pictures(p.faults, counts), flight.states, strict=True)
     )
     return Pair((first, second), (frames[0], frames[1]))
 
 
 def visible_in_both(pair: Pair, flight: Flight, points_m: Float64[np.ndarray, "n 3"], border_px: float) -> np.ndarray:
     """Whether points of the ground (world axes) lie in both pictures, at least `border_px` from their borders."""
-    seen = np.ones(len(points_m), dtype=bool)
+    visible = np.ones(len(points_m), dtype=bool)
     for image, state in zip(pair.images, flight.states, strict=True):
         pixels, ahead = image.camera.moved(state.world_from_body).project(points_m)
         with np.errstate(invalid="ignore"):
             low, high = pixels >= border_px, pixels <= np.array(image.camera.size) - 1.0 - border_px
-        seen &= ahead & np.all(low & high, axis=1)
-    return seen
+        visible &= ahead & np.all(low & high, axis=1)
+    return visible
 
 
 def measure(p: LandingScenarioParameters, flight: Flight, pair: Pair, streams: Streams) -> LandingMeasurements:

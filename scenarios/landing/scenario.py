@@ -9,12 +9,12 @@ from pydantic import BaseModel
 
 from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
-from marsyard.scenarios.algorithm_run import Judged, case_result, run_algorithm_on_copy
+from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
-from marsyard.scenarios.conditions import rendered
+from marsyard.scenarios.conditions import picture_columns
 from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.exposure import Sample, pixel_sample, summed_rows
-from marsyard.scenarios.interface import CaseResult, Scalar
+from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.pictures import KEPT_GROUNDS, measure
 from marsyard.scenarios.landing.score import (
@@ -31,7 +31,6 @@ from marsyard.scenarios.landing.truth import RenderedFlight
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredLanding, scored
 from marsyard.sim.frames import rigid
-from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
@@ -78,48 +77,41 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
             yield pixel_sample(image.counts, frame, p.detector, image.camera, about, hazard)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """One flight."""
+        """Fly one case; run each algorithm, and score its answer and the resulting landing."""
         p = self.checked(parameters)
         case = RenderedFlight.of(p, streams, self.load_ground)
-        measurements = measure(p, case.flight, case.pair, streams)
-        known = {**conditions(case, measurements), **rendered(p.render.backend, case.pair.counts)}
-        return case_result(p.algorithms, lambda algorithm: _judge(case, measurements, streams, algorithm, known), known)
+        flight, truth = case.flight, case.truth
+        measurements = measure(p, flight, case.pair, streams)
+        known = {**conditions(case, measurements), **picture_columns(p.render.backend, case.pair.counts)}
 
+        def judge(algorithm: str) -> CaseResult:
+            attempt = run_algorithm_on_copy(
+                lambda given: LANDING.make(algorithm, p.hda, p.executable, streams.case).estimate(given),
+                check_site,
+                measurements,
+            )
+            # without an answer the a-priori site is landed on
+            estimate = attempt.answer or SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world)
+            row = {
+                **({} if attempt.answer is None else outcome_row(attempt.answer)),
+                **site_row(estimate, flight, truth),
+                **landing_row(p, estimate, flight, truth, streams),
+                **motion_row(estimate.details, flight, case.pair),
+                **map_row(p, estimate, flight, truth),
+                **times_row(estimate.details),
+                **attempt.row,
+            }
+            if attempt.answer is not None:
+                first, second = (rigid(state.attitude, state.position_m) for state in flight.states)
+                answered = ScoredLanding(
+                    measurements=measurements,
+                    answer=attempt.answer,
+                    true_poses=(first, second),
+                    states=flight.states,
+                    ground=truth,
+                )
+                row |= scored(p.scores, answered, {*row, *known})
+            converged = attempt.answer is not None and estimate.outcome.converged
+            return algorithm_result(attempt, converged, row, products(case, estimate))
 
-def _judge(
-    case: RenderedFlight,
-    measurements: LandingMeasurements,
-    streams: Streams,
-    algorithm: str,
-    known: Mapping[str, Scalar],
-) -> Judged:
-    """Run one algorithm, and score its answer and the resulting landing."""
-    p, flight, truth = case.p, case.flight, case.truth
-    attempt = run_algorithm_on_copy(
-        lambda given: LANDING.make(algorithm, p.hda, p.executable, streams.case).estimate(given),
-        check_site,
-        measurements,
-    )
-    # without an answer the a-priori site is landed on
-    estimate = attempt.answer or SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world)
-    row = {
-        **({} if attempt.answer is None else outcome_row(attempt.answer)),
-        **site_row(estimate, flight, truth),
-        **landing_row(p, estimate, flight, truth, streams),
-        **motion_row(estimate.details, flight, case.pair),
-        **map_row(p, estimate, flight, truth),
-        **times_row(estimate.details),
-        **attempt.row,
-    }
-    if attempt.answer is not None:
-        first, second = (rigid(state.attitude, state.position_m) for state in flight.states)
-        answered = ScoredLanding(
-            measurements=measurements,
-            answer=attempt.answer,
-            true_poses=(first, second),
-            states=flight.states,
-            ground=truth,
-        )
-        row |= scored(p.scores, answered, {*row, *known})
-    converged = attempt.answer is not None and estimate.outcome.converged
-    return algorithm_result(attempt, converged, row, products(case, estimate))
+        return case_result(p.algorithms, judge, known)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.algorithms.hda import STAGES, HdaDetails, hda_products
+from marsyard.algorithms.hda import STAGES, Fate, HdaDetails, hda_products
 from marsyard.algorithms.hda.view import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.conditions import sun_columns
@@ -15,8 +15,7 @@ from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.confusion import SampledMap, hazard_counts, map_errors
 from marsyard.scenarios.landing.faults import stuck_range_m
 from marsyard.scenarios.landing.flight import Flight
-from marsyard.scenarios.landing.helicopter import Touchdown, horizontal_distance_m, land
-from marsyard.scenarios.landing.motion import motion_errors, solved_row
+from marsyard.scenarios.landing.helicopter import horizontal_distance_m, land
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.pictures import Pair
 from marsyard.scenarios.landing.truth import GroundTruth, RenderedFlight
@@ -33,6 +32,8 @@ CORRECT_PX = 1.0
 BORDER_PX = 12.0
 #: Minimum fraction of the features in both pictures to be tracked correctly.
 WELL_TRACKED = 0.9
+#: Reasons for dropped matches.
+DROPPED = (Fate.UNLIKE, Fate.OUT_OF_BOUNDS, Fate.NOT_RETURNED)
 #: Changes between pictures that tracking tolerates (section II.A): about the optical axis, about the others, of height.
 MAX_ROLL_DEG, MAX_TILT_DEG, MAX_CLIMB = 10.0, 20.0, 0.2
 #: Columns of tracks, motion, structure and map.
@@ -66,8 +67,8 @@ def site_populations(truth: GroundTruth) -> dict[str, Scalar]:
     A site with margin (`roomy_exists`) has safe positions all around up to a lander's radius. Every flight is in one of
     `none_exists`, `narrow_exists` and `roomy_exists`.
     """
-    safe, roomy = bool(np.any(truth.safe)), bool(np.any(truth.roomy))
-    return {"safe_exists": safe, "none_exists": not safe, "narrow_exists": safe and not roomy, "roomy_exists": roomy}
+    safe, margin = bool(np.any(truth.safe)), bool(np.any(truth.safe_with_margin))
+    return {"safe_exists": safe, "none_exists": not safe, "narrow_exists": safe and not margin, "roomy_exists": margin}
 
 
 def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict[str, Scalar]:
@@ -76,7 +77,7 @@ def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict
     The true site is the reported one minus the navigation error at the first picture. Only SAFE_SITE reports a safe
     site: where the algorithm did not converge the a-priori site is scored.
     """
-    row = _place_row("site", _true_site(estimate, flight), truth)
+    row = _ground_row("site", _true_site(estimate, flight), truth)
     safe_reported = estimate.outcome is SiteOutcome.SAFE_SITE and bool(row["site_safe"])
     return {**row, "safe_or_no_site_reported": safe_reported or estimate.outcome is SiteOutcome.NO_SAFE_SITE}
 
@@ -86,7 +87,7 @@ def _true_site(estimate: SiteEstimate, flight: Flight) -> np.ndarray | None:
     return None if estimate.site_world is None else (estimate.site_world - flight.position_error_m)[:2]
 
 
-def _place_row(name: str, position: np.ndarray | None, truth: GroundTruth) -> dict[str, Scalar]:
+def _ground_row(name: str, position: np.ndarray | None, truth: GroundTruth) -> dict[str, Scalar]:
     """The true ground under a lander at a position (x, y)."""
     columns = [f"{name}_{column}" for column in PLACE_COLUMNS]
     under = None if position is None else truth.under(position)
@@ -108,12 +109,15 @@ def landing_row(
     `touchdown_drift_m_s` are its vertical and horizontal speed. Without a site or a helicopter there is no landing:
     numbers are NaN, and `touchdown_safe` is absent.
     """
-    landed = _land(p, estimate, flight, truth, streams)
-    if landed is None or estimate.site_world is None:
-        nowhere = _place_row("touchdown", None, truth)
-        del nowhere["touchdown_safe"]
-        return {"landed": False, **nowhere, **dict.fromkeys(TOUCHDOWN_COLUMNS, NAN)}
-    site, position, velocity = estimate.site_world, landed.state.position_m, landed.state.velocity_m_s
+    site, relief, landed = estimate.site_world, truth.relief, None
+    if flight.transit is not None and site is not None:
+        ground = GroundPatch(np.array([relief.west_m, relief.south_m]), relief.spacing_m, relief.heights_m)
+        unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
+        landed = land(flight.transit, site, ground, unit, streams, stuck_range_m(p.faults, p.height_m))
+    if landed is None or site is None:
+        columns = (*(f"touchdown_{column}" for column in PLACE_COLUMNS), *TOUCHDOWN_COLUMNS)
+        return {"landed": False, **dict.fromkeys(columns, NAN)}
+    position, velocity = landed.state.position_m, landed.state.velocity_m_s
     numbers = (
         horizontal_distance_m(landed.gps_m, site),
         horizontal_distance_m(landed.believed_m, site),
@@ -121,25 +125,14 @@ def landing_row(
         float(landed.gps_deviation_m[1]),
         float(landed.gps_deviation_m[0]),
         landed.gps_solutions,
-        landed.turns,
-        landed.moved_m,
+        landed.iterations,
+        landed.change_m,
         landed.time_s - flight.states[1].time_s,
         -float(velocity[2]),
         float(np.hypot(*velocity[:2])),
     )
-    ground = _place_row("touchdown", position[:2], truth)
-    return {"landed": True, **ground, **dict(zip(TOUCHDOWN_COLUMNS, numbers, strict=True))}
-
-
-def _land(
-    p: LandingScenarioParameters, estimate: SiteEstimate, flight: Flight, truth: GroundTruth, streams: Streams
-) -> Touchdown | None:
-    if flight.transit is None or estimate.site_world is None:
-        return None
-    relief = truth.relief
-    ground = GroundPatch(np.array([relief.west_m, relief.south_m]), relief.spacing_m, relief.heights_m)
-    unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
-    return land(flight.transit, estimate.site_world, ground, unit, streams, stuck_range_m(p.faults, p.height_m))
+    below = _ground_row("touchdown", position[:2], truth)
+    return {"landed": True, **below, **dict(zip(TOUCHDOWN_COLUMNS, numbers, strict=True))}
 
 
 def true_motion(flight: Flight, pair: Pair) -> RigidTransform:
@@ -162,15 +155,6 @@ def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]
     if details.motion is not None:
         row |= motion_errors(details.motion.second_from_first, true_motion(flight, pair))
     return row | solved_row(details)
-
-
-def _within_limits(true: RigidTransform, flight: Flight, range_m: float) -> bool:
-    """Whether the change between the pictures is within the paper's limits of tracking (section II.A)."""
-    pitch, yaw, roll = np.degrees(np.abs(true.rotation.as_rotvec()))
-    climb = abs(float(flight.states[1].position_m[2] - flight.states[0].position_m[2]))
-    return bool(
-        roll < MAX_ROLL_DEG + 0.5 and max(pitch, yaw) < MAX_TILT_DEG + 0.5 and climb < (MAX_CLIMB + 0.01) * range_m
-    )
 
 
 def _tracks_row(details: HdaDetails, flight: Flight, pair: Pair) -> dict[str, Scalar]:
@@ -198,6 +182,39 @@ def _tracks_row(details: HdaDetails, flight: Flight, pair: Pair) -> dict[str, Sc
     }
 
 
+def motion_errors(found: RigidTransform, true: RigidTransform) -> dict[str, Scalar]:
+    """Errors of a motion from the first to the second camera's frame."""
+    (a, length), (b, true_length) = (
+        (np.array(motion.translation), float(np.linalg.norm(motion.translation))) for motion in (found, true)
+    )
+    direction = float(np.linalg.norm(a / length - b / true_length)) if length and true_length else NAN
+    return {
+        "rotation_error_deg": float(np.degrees((found.rotation * true.rotation.inv()).magnitude())),
+        "direction_error_deg": float(np.degrees(2.0 * np.arcsin(min(direction / 2.0, 1.0)))),
+        "length_error_m": length - true_length,
+        "baseline_error_share": float(np.linalg.norm(a - b)) / true_length if true_length > 0.0 else NAN,
+    }
+
+
+def solved_row(details: HdaDetails) -> dict[str, Scalar]:
+    """Inliers, matches and map size; without columns of stages that were not reached."""
+    row: dict[str, Scalar] = {}
+    if details.motion is not None:
+        row |= {
+            "inliers": int(details.motion.inliers.sum()),
+            "parallax_px": details.motion.parallax_px,
+            "motion_residual_px": float(np.median(details.motion.residuals_px)),
+        }
+    if details.matches is not None:
+        matches = details.matches
+        row |= {"points": len(matches.points), "matched_share": float(matches.accepted.mean())}
+        row |= {f"matches_{fate.name.lower()}": int(np.sum(matches.fates == fate)) for fate in DROPPED}
+    if details.ground is not None:
+        rows, columns = details.ground.elevation.elevation_m.shape
+        row |= {"map_rows": rows, "map_columns": columns, "cell_m": details.ground.elevation.cell_m}
+    return row
+
+
 def times_row(details: object) -> dict[str, Scalar]:
     """Processor time of the stages of Table I; NaN for stages that were not reached."""
     taken = details.times_s if isinstance(details, HdaDetails) else {}
@@ -220,6 +237,14 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     p, pair, truth = case.p, case.pair, case.truth
     covered = truth.covered
     slopes = truth.footprints.slope_rad[covered]
+    # the paper's limits of tracking (section II.A)
+    pitch, yaw, roll = np.degrees(np.abs(true_motion(case.flight, pair).rotation.as_rotvec()))
+    climb = abs(float(case.flight.states[1].position_m[2] - case.flight.states[0].position_m[2]))
+    within_limits = (
+        roll < MAX_ROLL_DEG + 0.5
+        and max(pitch, yaw) < MAX_TILT_DEG + 0.5
+        and climb < (MAX_CLIMB + 0.01) * pair.axis_range_m
+    )
     return {
         "site": p.site,
         "terrain": p.place.terrain,
@@ -236,7 +261,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
         "covered_m2": float(covered.sum() * truth.step_m**2),
         **site_populations(truth),
         "truly_safe_share": float(truth.safe.sum() / max(int(covered.sum()), 1)),
-        "within_limits": _within_limits(true_motion(case.flight, pair), case.flight, pair.axis_range_m),
+        "within_limits": bool(within_limits),
         "true_slope_median_deg": float(np.degrees(np.median(slopes))) if slopes.size else NAN,
         "texture": p.texture,
         "grid_px": p.hda.grid_px,
@@ -250,18 +275,16 @@ def _true_motion_columns(case: RenderedFlight) -> dict[str, Scalar]:
     """Height and attitude at the first picture, motion and rotation to the second."""
     states = case.flight.states
     heights = height_above_ground(case.world.ground.surface, np.stack([state.position_m for state in states]))
-    moved = states[1].position_m - states[0].position_m
-    turned = (states[0].attitude.inv() * states[1].attitude).as_rotvec(degrees=True)
+    motion = states[1].position_m - states[0].position_m
+    rotation_deg = (states[0].attitude.inv() * states[1].attitude).as_rotvec(degrees=True)
     upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
     return {
         "height_m": float(heights[0]),
-        "baseline_m": float(np.linalg.norm(moved)),
-        "height_change_share": float(moved[2] / heights[0]),
-        "baseline_share": float(np.hypot(*moved[:2]) / heights[0]),
-        "turned_deg": float(np.linalg.norm(turned)),
-        "pitch_deg": float(turned[0]),
-        "yaw_deg": float(turned[1]),
-        "roll_deg": float(turned[2]),
+        "baseline_m": float(np.linalg.norm(motion)),
+        "height_change_share": float(motion[2] / heights[0]),
+        "baseline_share": float(np.hypot(*motion[:2]) / heights[0]),
+        "turned_deg": float(np.linalg.norm(rotation_deg)),
+        **{f"{axis}_deg": float(angle) for axis, angle in zip(("pitch", "yaw", "roll"), rotation_deg, strict=True)},
         "off_nadir_deg": float(np.degrees(np.arccos(np.clip(upright[2], -1.0, 1.0)))),
     }
 

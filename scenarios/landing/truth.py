@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import distance_transform_edt
-from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.landing.flight import Flight
@@ -42,9 +41,13 @@ class GroundTruth:
     def of(cls, world: World, flight: Flight, pair: Pair, limits: Limits) -> GroundTruth:
         """The truth over the ground of the first picture."""
         centre = flight.states[0].position_m
-        axes = _horizontal_axes(flight.states[0].attitude)
-        points = _border_points(pair)
-        outline = (points - centre[:2]) @ axes.T
+        # the picture's right and up, as unit vectors on the ground (rows)
+        right = flight.states[0].attitude.apply(np.array([1.0, 0.0, 0.0]))[:2]
+        right = right / np.hypot(*right)
+        axes = np.array([right, [-right[1], right[0]]])
+        points = pair.frames[0].points_world()[::8, ::8, :2].reshape(-1, 2)
+        hull = cv2.convexHull(points[np.all(np.isfinite(points), axis=1)].astype(np.float32))
+        outline = (hull[:, 0].astype(np.float64) - centre[:2]) @ axes.T
         step = STEP_DIAMETERS * limits.diameter_m
         low, high = (np.floor(end / step) * step for end in (outline.min(axis=0), outline.max(axis=0)))
         x, y = (np.arange(a, b + 0.5 * step, step) for a, b in zip(low, high, strict=True))
@@ -55,8 +58,8 @@ class GroundTruth:
         west_south, east_north = corners.min(axis=0) - margin, corners.max(axis=0) + margin
         relief = Relief.of(world.ground, west_south, east_north, SPACING_DIAMETERS * limits.diameter_m, world.meshes)
         heights = relief.averaged(places, relief.spacing_m)
-        seen = visible_in_both(pair, flight, np.concatenate([corners, heights.reshape(-1, 1)], axis=1), 0.0)
-        around = distance_transform_edt(np.pad(seen.reshape(heights.shape), 1))[1:-1, 1:-1] * step
+        visible = visible_in_both(pair, flight, np.concatenate([corners, heights.reshape(-1, 1)], axis=1), 0.0)
+        around = distance_transform_edt(np.pad(visible.reshape(heights.shape), 1))[1:-1, 1:-1] * step
         covered = around >= 0.5 * limits.diameter_m
         return cls(relief, limits, places, relief.footprints(places, limits), covered, step)
 
@@ -66,14 +69,10 @@ class GroundTruth:
         return np.asarray(self.covered & self.footprints.safe)
 
     @property
-    def roomy(self) -> Bool[np.ndarray, "rows columns"]:
+    def safe_with_margin(self) -> Bool[np.ndarray, "rows columns"]:
         """Safe positions with safe positions all around up to the footprint's radius, as margin for errors."""
-        return np.asarray(distance_transform_edt(np.pad(self.safe, 1))[1:-1, 1:-1] * self.step_m > self.margin_m)
-
-    @property
-    def margin_m(self) -> float:
-        """Radius of safe positions about a position with margin."""
-        return 0.5 * self.limits.diameter_m
+        distance_m = distance_transform_edt(np.pad(self.safe, 1))[1:-1, 1:-1] * self.step_m
+        return np.asarray(distance_m > 0.5 * self.limits.diameter_m)
 
     def distance_to_hazard_m(self, place: Float[np.ndarray, "2"]) -> float:
         """Distance of a position (x, y) from the nearest unsafe position of the lattice."""
@@ -122,18 +121,3 @@ class RenderedFlight:
         flight = Flight.of(p, world.ground.surface, streams)
         pair = take_pictures(p, world, flight, camera_optics(p.optics), streams)
         return cls(p, world, flight, pair, GroundTruth.of(world, flight, pair, p.lander.limits))
-
-
-def _horizontal_axes(attitude: Rotation) -> Float[np.ndarray, "2 2"]:
-    """The picture's right and up, as unit vectors on the ground (rows)."""
-    right = attitude.apply(np.array([1.0, 0.0, 0.0]))[:2]
-    right = right / np.hypot(*right)
-    return np.array([right, [-right[1], right[0]]])
-
-
-def _border_points(pair: Pair) -> Float[np.ndarray, "n 2"]:
-    """World x, y of the convex hull of the first picture's ground."""
-    points = pair.frames[0].points_world()[::8, ::8, :2].reshape(-1, 2)
-    points = points[np.all(np.isfinite(points), axis=1)]
-    hull = cv2.convexHull(points.astype(np.float32))
-    return np.asarray(hull[:, 0].astype(np.float64))

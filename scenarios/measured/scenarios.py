@@ -23,7 +23,7 @@ from marsyard.scenarios.base import BaseScenario, algorithm_result
 from marsyard.scenarios.descent.parameters import check_binning
 from marsyard.scenarios.estimators import LANDING, VELOCITY
 from marsyard.scenarios.interface import CaseResult, Scalar, record_conditions
-from marsyard.scenarios.landing.motion import motion_errors, solved_row
+from marsyard.scenarios.landing.score import motion_errors, solved_row
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
 from marsyard.scenarios.measured.layout import TaskName

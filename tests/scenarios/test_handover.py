@@ -25,7 +25,7 @@ from marsyard.scenarios.conformance.inputs import descent
 from marsyard.scenarios.handover import Handover
 from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by
 from marsyard.scenarios.registry import scenario
-from marsyard.scenarios.velocity import asked
+from marsyard.scenarios.velocity import run_estimator
 from marsyard.sim.streams import Streams
 from tests.scenarios import spies
 
@@ -131,7 +131,7 @@ class LyingEstimator:
 
 
 def test_answers_are_plain_numbers_before_they_are_scored() -> None:
-    answer = asked(LyingEstimator, descent()).answer
+    answer = run_estimator(LyingEstimator, descent()).answer
     assert answer is not None
     assert type(answer.velocity_m_s) is np.ndarray
     assert (answer.velocity_m_s - np.array([1.0, 0.0])).tolist() == [399.0, 0.0]

@@ -19,7 +19,7 @@ import trimesh
 from marsyard.scenarios.measured.layout import VELOCITY, IngestError, read_ingest_file, read_table
 from marsyard.scenarios.measured.picture_files import read_counts, read_flat_field
 from marsyard.scenarios.measured.store import CasesFile
-from marsyard.scenarios.meshes import MOST_BYTES, MeshFileError, read_mesh
+from marsyard.scenarios.meshes import MAX_BYTES, MeshFileError, read_mesh
 from marsyard.scenarios.offline import VELOCITY_FORM, read_answers
 from marsyard.sim.camera import read_cameras
 from marsyard.sim.dynamics.recorded import COLUMNS, MAX_ROWS, TrajectoryFileError, read_poses
@@ -57,9 +57,7 @@ def test_zipped_formats_of_meshes_are_measured_before_they_expand(
         for _ in range(30):
             member.write(b" " * 10_000_000)
     assert path.stat().st_size < 1_000_000
-    with pytest.raises(
-        MeshFileError, match=rf"rock.3mf: expands to 300000000 bytes; allowed: up to {MOST_BYTES >> 20}"
-    ):
+    with pytest.raises(MeshFileError, match=rf"rock.3mf: expands to 300000000 bytes; allowed: up to {MAX_BYTES >> 20}"):
         read_mesh(str(path))
 
 

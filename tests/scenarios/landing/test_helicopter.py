@@ -88,8 +88,8 @@ def test_a_landing_agrees_with_its_own_filter() -> None:
     """Flown anew on the errors that the filter made over the flight it gave, it comes down at the same place."""
     for case in range(3):
         transit, down = _landed(case)
-        assert down.turns < 8
-        assert down.moved_m < 1e-3
+        assert down.iterations < 8
+        assert down.change_m < 1e-3
         path, navigated = down.flight.path, down.navigated
         errors = np.zeros((len(path.rows), 9))
         before = transit.navigated

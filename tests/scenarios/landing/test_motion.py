@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import Fate, HdaDetails, Matches
 from marsyard.algorithms.hda.view import View
-from marsyard.scenarios.landing.motion import solved_row
+from marsyard.scenarios.landing.score import solved_row
 from marsyard.sim.frames import rigid
 from marsyard.sim.sensor import preset
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.landing.pair_choice import PairParameters, choose_pair
+from marsyard.scenarios.landing.flight import choose_pair
+from marsyard.scenarios.landing.parameters import PairParameters
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.sensor import preset
