@@ -15,12 +15,11 @@ from pathlib import Path
 import numpy as np
 
 #: Default limit where ``MARSYARD_CACHE_GB`` is not set: a fraction of the free space, and a bound on it.
-FREE_SHARE, LIMIT_GB = 0.4, 10.0
+FREE_FRACTION, LIMIT_GB = 0.4, 10.0
 GIGA = 10**9
 #: Suffix of files that are being written, and the age from which such a file is left over from an interrupted process.
 UNFINISHED, ABANDONED_S = ".part", 86400.0
-#: Bytes of the checksum after an array.
-_CHECKSUM_BYTES = 4
+_CHECKSUM_BYTES = 4  #: Bytes of the checksum after an array.
 #: Files that this process has verified, with their state at that time: device, inode, modification time and size.
 _VERIFIED: dict[Path, tuple[int, int, int, int]] = {}
 
@@ -45,7 +44,7 @@ def limit_bytes(folder: Path, kept_bytes: int) -> int:
     """
     configured = os.environ.get("MARSYARD_CACHE_GB")
     if not configured:
-        return int(min(FREE_SHARE * (shutil.disk_usage(folder).free + kept_bytes), LIMIT_GB * GIGA))
+        return int(min(FREE_FRACTION * (shutil.disk_usage(folder).free + kept_bytes), LIMIT_GB * GIGA))
     try:
         gigabytes = float(configured)
     except ValueError:

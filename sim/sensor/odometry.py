@@ -22,7 +22,7 @@ start by definition. The estimate assumes flat ground between stops: climbed roc
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
 
@@ -140,20 +140,20 @@ class Odometer:
         wheels, walk, *tilt = np.split(rng.standard_normal(8), [2, 3, 5])
         fails = bool(rng.random() < p.visual.failure_share)
         if visual and not fails:
-            moved = self._visual_displacement(estimate, driven, tilt[1])
+            start, end = driven.start.world_from_rover, driven.end.world_from_rover
+            error = np.hypot(p.visual.walk_m * np.sqrt(driven.length_m), p.visual.floor_m) * tilt[1]
+            path = (1.0 + self.visual_scale) * (start.inv() * end).translation + error
+            displacement = self._attitude(start, estimate.heading_error_rad).apply(path)
         else:
-            moved = self._wheel_displacement(estimate, driven, p.walk_m * np.sqrt(driven.command.length_m) * wheels)
+            noise_m = p.walk_m * np.sqrt(driven.command.length_m) * wheels
+            displacement = self._wheel_displacement(estimate, driven, noise_m)
         heading = estimate.heading_error_rad + self.heading_scale * driven.turn_left_rad
         heading += self.heading_drift_rad_m * driven.length_m
         heading += float(np.radians(p.heading_walk_deg) * np.sqrt(driven.length_m) * walk[0])
         noise = Rotation.from_rotvec(np.radians(p.tilt_noise_deg) * np.array([*tilt[0], 0.0]))
         attitude = self._attitude(driven.end.world_from_rover, heading) * noise
-        position = estimate.world_from_rover.translation + moved
-        return replace(
-            estimate,
-            world_from_rover=rigid(attitude, position),
-            heading_error_rad=heading,
-            visual_failed=visual and fails,
+        return PoseEstimate(
+            rigid(attitude, estimate.world_from_rover.translation + displacement), heading, visual and fails
         )
 
     @cached_property
@@ -178,14 +178,3 @@ class Odometer:
         true = Rotation.concatenate([part.before.world_from_rover.rotation for part in driven.parts])
         turn = Rotation.from_rotvec([0.0, 0.0, estimate.heading_error_rad]) * self._anchor
         return np.asarray((turn * true * self.misalignment).apply(paths).sum(axis=0))
-
-    def _visual_displacement(
-        self, estimate: PoseEstimate, driven: Drive, draws: Float64[np.ndarray, "3"]
-    ) -> Float64[np.ndarray, "3"]:
-        """Displacement by visual odometry, world axes."""
-        p = self.parameters.visual
-        start, end = driven.start.world_from_rover, driven.end.world_from_rover
-        motion = (start.inv() * end).translation
-        error = np.hypot(p.walk_m * np.sqrt(driven.length_m), p.floor_m) * draws
-        attitude = self._attitude(start, estimate.heading_error_rad)
-        return np.asarray(attitude.apply((1.0 + self.visual_scale) * motion + error))

@@ -15,10 +15,8 @@ from pydantic import Field
 from marsyard.sim.parameters import Parameters, Positive
 from marsyard.sim.terrain.parameters import TerrainParameters
 
-#: Lowest sine of the sun's elevation for which a plane-parallel atmosphere is used.
-LOWEST_SUN_SINE = 0.05
-#: Angular radius of the sun at 1 AU.
-SUN_RADIUS_AT_1_AU_RAD = 0.00465
+LOWEST_SUN_SINE = 0.05  #: Lowest sine of the sun's elevation for which a plane-parallel atmosphere is used.
+SUN_RADIUS_AT_1_AU_RAD = 0.00465  #: Angular radius of the sun at 1 AU.
 
 
 class Environment(Parameters):
@@ -27,13 +25,9 @@ class Environment(Parameters):
     planet: Annotated[str, Field(description="which planet")] = "Mars"
     gravity_m_s2: Annotated[Positive, Field(description="gravity, m/s2")] = 3.72
     rotation_rad_s: Annotated[float, Field(ge=0.0, description="sidereal rotation rate, rad/s")] = 7.0882e-5
-    solar_irradiance: Annotated[
-        Positive, Field(description="sunlight above the air over that at 1 AU; 0.44 at 1.5 AU")
-    ] = 0.44
+    solar_irradiance: Annotated[Positive, Field(description="sunlight above the air over that at 1 AU")] = 0.44
     optical_depth: Annotated[float, Field(ge=0.0, le=10.0, description="extinction optical depth of the air")] = 0.5
-    single_scattering_albedo: Annotated[
-        float, Field(ge=0.0, lt=1.0, description="share of the extinction that is scattering")
-    ] = 0.94
+    single_scattering_albedo: Annotated[float, Field(ge=0.0, lt=1.0, description="scattering over extinction")] = 0.94
     asymmetry: Annotated[float, Field(gt=-1.0, lt=1.0, description="mean cosine of the scattering angle")] = 0.65
 
     @property
@@ -158,12 +152,6 @@ PAPER: dict[str, PaperFigures] = {
 }
 
 
-def _texture(coarsest_m: float, amplitude: float, decay: float) -> SiteTexture:
-    """Octaves down to a millimetre, each `decay` times as strong as the one before."""
-    octaves = int(np.log2(coarsest_m / 0.001)) + 1
-    return SiteTexture(coarsest_m=coarsest_m, amplitudes=tuple(round(amplitude * decay**n, 5) for n in range(octaves)))
-
-
 @cache
 def sites() -> dict[str, Site]:
     """Return all sites of ``sites.toml`` by name."""
@@ -174,7 +162,11 @@ def sites() -> dict[str, Site]:
         for scale in {"descent", "ground"} & set(entry):
             entry[scale] = _with_base(entry[scale], tables["grounds"])
         for texture, coarsest_m in (("ground_texture", 3.0), ("rock_texture", 0.2)):
-            entry[texture] = _texture(coarsest_m, **entry[texture])
+            # octaves down to a millimetre, each `decay` times as strong as the one before
+            strongest, decay = entry[texture]["amplitude"], entry[texture]["decay"]
+            octaves = range(int(np.log2(coarsest_m / 0.001)) + 1)
+            amplitudes = tuple(round(strongest * decay**n, 5) for n in octaves)
+            entry[texture] = SiteTexture(coarsest_m=coarsest_m, amplitudes=amplitudes)
         found[name] = Site(name=name, **entry)
     return found
 
