@@ -57,9 +57,9 @@ def limit_bytes(folder: Path, kept_bytes: int) -> int:
 def kept_bytes(folder: Path) -> int:
     """Return the total size of the finished files in a folder."""
     total = 0
-    for path in folder.iterdir():
+    for path in (path for path in folder.iterdir() if path.suffix != UNFINISHED):
         with contextlib.suppress(FileNotFoundError):
-            total += 0 if path.suffix == UNFINISHED else path.stat().st_size
+            total += path.stat().st_size
     return total
 
 
@@ -111,12 +111,10 @@ def save_array(path: Path, array: np.ndarray) -> np.ndarray:
         except BaseException:
             Path(part.name).unlink(missing_ok=True)
             raise
-    with contextlib.suppress(OSError):  # not every file system can sync a folder
+    with contextlib.suppress(OSError), contextlib.ExitStack() as stack:  # not every file system can sync a folder
         descriptor = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        stack.callback(os.close, descriptor)
+        os.fsync(descriptor)
     _VERIFIED[path] = state
     return mapped
 

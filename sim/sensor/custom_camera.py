@@ -1,8 +1,6 @@
-"""User cameras in campaigns: geometry from a camera file.
+"""User cameras in campaigns: geometry from a camera file, copied into the campaign's parameters when it is read.
 
-A campaign names the camera file once. Its content is copied into the campaign's parameters when it is read: the
-campaign's folder contains the camera itself, and later changes of the file have no effect (`resume` and `append` report
-them).
+Later changes of the file have no effect; `resume` and `append` report them.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
 """Frame-transfer CCD: radiance to counts, with noise, smear, defects, bursts and 8-bit companding; auto-exposure.
 
 Companding: a step of the square-root table grows with the square root of the count, as shot noise does. The table is
-
-    code = round(a (sqrt(count + b) - sqrt(b))),   a = 2 sqrt(b)
-
-so that the steps begin with one count; b is such that the full scale has code 255. Every code is used. A code is
-expanded to the middle of its counts.
+``code = round(a (sqrt(count + b) - sqrt(b)))``, ``a = 2 sqrt(b)``: the steps begin with one count. The full scale has
+code 255, which sets b. Every code is used. A code is expanded to the middle of its counts.
 """
 
 from __future__ import annotations

@@ -179,8 +179,8 @@ class Approach:
     def attitudes(self, times_s: Times) -> Rotation:
         """Nominal rotations from body to world axes: body -z along the flight direction, spinning about it."""
         flight = Rotation.from_rotvec(np.interp(times_s, *self._knots())[:, None] * self._turn_axis())
-        spun = Rotation.from_rotvec(self._spun(times_s)[:, None] * np.array([0.0, 0.0, 1.0]))
-        return Rotation.from_quat(multiply_quaternions(flight.as_quat(), spun.as_quat()))
+        spin = Rotation.from_rotvec(self._spin_angle(times_s)[:, None] * np.array([0.0, 0.0, 1.0]))
+        return Rotation.from_quat(multiply_quaternions(flight.as_quat(), spin.as_quat()))
 
     def body_rates(self, times_s: Times) -> Vectors:
         """Nominal angular velocities, body axes, rad/s."""
@@ -188,9 +188,9 @@ class Approach:
         times, angles = self._knots()
         knot_rates = np.concatenate([[0.0], np.diff(angles) / np.diff(times), [0.0]])
         turning = knot_rates[np.searchsorted(times, times_s, side="right")]
-        spun, (first, second, _) = self._spun(times_s), self._turn_axis()
-        x = turning * (np.cos(spun) * first + np.sin(spun) * second)
-        y = turning * (np.cos(spun) * second - np.sin(spun) * first)
+        angle, (first, second, _) = self._spin_angle(times_s), self._turn_axis()
+        x = turning * (np.cos(angle) * first + np.sin(angle) * second)
+        y = turning * (np.cos(angle) * second - np.sin(angle) * first)
         return np.stack([x, y, np.where(times_s < self._deploy_s(), self._spin_rate(), 0.0)], axis=1)
 
     def specific_forces(self, times_s: Times) -> Vectors:
@@ -209,13 +209,13 @@ class Approach:
     def _spin_rate(self) -> float:
         return float(2.0 * np.pi * self.parameters.spin_rpm / 60.0)
 
-    def _spun(self, times_s: Times) -> Times:
+    def _spin_angle(self, times_s: Times) -> Times:
         return np.asarray(self._spin_rate() * (np.minimum(times_s, self._deploy_s()) - self.start_s))
 
     def _turn_axis(self) -> Vector:
         # tilts nadir towards the heading: (0, 0, -1) x (sin a, cos a, 0)
         heading = np.radians(self.parameters.heading_deg)
-        return np.asarray(np.array([np.cos(heading), -np.sin(heading), 0.0]))
+        return np.array([np.cos(heading), -np.sin(heading), 0.0])
 
     def _knots(self) -> tuple[Vector, Vector]:
         """Times at which the turn rate of the flight direction changes, and its angle from nadir there."""

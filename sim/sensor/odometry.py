@@ -1,16 +1,12 @@
 """Pose estimation of a rover: wheel odometry with an inertial unit, and optional visual odometry.
 
 Attitude (Ali et al. 2005, as on MER). Accelerometers measure the tilt at each stop, gyros the heading along a drive:
-
-    R_estimated = Rz(heading error) A R_true B N
-
-B is a misalignment of the accelerometers, constant in a run; A, a rotation of the world, makes the estimate exact at
-the start, so that B has an effect only when the rover turns or tilts; N is the noise of a stop. The heading error is
-the sum of a fraction of the turns, a drift along the path and a random walk.
+``R_estimated = Rz(heading error) A R_true B N``. B is a misalignment of the accelerometers, constant in a run. A, a
+rotation of the world, makes the estimate exact at the start: B has an effect only when the rover turns or tilts. N is
+the noise of a stop. The heading error is the sum of a fraction of the turns, a drift along the path and a random walk.
 
 Position by wheels. Each part of a drive adds the commanded path in the estimated axes; slip is not observed:
-
-    dp = R_estimated ((1 + scale) path_commanded + noise)
+``dp = R_estimated ((1 + scale) path_commanded + noise)``.
 
 Position by visual odometry (paper, section 4.2: "roughly 2% of the rover travel distance"). Each drive adds its true
 motion with an own scale error, a random walk and a floor; the attitude is the inertial unit's. If it does not converge,

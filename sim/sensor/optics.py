@@ -1,9 +1,8 @@
 """Optics and radiometry of a camera: sunlight to electrons, point spread, natural fall-off and dust on the lens.
 
 A surface of radiance factor I/F under the solar photon irradiance E shows the radiance (I/F) E / pi. Behind a lens of
-f-number N and transmission T a pixel of area A gathers on axis
-
-    rate = (I/F) A T / (4 N^2)  integral of E(wavelength) T_filter(wavelength) QE(wavelength)      electrons per second
+f-number N and transmission T a pixel of area A gathers, on axis, electrons per second at the rate
+``(I/F) A T / (4 N^2)  integral of E(wavelength) T_filter(wavelength) QE(wavelength)``.
 
 The sun is a black body of 5772 K and of its true size (IAU 2015 Resolution B3): 1361 W/m2 at 1 AU. Between 400 and
 1100 nm that is within a few per cent of the measured spectrum, less than the uncertainty of quantum efficiency and lens

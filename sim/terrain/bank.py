@@ -10,7 +10,6 @@ from pathlib import Path
 from weakref import WeakValueDictionary
 
 import numpy as np
-from jaxtyping import Float32
 
 from marsyard.sim.cache import CacheWarning, cache_directory, evict_files, load_array, save_array, touch
 from marsyard.sim.terrain.imported import blend_into_ground, detail_below_posting, embed
@@ -87,7 +86,13 @@ class TerrainBank:
         if flat is not None and flat.size == self._size():
             touch(path)
         else:
-            flat = self._build(number, path)
+            flat = np.concatenate([one.reshape(-1) for one in synthesise(self.parameters, self._rng(number)).levels])
+            try:
+                evict_files(path.parent, 4 * self._size(), set(_IN_USE))
+                flat = save_array(path, flat)
+            except OSError as error:
+                warnings.warn(f"terrain {number} is not kept: {path}: {error.strerror}", CacheWarning, stacklevel=2)
+                flat.flags.writeable = False
         _IN_USE[path] = flat
         sides = self._sides()
         parts = np.split(flat, np.cumsum([2 * side**2 for side in sides])[:-1])
@@ -114,17 +119,6 @@ class TerrainBank:
         hashes = " ".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.exists())
         identity = f"{parameters} {self.seed} {number} {_code_version()} {hashes}"
         return cache_directory("terrain") / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.npy"
-
-    def _build(self, number: int, path: Path) -> Float32[np.ndarray, "samples"]:
-        built = synthesise(self.parameters, self._rng(number))
-        flat = np.concatenate([level.reshape(-1) for level in built.levels])
-        try:
-            evict_files(path.parent, 4 * self._size(), set(_IN_USE))
-            return save_array(path, flat)
-        except OSError as error:
-            warnings.warn(f"terrain {number} is not kept: {path}: {error.strerror}", CacheWarning, stacklevel=2)
-            flat.flags.writeable = False
-            return flat
 
     def _sides(self) -> list[int]:
         """Samples along a side of each level."""

@@ -26,7 +26,7 @@ class TerrainFileError(ValueError):
 
 
 class RealTerrain(Parameters):
-    """A digital terrain model (DTM) from a file, in place of the fractal ground where it reaches.
+    """A digital terrain model (DTM) from a file, that replaces the fractal ground within its borders.
 
     The file is a GeoTIFF (rows from north to south, projected, metres; needs the extra `geo`) or an ``.npz`` with
     ``dem`` (heights, m, row 0 in the north) and ``dem_gsd`` (m), and optionally ``ortho``, ``ortho_gsd`` and

@@ -62,12 +62,8 @@ class Environment(Parameters):
         # down at the top (I + 2/3 I1 = 0) nor up from the ground (I - 2/3 I1 = 0)
         two_thirds = 2.0 / 3.0
         fade = np.exp(-tau / mu)
-        system = np.array(
-            [
-                [1.0 + two_thirds * p, 1.0 - two_thirds * p],
-                [(1.0 - two_thirds * p) * np.exp(-k * tau), (1.0 + two_thirds * p) * np.exp(k * tau)],
-            ]
-        )
+        more, less = 1.0 + two_thirds * p, 1.0 - two_thirds * p
+        system = np.array([[more, less], [less * np.exp(-k * tau), more * np.exp(k * tau)]])
         c1, c2 = np.linalg.solve(system, [alpha + two_thirds * beta, (alpha - two_thirds * beta) * fade])
         mean = c1 * np.exp(-k * tau) + c2 * np.exp(k * tau) - alpha * fade
         slant = p * (c1 * np.exp(-k * tau) - c2 * np.exp(k * tau)) - beta * fade
@@ -102,7 +98,7 @@ class SiteTexture(Parameters):
 
 
 class Site(Parameters):
-    """A place to land, drive or fly.
+    """A site to land, drive or fly.
 
     `descent` is its terrain from parachute heights (posts of metres over kilometres), `ground` from a mast or a
     helicopter (posts of centimetres over 100-200 m); a site has at least one.

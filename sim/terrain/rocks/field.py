@@ -147,8 +147,8 @@ class RockField:
         """
         placed = parameters.placed
         drawn = draw_diameters(parameters, surface.period_m**2, substream(rng, "rock sizes"))
-        looks = substream(rng, "rock looks")
-        ratio = parameters.height_ratio * (1.0 + parameters.height_spread * looks.uniform(-1.0, 1.0, drawn.size))
+        appearance = substream(rng, "rock looks")
+        ratio = parameters.height_ratio * (1.0 + parameters.height_spread * appearance.uniform(-1.0, 1.0, drawn.size))
         first = shapes.FORMS.index(parameters.form) * SHAPES_OF_FORM
         placed_shape, placed_yaw, draws = [], [], substream(rng, "placed rocks")
         for rock in placed:
@@ -160,8 +160,9 @@ class RockField:
             placed_yaw.append(turn if rock.yaw_deg is None else float(np.radians(rock.yaw_deg)))
         diameter = np.concatenate([[rock.diameter_m for rock in placed], drawn])
         height = np.concatenate([[rock.height_m or 0.5 * rock.diameter_m for rock in placed], ratio * drawn])
-        shape = np.concatenate([placed_shape, first + looks.integers(0, SHAPES_OF_FORM, drawn.size)]).astype(np.int32)
-        yaw = np.concatenate([placed_yaw, looks.uniform(-np.pi, np.pi, drawn.size)])
+        kinds = first + appearance.integers(0, SHAPES_OF_FORM, drawn.size)
+        shape = np.concatenate([placed_shape, kinds]).astype(np.int32)
+        yaw = np.concatenate([placed_yaw, appearance.uniform(-np.pi, np.pi, drawn.size)])
         radius = rock_shapes(shapes.COARSE).reach[shape] * diameter
         xy = _draw_positions(parameters, radius, diameter, surface.period_m, substream(rng, "rock places"))
         position = np.column_stack([xy, surface.height(xy[:, 0], xy[:, 1])])
@@ -203,7 +204,7 @@ class RockField:
         - smallest_m: smallest diameter of interest
         - above_m, pixel_rad: height of the eye above the ground there, and angle that a pixel subtends
         - detail: level of detail of all rocks, 0 (80 triangles) to 3 (5120); by default each rock's is the coarsest
-          that looks like the finest (`DEVIATION_PX`)
+          that deviates too little from the finest to be seen (`DEVIATION_PX`)
         """
         large = np.flatnonzero(self.diameter_m >= smallest_m)
         reach = int(np.ceil(radius_m / self.period_m))
@@ -269,5 +270,5 @@ def _draw_positions(
     drawn = place_discs(radius[count:], occupied, period_m, cell, MAX_TRIES, rng)
     crowded = int(np.count_nonzero(np.isnan(drawn[:, 0])))
     if crowded:
-        raise ValueError(f"{crowded} of {drawn.shape[0]} rocks find no free place; a smaller rocks.abundance is needed")
+        raise ValueError(f"{crowded} of {len(drawn)} rocks find no free position; a smaller rocks.abundance is needed")
     return np.concatenate([placed, drawn])

@@ -31,7 +31,7 @@ Points = Float64[np.ndarray, "n 3"]
 
 @dataclass(frozen=True)
 class ShapeSet:
-    """All shapes at one level of detail; each is a displaced icosphere, so they share their triangles.
+    """All shapes at one level of detail; each is a displaced icosphere, so all have the same triangles.
 
     A unit shape stands on the ground plane z = 0, part of it below; seen from above, the mean of its longest and its
     shortest diameter is 1, and it is `UNIT_HEIGHT` high.

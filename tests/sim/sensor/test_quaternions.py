@@ -12,7 +12,7 @@ def test_products_are_those_of_rotations() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 100])
-def test_running_products_go_on_to_the_right(count: int) -> None:
+def test_accumulated_quaternions_equal_rotation_products(count: int) -> None:
     steps = Rotation.random(count, rng=count)
     product, expected = Rotation.identity(), []
     for step in steps:

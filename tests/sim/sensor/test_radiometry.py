@@ -36,10 +36,10 @@ def test_neutral_density_filters() -> None:
 @pytest.mark.parametrize(
     ("temperature_c", "ratio", "share"), [(-34.0, 102.0, None), (0.0, 100.0, 0.02), (23.0, 87.0, 0.15)]
 )
-def test_paper_signal_to_noise_and_shares_of_dark_current(
+def test_paper_signal_to_noise_and_dark_current_fractions(
     temperature_c: float, ratio: float, share: float | None
 ) -> None:
-    """Section III.B.3, one set of constants: the ratio within 2, shares within a factor of 1.2."""
+    """Section III.B.3, one set of constants: the ratio within 2, fractions within a factor of 1.2."""
     for camera in (FLOWN, FIELD):
         p = camera.detector.model_copy(update={"temperature_c": temperature_c})
         assert _signal_to_noise(p, DARKEST_RADIANCE_FACTOR) == pytest.approx(ratio, abs=2.0)

@@ -174,7 +174,7 @@ def test_refinement_keeps_the_surface_exactly() -> None:
     np.testing.assert_allclose(ours, theirs, atol=2e-6)
 
 
-def test_smooth_pair_has_unit_power() -> None:
+def test_smooth_fields_have_unit_power() -> None:
     powers = [
         np.mean(np.sum(draw_smooth_fields(100.0, 4.0, 8.0, 0.3, np.random.default_rng(s)) ** 2.0, axis=2))
         for s in range(30)
