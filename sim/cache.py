@@ -15,12 +15,11 @@ from pathlib import Path
 import numpy as np
 
 #: Default limit where ``MARSYARD_CACHE_GB`` is not set: a fraction of the free space, and a bound on it.
-FREE_SHARE, LIMIT_GB = 0.4, 10.0
+FREE_FRACTION, LIMIT_GB = 0.4, 10.0
 GIGA = 10**9
 #: Suffix of files that are being written, and the age from which such a file is left over from an interrupted process.
 UNFINISHED, ABANDONED_S = ".part", 86400.0
-#: Bytes of the checksum after an array.
-_CHECKSUM_BYTES = 4
+_CHECKSUM_BYTES = 4  #: Bytes of the checksum after an array.
 #: Files that this process has verified, with their state at that time: device, inode, modification time and size.
 _VERIFIED: dict[Path, tuple[int, int, int, int]] = {}
 
@@ -45,7 +44,7 @@ def limit_bytes(folder: Path, kept_bytes: int) -> int:
     """
     configured = os.environ.get("MARSYARD_CACHE_GB")
     if not configured:
-        return int(min(FREE_SHARE * (shutil.disk_usage(folder).free + kept_bytes), LIMIT_GB * GIGA))
+        return int(min(FREE_FRACTION * (shutil.disk_usage(folder).free + kept_bytes), LIMIT_GB * GIGA))
     try:
         gigabytes = float(configured)
     except ValueError:
@@ -58,9 +57,9 @@ def limit_bytes(folder: Path, kept_bytes: int) -> int:
 def kept_bytes(folder: Path) -> int:
     """Return the total size of the finished files in a folder."""
     total = 0
-    for path in folder.iterdir():
+    for path in (path for path in folder.iterdir() if path.suffix != UNFINISHED):
         with contextlib.suppress(FileNotFoundError):
-            total += 0 if path.suffix == UNFINISHED else path.stat().st_size
+            total += path.stat().st_size
     return total
 
 
@@ -112,12 +111,10 @@ def save_array(path: Path, array: np.ndarray) -> np.ndarray:
         except BaseException:
             Path(part.name).unlink(missing_ok=True)
             raise
-    with contextlib.suppress(OSError):  # not every file system can sync a folder
+    with contextlib.suppress(OSError), contextlib.ExitStack() as stack:  # not every file system can sync a folder
         descriptor = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        stack.callback(os.close, descriptor)
+        os.fsync(descriptor)
     _VERIFIED[path] = state
     return mapped
 

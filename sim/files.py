@@ -20,8 +20,7 @@ _SPECIAL_FILES = {
 }
 #: Errors of numpy and zipfile for damaged archives and headers; NotImplementedError is an unknown compression.
 ARCHIVE_ERRORS = (OSError, ValueError, EOFError, TypeError, KeyError, NotImplementedError, zipfile.BadZipFile)
-#: Shape and type of an array.
-ArrayHeader = tuple[tuple[int, ...], np.dtype[Any]]
+ArrayHeader = tuple[tuple[int, ...], np.dtype[Any]]  #: Shape and type of an array.
 
 
 def check_regular(path: str | Path) -> os.stat_result:

@@ -44,8 +44,7 @@ def kernels_are_ready(user: str) -> bool:
 
 def mark_ready(user: str) -> None:
     """Record that the kernels of this user are compiled."""
-    mark = _mark(user)
-    if mark is not None:
+    if (mark := _mark(user)) is not None:
         with suppress(OSError):
             mark.parent.mkdir(parents=True, exist_ok=True)
             mark.touch()

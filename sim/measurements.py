@@ -6,7 +6,7 @@ Nothing here is ground truth. Cameras are as calibrated, times as tagged, attitu
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -139,17 +139,16 @@ class DescentMeasurements:
         """Select pictures by ascending indices, with the mean velocities between them."""
         at = self.inertial_velocities_m_s
         intervals = [self._mean_velocity(first, second) for first, second in pairwise(indices)]
-        return DescentMeasurements(
+        return replace(
+            self,
             images=tuple(self.images[index] for index in indices),
             attitudes=tuple(self.attitudes[index] for index in indices),
             altitudes=tuple(self.altitudes[index] for index in indices),
             interval_velocities_m_s=np.array(intervals, dtype=np.float64).reshape(-1, 3),
-            sun_direction=self.sun_direction,
             inertial_velocities_m_s=None if at is None else at[list(indices)],
         )
 
     def _mean_velocity(self, first: int, second: int) -> Float[np.ndarray, "3"]:
-        """Mean inertial velocity between two pictures."""
         between = self.interval_velocities_m_s[first:second]
         if len(between) == 1:
             return np.asarray(between[0])
@@ -242,12 +241,11 @@ class DriveCommand:
     @property
     def displacement_m(self) -> Float[np.ndarray, "2"]:
         """End position without slip, in the rover's axes at the start (forward, left)."""
-        # chord of an arc: the path, shortened by sin(t/2) / (t/2) and turned by t/2
+        # chord of an arc: the path, shortened by sin(t/2) / (t/2) and rotated by t/2
         half = 0.5 * self.turn_left_rad
-        shortened = float(np.sinc(half / np.pi))
         sine, cosine = np.sin(half), np.cos(half)
         path = np.array([[cosine, -sine], [sine, cosine]]) @ np.array([self.forward_m, self.left_m])
-        return np.asarray(shortened * path)
+        return np.asarray(float(np.sinc(half / np.pi)) * path)
 
     def part(self, fraction: float) -> DriveCommand:
         """The motion over a fraction of its duration."""

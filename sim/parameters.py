@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -20,3 +21,14 @@ class Parameters(BaseModel):
     """User parameters: unknown keys are errors, validated objects are immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def merge_settings(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge changes into nested settings: tables are merged, other values replaced."""
+    merged = dict(base)
+    for key, value in changes.items():
+        below = merged.get(key)
+        if isinstance(below, Mapping) and isinstance(value, Mapping):
+            value = merge_settings(below, value)
+        merged[key] = value
+    return merged

@@ -11,11 +11,8 @@ from pathlib import Path
 @cache
 def processor_features() -> str:
     """Return the machine type and a hash of the instruction set extensions that compiled code is made for."""
-    flags = ""
     cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
-            if line.startswith(("flags", "Features")):
-                flags = " ".join(sorted(line.split(":", 1)[1].split()))
-                break
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    stated = next((line.split(":", 1)[1] for line in lines if line.startswith(("flags", "Features"))), "")
+    flags = " ".join(sorted(stated.split()))
     return f"{platform.machine()}-{hashlib.sha256(flags.encode()).hexdigest()[:12]}"

@@ -14,16 +14,15 @@ import numpy as np
 
 
 @lru_cache(maxsize=1024)
-def _words(text: str) -> tuple[int, int, int, int]:
-    """128 bits of the SHA-256 of a text as four words for the spawn key of `SeedSequence`."""
+def hash_words(text: str) -> tuple[int, ...]:
+    """Return 128 bits of the SHA-256 of a text as four words for the spawn key of `SeedSequence`."""
     digest = hashlib.sha256(text.encode()).digest()
-    first, second, third, fourth = (int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4))
-    return first, second, third, fourth
+    return tuple(int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4))
 
 
 def stream_key(campaign: str, case: int, name: str) -> tuple[int, ...]:
     """The spawn key of a stream: always nine words, so that no two keys coincide."""
-    return (*_words(campaign), case, *_words(name))
+    return (*hash_words(campaign), case, *hash_words(name))
 
 
 @dataclass(frozen=True)

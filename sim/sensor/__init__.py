@@ -19,55 +19,13 @@ from marsyard.sim.sensor.motion import ImageMotion
 from marsyard.sim.sensor.odometry import OdometryParameters
 from marsyard.sim.sensor.optics import natural_fall_off
 from marsyard.sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, preset, read_datasheet
-from marsyard.sim.sensor.ranging import (
-    LaserParameters,
-    RadarAltimeter,
-    RadarParameters,
-    height_above_ground,
-)
+from marsyard.sim.sensor.ranging import LaserParameters, RadarAltimeter, RadarParameters, height_above_ground
 from marsyard.sim.sensor.satellite_navigation import Gps, GpsParameters
 
-__all__ = [
-    "MASTS",
-    "PRESETS",
-    "Approach",
-    "ApproachParameters",
-    "AutoExposure",
-    "AutoExposureParameters",
-    "CameraDesign",
-    "Clock",
-    "ClockParameters",
-    "CustomCamera",
-    "CustomCameraChoice",
-    "Detector",
-    "DetectorChoice",
-    "DetectorParameters",
-    "Gps",
-    "GpsParameters",
-    "ImageMotion",
-    "Imu",
-    "ImuIncrements",
-    "ImuParameters",
-    "InertialSolution",
-    "LaserParameters",
-    "Mast",
-    "MastState",
-    "NamedOrCustomCamera",
-    "NavigationErrors",
-    "OdometryParameters",
-    "PointingParameters",
-    "RadarAltimeter",
-    "RadarParameters",
-    "Readings",
-    "Sampling",
-    "StereoCalibrationParameters",
-    "StereoHead",
-    "WarmUp",
-    "auto_expose",
-    "height_above_ground",
-    "mount_on_head",
-    "natural_fall_off",
-    "preset",
-    "read_datasheet",
-    "stereo_mast",
-]
+__all__ = ["MASTS", "PRESETS", "Approach", "ApproachParameters", "AutoExposure", "AutoExposureParameters"]
+__all__ += ["CameraDesign", "Clock", "ClockParameters", "CustomCamera", "CustomCameraChoice", "Detector"]
+__all__ += ["DetectorChoice", "DetectorParameters", "Gps", "GpsParameters", "ImageMotion", "Imu", "ImuIncrements"]
+__all__ += ["ImuParameters", "InertialSolution", "LaserParameters", "Mast", "MastState", "NamedOrCustomCamera"]
+__all__ += ["NavigationErrors", "OdometryParameters", "PointingParameters", "RadarAltimeter", "RadarParameters"]
+__all__ += ["Readings", "Sampling", "StereoCalibrationParameters", "StereoHead", "WarmUp", "auto_expose"]
+__all__ += ["height_above_ground", "mount_on_head", "natural_fall_off", "preset", "read_datasheet", "stereo_mast"]

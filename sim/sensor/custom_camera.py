@@ -1,8 +1,6 @@
-"""User cameras in campaigns: geometry from a camera file.
+"""User cameras in campaigns: geometry from a camera file, copied into the campaign's parameters when it is read.
 
-A campaign names the camera file once. Its content is copied into the campaign's parameters when it is read: the
-campaign's folder contains the camera itself, and later changes of the file have no effect (`resume` and `append` report
-them).
+Later changes of the file have no effect; `resume` and `append` report them.
 """
 
 from __future__ import annotations
@@ -57,9 +55,8 @@ class CustomCamera(Parameters):
             return Cahvor.from_cahv(pinhole, r=np.array(self.r), o=np.array(self.o))
         if self.e is None or self.linearity is None:
             raise ValueError("CAHVORE needs e and linearity")
-        return Cahvore.from_cahv(
-            pinhole, np.array(self.r), np.array(self.e), linearity=self.linearity, o=np.array(self.o)
-        )
+        r, e, o = (np.array(vector) for vector in (self.r, self.e, self.o))
+        return Cahvore.from_cahv(pinhole, r, e, linearity=self.linearity, o=o)
 
     def input_files(self) -> tuple[str, ...]:
         """The file that the camera was read from."""
@@ -80,14 +77,9 @@ class CustomCamera(Parameters):
             for letter in "hvore"
             if hasattr(mounted, letter)
         }
-        return cls(
-            model=type(mounted).__name__.upper(),  # type: ignore[arg-type]  # the classes' names are the models'
-            columns=mounted.size[0],
-            rows=mounted.size[1],
-            linearity=mounted.linearity if isinstance(mounted, Cahvore) else None,
-            **vectors,
-            **origin,
-        )
+        values = {"columns": mounted.size[0], "rows": mounted.size[1], "linearity": getattr(mounted, "linearity", None)}
+        # the classes' names are the models'
+        return cls.model_validate({"model": type(mounted).__name__.upper(), **values, **vectors, **origin})
 
 
 def _read(stated: object) -> object:

@@ -1,11 +1,8 @@
 """Frame-transfer CCD: radiance to counts, with noise, smear, defects, bursts and 8-bit companding; auto-exposure.
 
 Companding: a step of the square-root table grows with the square root of the count, as shot noise does. The table is
-
-    code = round(a (sqrt(count + b) - sqrt(b))),   a = 2 sqrt(b)
-
-so that the steps begin with one count; b is such that the full scale has code 255. Every code is used. A code is
-expanded to the middle of its counts.
+``code = round(a (sqrt(count + b) - sqrt(b)))``, ``a = 2 sqrt(b)``: the steps begin with one count. The full scale has
+code 255, which sets b. Every code is used. A code is expanded to the middle of its counts.
 """
 
 from __future__ import annotations
@@ -23,10 +20,12 @@ from scipy.optimize import brentq
 from marsyard.sim.measurements import DetectorCalibration
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive
 from marsyard.sim.sensor.motion import ImageMotion, moving_exposure
-from marsyard.sim.sensor.optics import OpticsParameters, apply_point_spread, dust_transmission
+from marsyard.sim.sensor.optics import OpticsParameters, Picture, apply_point_spread, dust_transmission
 
 CODES = 256
 _RelativeError = Annotated[float, Field(ge=0.0, le=0.1)]
+Counts = UInt16[np.ndarray, "rows columns"]
+Delivered = UInt16[np.ndarray, "delivered_rows columns"]
 
 
 class DefectParameters(Parameters):
@@ -124,46 +123,39 @@ class Detector:
     """
 
     parameters: DetectorParameters
-    response: Float32[np.ndarray, "rows columns"]
+    response: Picture
     calibration: DetectorCalibration
-    hot_e_s: Float32[np.ndarray, "rows columns"] | None = None
+    hot_e_s: Picture | None = None
     listed: Bool[np.ndarray, "delivered_rows columns"] | None = None
 
     @classmethod
-    def drawn(
-        cls, fall_off: Float32[np.ndarray, "rows columns"], parameters: DetectorParameters, rng: np.random.Generator
-    ) -> Detector:
+    def drawn(cls, fall_off: Picture, parameters: DetectorParameters, rng: np.random.Generator) -> Detector:
         """Draw pixel responses, defects and dust of a detector behind a lens with this fall-off."""
-        rows, columns = fall_off.shape
-        if rows % parameters.rows_summed:
-            raise ValueError(f"{rows} rows cannot be summed by {parameters.rows_summed}")
-        response = fall_off * (
-            1.0 + parameters.response_spread * rng.standard_normal((rows, columns), dtype=np.float32)
-        )
-        delivered = _sum_rows(response, parameters.rows_summed) / parameters.rows_summed
-        measured = delivered * (1.0 + parameters.calibration_error * rng.standard_normal(delivered.shape))
-        calibration = DetectorCalibration(
-            flat_field=measured.astype(np.float64),
-            exposure_s=parameters.exposure_s,
-            transfer_row_s=parameters.transfer_row_s,
-            clear_row_s=parameters.clear_row_s,
-            rows_summed=parameters.rows_summed,
-            offset_dn=parameters.offset_dn,
-            full_scale_dn=parameters.full_scale_dn,
-        )
-        defects, optics = parameters.defects, parameters.optics
-        hot = None if defects.hot_share == 0.0 else _hot_currents(fall_off.shape, defects, rng)
-        dead = None
-        if defects.dead_share > 0.0:
-            dead = rng.random(fall_off.shape, dtype=np.float32) < defects.dead_share
+        p, rows = parameters, len(fall_off)
+        if rows % p.rows_summed:
+            raise ValueError(f"{rows} rows cannot be summed by {p.rows_summed}")
+        response = fall_off * (1.0 + p.response_spread * rng.standard_normal(fall_off.shape, dtype=np.float32))
+        delivered = _sum_rows(response, p.rows_summed) / p.rows_summed
+        measured = delivered * (1.0 + p.calibration_error * rng.standard_normal(delivered.shape))
+        names = ("exposure_s", "transfer_row_s", "clear_row_s", "rows_summed", "offset_dn", "full_scale_dn")
+        settings = {name: getattr(p, name) for name in names}
+        calibration = DetectorCalibration(flat_field=measured.astype(np.float64), **settings)
+        bad, hot = np.zeros(fall_off.shape, dtype=np.bool_), None
+        if p.defects.hot_share > 0.0:
+            # exponentially distributed over the hot pixels
+            is_hot = rng.random(fall_off.shape, dtype=np.float32) < p.defects.hot_share
+            hot = np.zeros(fall_off.shape, dtype=np.float32)
+            hot[is_hot] = p.defects.hot_e_s * rng.standard_exponential(int(is_hot.sum()), dtype=np.float32)
+            bad |= hot > 0.0
+        if p.defects.dead_share > 0.0:
+            dead = rng.random(fall_off.shape, dtype=np.float32) < p.defects.dead_share
             response = np.where(dead, np.float32(0.0), response)
-        if optics.dust_discs > 0:
-            response = response * dust_transmission(fall_off.shape, optics, rng)
-        bad = [one for one in (None if hot is None else hot > 0.0, dead) if one is not None]
-        listed = None
-        if defects.listed and bad:
-            listed = _sum_rows(np.logical_or.reduce(bad).astype(np.float32), parameters.rows_summed) > 0.0
-        return cls(parameters, response.astype(np.float32), calibration, hot, listed)
+            bad |= dead
+        if p.optics.dust_discs > 0:
+            response = response * dust_transmission(fall_off.shape, p.optics, rng)
+        has_list = p.defects.listed and (p.defects.hot_share > 0.0 or p.defects.dead_share > 0.0)
+        listed = _sum_rows(bad.astype(np.float32), p.rows_summed) > 0.0 if has_list else None
+        return cls(p, response.astype(np.float32), calibration, hot, listed)
 
     def with_exposure(self, exposure_s: float) -> Detector:
         """Return the same detector with another exposure time, also in its calibration."""
@@ -173,14 +165,11 @@ class Detector:
     def window(self, column: int, row: int, size: tuple[int, int]) -> Detector:
         """Return the part of the detector read by a subframe: upper left pixel and size (columns, rows).
 
-        Its pixels are those of the whole detector, except for noise. The part is cleared and shifted out as if it were
-        the whole detector next to the storage area: its packets gather smear under its own rows only. In the whole
-        detector a packet also passes `row` rows before the part on its way out, and the rows after the part during the
-        clearing. A subframe therefore lacks about ``row * transfer_row_s / exposure_s`` of the mean radiance of the
-        rows before it, column by column, and the same of the rows after it with `clear_row_s`. It is exact for a
-        detector without smear, such as the research rover's cameras and the XC-55. Where smear matters, expose the
-        whole picture and crop it. Raises ValueError if the part is empty, leaves the detector or cuts through summed
-        rows.
+        Its pixels are those of the whole detector, except for noise. Packets gather smear under the part's own rows
+        only: a subframe lacks about ``row * transfer_row_s / exposure_s`` of the mean radiance of the rows before it,
+        column by column, and the same of the rows after it with `clear_row_s`. It is exact for a detector without
+        smear, such as the XC-55. Where smear matters, expose the whole picture and crop it. Raises ValueError if the
+        part is empty, leaves the detector or cuts through summed rows.
         """
         rows, columns = self.response.shape
         count = self.parameters.rows_summed
@@ -192,21 +181,13 @@ class Detector:
                 f"{columns} x {rows}"
             )
         part = np.s_[row : row + size[1], column : column + size[0]]
-        measured = self.calibration.flat_field[row // count : (row + size[1]) // count, part[1]]
-        return replace(
-            self,
-            response=np.ascontiguousarray(self.response[part]),
-            calibration=replace(self.calibration, flat_field=measured),
-            hot_e_s=None if self.hot_e_s is None else self.hot_e_s[part],
-            listed=None if self.listed is None else self.listed[row // count : (row + size[1]) // count, part[1]],
-        )
+        summed = np.s_[row // count : (row + size[1]) // count, part[1]]
+        hot = None if self.hot_e_s is None else self.hot_e_s[part]
+        listed = None if self.listed is None else self.listed[summed]
+        calibration = replace(self.calibration, flat_field=self.calibration.flat_field[summed])
+        return replace(self, response=self.response[part].copy(), calibration=calibration, hot_e_s=hot, listed=listed)
 
-    def expose(
-        self,
-        radiance: Float32[np.ndarray, "rows columns"],
-        rng: np.random.Generator,
-        motion: ImageMotion | None = None,
-    ) -> UInt16[np.ndarray, "delivered_rows columns"]:
+    def expose(self, radiance: Picture, rng: np.random.Generator, motion: ImageMotion | None = None) -> Delivered:
         """Simulate the counts of one exposure from the scene's radiance factor at mid exposure."""
         p = self.parameters
         mean = _sum_rows(self.charge(radiance, motion), p.rows_summed) + self.dark_charge()
@@ -214,16 +195,20 @@ class Detector:
         electrons = rng.poisson(np.maximum(mean, 0.0)).astype(np.float32)
         electrons += np.float32(p.read_noise_e) * rng.standard_normal(electrons.shape, dtype=np.float32)
         np.minimum(electrons, np.float32(p.full_well_e), out=electrons)
-        counts = _add_bursts(electrons / np.float32(p.gain_e_dn) + np.float32(p.offset_dn), p.bursts, rng)
-        rounded = np.clip(np.rint(counts), 0, p.full_scale_dn)
-        delivered: UInt16[np.ndarray, "delivered_rows columns"] = rounded.astype(np.uint16)
+        counts = electrons / np.float32(p.gain_e_dn) + np.float32(p.offset_dn)
+        if p.bursts.bursts > 0.0:
+            # at random positions of the readout, along the rows
+            readout = counts.reshape(-1)
+            for _ in range(int(rng.poisson(p.bursts.bursts))):
+                start = int(rng.integers(readout.size))
+                burst = readout[start : start + 1 + int(rng.exponential(p.bursts.length_px))]
+                burst += np.float32(p.bursts.amplitude_dn) * rng.standard_normal(burst.size, dtype=np.float32)
+        delivered: Delivered = np.clip(np.rint(counts), 0, p.full_scale_dn).astype(np.uint16)
         if self.listed is not None:
             delivered = fill_bad_pixels(delivered, self.listed)
         return expand(compand(delivered, p.full_scale_dn), p.full_scale_dn) if p.companded else delivered
 
-    def charge(
-        self, radiance: Float32[np.ndarray, "rows columns"], motion: ImageMotion | None = None
-    ) -> Float32[np.ndarray, "rows columns"]:
+    def charge(self, radiance: Picture, motion: ImageMotion | None = None) -> Picture:
         """Compute the mean photo charge in electrons of each physical pixel at the end of the transfer.
 
         Besides its exposure, a packet collects light from the rows that it passes: during the clearing before the
@@ -238,7 +223,7 @@ class Detector:
             seconds *= np.float32(p.responsivity_e_s)
             return seconds
         rate = scene * self.response * np.float32(p.responsivity_e_s)
-        charge: Float32[np.ndarray, "rows columns"] = np.float32(p.exposure_s) * rate
+        charge: Picture = np.float32(p.exposure_s) * rate
         if p.transfer_row_s > 0.0 or p.clear_row_s > 0.0:
             passed = np.cumsum(rate, axis=0)
             charge += np.float32(p.transfer_row_s) * (passed - rate)
@@ -267,19 +252,7 @@ def _sum_rows(picture: Float[np.ndarray, "rows columns"], count: int) -> Float[n
     return np.asarray(picture.reshape(rows // count, count, columns).sum(axis=1))
 
 
-def _hot_currents(
-    shape: tuple[int, int], parameters: DefectParameters, rng: np.random.Generator
-) -> Float32[np.ndarray, "rows columns"]:
-    """Excess dark current at 0 deg C, electrons per second; exponentially distributed over the hot pixels."""
-    hot = rng.random(shape, dtype=np.float32) < parameters.hot_share
-    current = np.zeros(shape, dtype=np.float32)
-    current[hot] = parameters.hot_e_s * rng.standard_exponential(int(hot.sum()), dtype=np.float32)
-    return current
-
-
-def fill_bad_pixels(
-    counts: UInt16[np.ndarray, "rows columns"], bad: Bool[np.ndarray, "rows columns"]
-) -> UInt16[np.ndarray, "rows columns"]:
+def fill_bad_pixels(counts: Counts, bad: Bool[np.ndarray, "rows columns"]) -> Counts:
     """Replace bad pixels by the mean of the good ones among their eight neighbours, if there are any."""
     good = np.where(bad, 0.0, 1.0)
     total, fraction = (uniform_filter(values, 3, mode="constant") for values in (good * counts, good))
@@ -288,20 +261,6 @@ def fill_bad_pixels(
     repaired = counts.copy()
     repaired[fillable] = np.rint(total[fillable] / fraction[fillable]).astype(np.uint16)
     return repaired
-
-
-def _add_bursts(
-    counts: Float32[np.ndarray, "rows columns"], parameters: BurstParameters, rng: np.random.Generator
-) -> Float32[np.ndarray, "rows columns"]:
-    """Add bursts of noise at random positions of the readout, along the rows."""
-    if parameters.bursts == 0.0:
-        return counts
-    disturbed = counts.reshape(-1).copy()
-    for _ in range(int(rng.poisson(parameters.bursts))):
-        start = int(rng.integers(disturbed.size))
-        burst = disturbed[start : start + 1 + int(rng.exponential(parameters.length_px))]
-        burst += np.float32(parameters.amplitude_dn) * rng.standard_normal(burst.size, dtype=np.float32)
-    return disturbed.reshape(counts.shape)
 
 
 @cache
@@ -329,12 +288,12 @@ def expansion_table(full_scale_dn: int) -> UInt16[np.ndarray, "codes"]:
     return counts
 
 
-def compand(counts: UInt16[np.ndarray, "rows columns"], full_scale_dn: int) -> UInt8[np.ndarray, "rows columns"]:
+def compand(counts: Counts, full_scale_dn: int) -> UInt8[np.ndarray, "rows columns"]:
     """Compress counts to 8-bit codes."""
     return np.asarray(compression_table(full_scale_dn)[counts])
 
 
-def expand(codes: UInt8[np.ndarray, "rows columns"], full_scale_dn: int) -> UInt16[np.ndarray, "rows columns"]:
+def expand(codes: UInt8[np.ndarray, "rows columns"], full_scale_dn: int) -> Counts:
     """Expand 8-bit codes to counts."""
     return np.asarray(expansion_table(full_scale_dn)[codes])
 
@@ -355,7 +314,7 @@ class AutoExposure:
 
 def auto_expose(
     detector: Detector,
-    radiance: Float32[np.ndarray, "rows columns"],
+    radiance: Picture,
     parameters: AutoExposureParameters,
     rng: np.random.Generator,
     region: tuple[slice, slice] | None = None,
@@ -367,15 +326,23 @@ def auto_expose(
     - rng: random stream of the test pictures' noise
     - region: rows and columns of the delivered picture whose percentile is used; all by default
 
-    Raises ValueError if the region has no pixel.
+    The factor on the exposure time is 1/8 to 8, and a quarter if the counts saturate. Raises ValueError if the region
+    has no pixel.
     """
     tried: list[float] = []
-    exposure = float(np.clip(detector.parameters.exposure_s, parameters.least_s, parameters.most_s))
+    p = detector.parameters
+    saturation = min(float(p.full_scale_dn), p.full_well_e / p.gain_e_dn + p.offset_dn)
+    exposure = float(np.clip(p.exposure_s, parameters.least_s, parameters.most_s))
     while True:
         current = detector.with_exposure(exposure)
         tried.append(exposure)
-        counts = current.expose(radiance, rng, motion)
-        factor = _correction(counts if region is None else counts[region], current, parameters)
+        counts = current.expose(radiance, rng, motion)[region or np.s_[:]]
+        if counts.size == 0:
+            raise ValueError("auto-exposure was given a region without pixels")
+        level = float(np.percentile(counts, parameters.percentile))
+        signal = max(level - p.offset_dn, 1.0)
+        factor = float(np.clip((parameters.target * saturation - p.offset_dn) / signal, 0.125, 8.0))
+        factor = 0.25 if level >= 0.99 * saturation else factor
         converged = abs(factor - 1.0) <= parameters.tolerance
         following = float(np.clip(exposure * factor, parameters.least_s, parameters.most_s))
         if converged or following == exposure:
@@ -383,18 +350,3 @@ def auto_expose(
         if len(tried) == parameters.pictures:
             return AutoExposure(detector.with_exposure(following), tuple(tried), False)
         exposure = following
-
-
-def _correction(
-    counts: UInt16[np.ndarray, "rows columns"], detector: Detector, parameters: AutoExposureParameters
-) -> float:
-    """Factor on the exposure time: 1/8 to 8, and a quarter if the counts saturate."""
-    if counts.size == 0:
-        raise ValueError("auto-exposure was given a region without pixels")
-    p = detector.parameters
-    saturation = min(float(p.full_scale_dn), p.full_well_e / p.gain_e_dn + p.offset_dn)
-    level = float(np.percentile(counts, parameters.percentile))
-    if level >= 0.99 * saturation:
-        return 0.25
-    signal = max(level - p.offset_dn, 1.0)
-    return float(np.clip((parameters.target * saturation - p.offset_dn) / signal, 0.125, 8.0))

@@ -21,12 +21,16 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.parameters import NonNegative, Parameters, Positive
-from marsyard.sim.sensor.instrument import Clock, ClockParameters, GaussMarkov
+from marsyard.sim.sensor.instrument import Clock, ClockParameters, GaussMarkov, Times
 
-#: Standard gravity, the unit of accelerometer specifications.
-STANDARD_GRAVITY_M_S2 = 9.80665
+STANDARD_GRAVITY_M_S2 = 9.80665  #: Standard gravity, the unit of accelerometer specifications.
+MILLI_G = 1e-3 * STANDARD_GRAVITY_M_S2
 DEG_H = np.radians(1.0) / 3600.0
 DEG_SQRT_H = np.radians(1.0) / 60.0
+Vector = Float64[np.ndarray, "3"]
+Vectors = Float64[np.ndarray, "n 3"]
+Boundaries = Float64[np.ndarray, "m"]
+Quaternions = Float64[np.ndarray, "n 4"]  #: In the order x, y, z, w.
 
 
 class WarmUp(Parameters):
@@ -36,10 +40,9 @@ class WarmUp(Parameters):
     change_k: Annotated[float, Field(ge=-100.0, le=100.0, description="final change, K")] = 0.0
     time_constant_s: Annotated[Positive, Field(description="time constant of the approach, s")] = 600.0
 
-    def temperature_k(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+    def temperature_k(self, times_s: Times) -> Times:
         """Compute the temperature less the calibration temperature, K."""
-        since = np.maximum(times_s - self.start_s, 0.0)
-        return np.asarray(-self.change_k * np.expm1(-since / self.time_constant_s))
+        return np.asarray(-self.change_k * np.expm1(-np.maximum(times_s - self.start_s, 0.0) / self.time_constant_s))
 
 
 class ImuParameters(Parameters):
@@ -95,11 +98,11 @@ class Triad:
     - count: resolution, unit; 0 for no rounding
     """
 
-    bias: Float64[np.ndarray, "3"]
-    bias_per_k: Float64[np.ndarray, "3"]
+    bias: Vector
+    bias_per_k: Vector
     wander: GaussMarkov
     warm_up: WarmUp
-    scale: Float64[np.ndarray, "3"]
+    scale: Vector
     misalignment: Float64[np.ndarray, "3 3"]
     random_walk: float
     count: float
@@ -109,19 +112,17 @@ class Triad:
         """Matrix of scale and misalignment errors: measured less true input is this matrix times the input."""
         return np.asarray(np.diag(self.scale) + self.misalignment)
 
-    def bias_at(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
+    def bias_at(self, times_s: Times) -> Vectors:
         """Compute the total bias: constant, thermal and time-correlated; unit/s."""
         thermal = self.warm_up.temperature_k(times_s)[:, None] * self.bias_per_k
         return np.asarray(self.bias + thermal + self.wander.at(times_s))
 
-    def measure(
-        self, true: Float64[np.ndarray, "n 3"], boundaries_s: Float64[np.ndarray, "m"], rng: np.random.Generator
-    ) -> Float64[np.ndarray, "n 3"]:
+    def measure(self, true: Vectors, boundaries_s: Boundaries, rng: np.random.Generator) -> Vectors:
         """Measure true increments between m = n + 1 boundaries; rounding residuals are carried over."""
         steps = np.diff(boundaries_s)[:, None]
         noise = self.random_walk * np.sqrt(steps) * rng.standard_normal(true.shape)
         bias = self.bias_at(0.5 * (boundaries_s[1:] + boundaries_s[:-1])) * steps
-        measured: Float64[np.ndarray, "n 3"] = true + true @ self.sensitivity_error.T + bias + noise
+        measured: Vectors = true + true @ self.sensitivity_error.T + bias + noise
         if self.count == 0.0:
             return measured
         counts = np.rint(np.cumsum(measured, axis=0) / self.count)
@@ -138,10 +139,10 @@ class ImuIncrements:
     - delta_velocities_m_s: integrals of specific force over each interval, in the body axes at its start
     """
 
-    times_s: Float64[np.ndarray, "m"]
+    times_s: Boundaries
     period_s: float
-    delta_angles_rad: Float64[np.ndarray, "n 3"]
-    delta_velocities_m_s: Float64[np.ndarray, "n 3"]
+    delta_angles_rad: Vectors
+    delta_velocities_m_s: Vectors
 
 
 @dataclass(frozen=True)
@@ -157,37 +158,32 @@ class Imu:
     def drawn(cls, parameters: ImuParameters, span_s: tuple[float, float], rng: np.random.Generator) -> Imu:
         """Draw the errors for use within a time span."""
         p = parameters
-        milli_g = 1e-3 * STANDARD_GRAVITY_M_S2
-        gyro_wander, force_wander = (
-            np.full(3, p.gyro_wander_deg_h * DEG_H),
-            np.full(3, p.accelerometer_wander_mg * milli_g),
-        )
-        return cls(
-            parameters,
-            gyro=Triad(
-                bias=p.gyro_bias_deg_h * DEG_H * rng.standard_normal(3),
-                bias_per_k=p.gyro_bias_deg_h_k * DEG_H * rng.standard_normal(3),
-                wander=GaussMarkov.drawn(gyro_wander, p.gyro_wander_s, span_s, rng),
-                warm_up=p.warm_up,
-                scale=1e-6 * p.gyro_scale_ppm * rng.standard_normal(3),
-                misalignment=1e-3 * p.gyro_misalignment_mrad * _off_diagonal(rng),
-                random_walk=p.angular_random_walk_deg_sqrt_h * DEG_SQRT_H,
-                count=p.gyro_count_rad,
-            ),
-            accelerometer=Triad(
-                bias=p.accelerometer_bias_mg * milli_g * rng.standard_normal(3),
-                bias_per_k=p.accelerometer_bias_mg_k * milli_g * rng.standard_normal(3),
-                wander=GaussMarkov.drawn(force_wander, p.accelerometer_wander_s, span_s, rng),
-                warm_up=p.warm_up,
-                scale=1e-6 * p.accelerometer_scale_ppm * rng.standard_normal(3),
-                misalignment=1e-3 * p.accelerometer_misalignment_mrad * _off_diagonal(rng),
-                random_walk=1e-3 * p.velocity_random_walk_ug_sqrt_hz * milli_g,
-                count=p.accelerometer_count_m_s,
-            ),
-            clock=Clock.drawn(p.clock, rng),
-        )
 
-    def boundaries(self, start_s: float, end_s: float) -> Float64[np.ndarray, "m"]:
+        def triad(sensor: str, biases: tuple[float, ...], wander_s: float, random_walk: float, count: float) -> Triad:
+            """Draw the errors of three sensors; `biases`: constant bias, its change per K, and wander, SI units."""
+            bias, per_k, wander = biases
+            return Triad(
+                bias=bias * rng.standard_normal(3),
+                bias_per_k=per_k * rng.standard_normal(3),
+                wander=GaussMarkov.drawn(np.full(3, wander), wander_s, span_s, rng),
+                warm_up=p.warm_up,
+                scale=1e-6 * getattr(p, f"{sensor}_scale_ppm") * rng.standard_normal(3),
+                misalignment=1e-3
+                * getattr(p, f"{sensor}_misalignment_mrad")
+                * (rng.standard_normal((3, 3)) * (1.0 - np.eye(3))),
+                random_walk=random_walk,
+                count=count,
+            )
+
+        rates = (p.gyro_bias_deg_h * DEG_H, p.gyro_bias_deg_h_k * DEG_H, p.gyro_wander_deg_h * DEG_H)
+        gyro = triad("gyro", rates, p.gyro_wander_s, p.angular_random_walk_deg_sqrt_h * DEG_SQRT_H, p.gyro_count_rad)
+        forces = (p.accelerometer_bias_mg, p.accelerometer_bias_mg_k, p.accelerometer_wander_mg)
+        walk = 1e-3 * p.velocity_random_walk_ug_sqrt_hz * MILLI_G
+        biases = tuple(force * MILLI_G for force in forces)
+        accelerometer = triad("accelerometer", biases, p.accelerometer_wander_s, walk, p.accelerometer_count_m_s)
+        return cls(parameters, gyro, accelerometer, Clock.drawn(p.clock, rng))
+
+    def boundaries(self, start_s: float, end_s: float) -> Boundaries:
         """Compute the true times of the sample boundaries from start to the last one not after the end."""
         count = int(np.floor((end_s - start_s) * self.parameters.rate_hz + 1e-9))
         if count < 1:
@@ -208,40 +204,31 @@ class Imu:
         )
 
 
-def true_increments(
-    trajectory: Trajectory, boundaries_s: Float64[np.ndarray, "m"]
-) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+def true_increments(trajectory: Trajectory, boundaries_s: Boundaries) -> tuple[Vectors, Vectors]:
     """Compute rotation vectors between boundaries and integrals of specific force in the body axes at each start.
 
     Specific force is integrated in world axes as a cubic spline through the boundaries. For a frequency f the relative
     error is of the order of (2 pi f step)^4 / 720: 1e-9 for a nodding of 1 Hz at 400 samples per second.
     """
     motion = trajectory.motion(boundaries_s)
-    attitudes = motion.attitudes
-    forces = attitudes.apply(motion.specific_forces_m_s2)
+    forces = motion.attitudes.apply(motion.specific_forces_m_s2)
     gained = np.diff(CubicSpline(boundaries_s, forces).antiderivative()(boundaries_s), axis=0)
-    at_start = attitudes[:-1].inv()
-    turns = Rotation.from_quat(products(at_start.as_quat(), attitudes[1:].as_quat()))
+    at_start = motion.attitudes[:-1].inv()
+    turns = Rotation.from_quat(multiply_quaternions(at_start.as_quat(), motion.attitudes[1:].as_quat()))
     return turns.as_rotvec(), at_start.apply(gained)
 
 
-def _off_diagonal(rng: np.random.Generator) -> Float64[np.ndarray, "3 3"]:
-    return np.asarray(rng.standard_normal((3, 3)) * (1.0 - np.eye(3)))
-
-
-def products(left: Float64[np.ndarray, "n 4"], right: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
+def multiply_quaternions(left: Quaternions, right: Quaternions) -> Quaternions:
     """Multiply quaternions (x, y, z, w) pairwise, several times faster than `Rotation`; the right one acts first."""
     ax, ay, az, aw = left.T
     bx, by, bz, bw = right.T
-    product: Float64[np.ndarray, "n 4"] = np.empty(left.shape)
-    product[:, 0] = aw * bx + ax * bw + ay * bz - az * by
-    product[:, 1] = aw * by + ay * bw + az * bx - ax * bz
-    product[:, 2] = aw * bz + az * bw + ax * by - ay * bx
-    product[:, 3] = aw * bw - ax * bx - ay * by - az * bz
-    return product
+    x = aw * bx + ax * bw + ay * bz - az * by
+    y = aw * by + ay * bw + az * bx - ax * bz
+    z = aw * bz + az * bw + ax * by - ay * bx
+    return np.stack([x, y, z, aw * bw - ax * bx - ay * by - az * bz], axis=1)
 
 
-def running_products(steps: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 4"]:
+def accumulate_quaternions(steps: Quaternions) -> Quaternions:
     """Compute the products of the first 1, 2, ... n quaternions, each step to the right of those before it.
 
     Recursion: the products of pairs give every second running product; the others follow from these.
@@ -249,9 +236,9 @@ def running_products(steps: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "
     count = len(steps)
     if count == 1:
         return steps
-    through_pairs = running_products(products(steps[: count - 1 : 2], steps[1::2]))
+    through_pairs = accumulate_quaternions(multiply_quaternions(steps[: count - 1 : 2], steps[1::2]))
     running = np.empty((count, 4))
     running[0] = steps[0]
     running[1::2] = through_pairs
-    running[2::2] = products(through_pairs[: (count - 1) // 2], steps[2::2])
+    running[2::2] = multiply_quaternions(through_pairs[: (count - 1) // 2], steps[2::2])
     return running

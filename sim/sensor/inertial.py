@@ -23,12 +23,12 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.parameters import NonNegative, Parameters, Positive
-from marsyard.sim.sensor.imu import Imu, ImuIncrements, products, running_products
+from marsyard.sim.sensor.imu import Imu, ImuIncrements, Vector, Vectors, accumulate_quaternions, multiply_quaternions
+from marsyard.sim.sensor.instrument import Times
 
 #: Steps of the propagation per second: at 2 rpm the midpoint rule's error is 5e-5 of the effect that the spin averages.
 STEPS_PER_S = 5.0
-#: Mean of sin^4, the shape of the deceleration over the entry.
-_MEAN_SIN4 = 3.0 / 8.0
+_MEAN_SIN4 = 3.0 / 8.0  #: Mean of sin^4, the shape of the deceleration over the entry.
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,10 @@ class NavigationErrors:
     - velocity_m_s: estimated less true velocity, world axes
     """
 
-    attitude_rad: Float64[np.ndarray, "3"]
-    velocity_m_s: Float64[np.ndarray, "3"]
+    attitude_rad: Vector
+    velocity_m_s: Vector
 
-    def apply(
-        self, attitude: Rotation, velocity_m_s: Float64[np.ndarray, "3"]
-    ) -> tuple[Rotation, Float64[np.ndarray, "3"]]:
+    def apply(self, attitude: Rotation, velocity_m_s: Vector) -> tuple[Rotation, Vector]:
         """Add the errors to a true attitude and velocity."""
         return Rotation.from_rotvec(self.attitude_rad) * attitude, velocity_m_s + self.velocity_m_s
 
@@ -64,35 +62,30 @@ class InertialSolution:
 
     @classmethod
     def propagate(
-        cls,
-        increments: ImuIncrements,
-        attitude: Rotation,
-        velocity_m_s: Float64[np.ndarray, "3"],
-        gravity_m_s2: float,
+        cls, increments: ImuIncrements, attitude: Rotation, velocity_m_s: Vector, gravity_m_s2: float
     ) -> InertialSolution:
         """Propagate from an estimated attitude and velocity at the first boundary, with gravity along world -z."""
         turns = Rotation.from_rotvec(increments.delta_angles_rad).as_quat()
-        attitudes = Rotation.from_quat(running_products(np.concatenate([attitude.as_quat()[None], turns])))
+        attitudes = Rotation.from_quat(accumulate_quaternions(np.concatenate([attitude.as_quat()[None], turns])))
         gravity = np.array([0.0, 0.0, -gravity_m_s2])
         gained = attitudes[:-1].apply(increments.delta_velocities_m_s) + gravity * increments.period_s
         velocities = velocity_m_s + _running_sums(gained)
         moved = 0.5 * (velocities[1:] + velocities[:-1]) * increments.period_s
         return cls(increments, attitudes, velocities, _running_sums(moved))
 
-    def attitude(self, times_s: Float64[np.ndarray, "n"]) -> Rotation:
+    def attitude(self, times_s: Times) -> Rotation:
         """Interpolate attitudes at time tags with a constant rate between samples."""
         interval, fraction = self._locate(times_s)
-        return self.attitudes[interval] * Rotation.from_rotvec(
-            fraction[:, None] * self.increments.delta_angles_rad[interval]
-        )
+        turns = fraction[:, None] * self.increments.delta_angles_rad[interval]
+        return self.attitudes[interval] * Rotation.from_rotvec(turns)
 
-    def velocity(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
+    def velocity(self, times_s: Times) -> Vectors:
         """Interpolate velocities at time tags linearly between samples, world axes."""
         interval, fraction = self._locate(times_s)
         before, after = self.velocities_m_s[interval], self.velocities_m_s[interval + 1]
         return np.asarray(before + fraction[:, None] * (after - before))
 
-    def mean_velocities(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "intervals 3"]:
+    def mean_velocities(self, times_s: Times) -> Float64[np.ndarray, "intervals 3"]:
         """Compute mean velocities between successive time tags, world axes; acceleration is constant in a sample."""
         interval, fraction = self._locate(times_s)
         before, after = self.velocities_m_s[interval], self.velocities_m_s[interval + 1]
@@ -100,7 +93,7 @@ class InertialSolution:
         displacements = self.displacements_m[interval] + elapsed * (before + 0.5 * fraction[:, None] * (after - before))
         return np.asarray(np.diff(displacements, axis=0) / np.diff(times_s)[:, None])
 
-    def _locate(self, times_s: Float64[np.ndarray, "n"]) -> tuple[np.ndarray, Float64[np.ndarray, "n"]]:
+    def _locate(self, times_s: Times) -> tuple[np.ndarray, Times]:
         """Interval of each time, and its elapsed fraction. Raises ValueError before the first or after the last tag."""
         tags = self.increments.times_s
         if times_s.size and (times_s.min() < tags[0] or times_s.max() > tags[-1]):
@@ -114,7 +107,7 @@ class InertialSolution:
         return interval, np.minimum((times_s - tags[interval]) / length, 1.0)
 
 
-def _running_sums(steps: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "m 3"]:
+def _running_sums(steps: Vectors) -> Float64[np.ndarray, "m 3"]:
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
 
 
@@ -183,29 +176,27 @@ class Approach:
         velocity = p.velocity_sd_m_s * rng.standard_normal(3) + gained.sum(axis=0)
         return NavigationErrors(attitude_rad=attitude[-1], velocity_m_s=velocity)
 
-    def attitudes(self, times_s: Float64[np.ndarray, "n"]) -> Rotation:
+    def attitudes(self, times_s: Times) -> Rotation:
         """Nominal rotations from body to world axes: body -z along the flight direction, spinning about it."""
-        flight = Rotation.from_rotvec(self._off_nadir(times_s)[:, None] * self._turn_axis())
-        spun = Rotation.from_rotvec(self._spun(times_s)[:, None] * np.array([0.0, 0.0, 1.0]))
-        return Rotation.from_quat(products(flight.as_quat(), spun.as_quat()))
+        flight = Rotation.from_rotvec(np.interp(times_s, *self._knots())[:, None] * self._turn_axis())
+        spin = Rotation.from_rotvec(self._spin_angle(times_s)[:, None] * np.array([0.0, 0.0, 1.0]))
+        return Rotation.from_quat(multiply_quaternions(flight.as_quat(), spin.as_quat()))
 
-    def body_rates(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
+    def body_rates(self, times_s: Times) -> Vectors:
         """Nominal angular velocities, body axes, rad/s."""
         # the turn of the flight direction leaves its axis fixed: only the spin moves the axis in the body
         times, angles = self._knots()
         knot_rates = np.concatenate([[0.0], np.diff(angles) / np.diff(times), [0.0]])
         turning = knot_rates[np.searchsorted(times, times_s, side="right")]
-        spun, (first, second, _) = self._spun(times_s), self._turn_axis()
-        rates: Float64[np.ndarray, "n 3"] = np.empty((times_s.size, 3))
-        rates[:, 0] = turning * (np.cos(spun) * first + np.sin(spun) * second)
-        rates[:, 1] = turning * (np.cos(spun) * second - np.sin(spun) * first)
-        rates[:, 2] = np.where(times_s < self._deploy_s(), self._spin_rate(), 0.0)
-        return rates
+        angle, (first, second, _) = self._spin_angle(times_s), self._turn_axis()
+        x = turning * (np.cos(angle) * first + np.sin(angle) * second)
+        y = turning * (np.cos(angle) * second - np.sin(angle) * first)
+        return np.stack([x, y, np.where(times_s < self._deploy_s(), self._spin_rate(), 0.0)], axis=1)
 
-    def specific_forces(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
+    def specific_forces(self, times_s: Times) -> Vectors:
         """Nominal acceleration less gravity, body axes, m/s2: drag along the spin axis."""
         p = self.parameters
-        entering = np.clip((times_s - self._entry_s()) / p.entry_s, 0.0, 1.0)
+        entering = np.clip((times_s - (self._deploy_s() - p.entry_s)) / p.entry_s, 0.0, 1.0)
         drag = p.entry_speed_m_s / (p.entry_s * _MEAN_SIN4) * np.sin(np.pi * entering) ** 4
         hanging = np.maximum(times_s - self._deploy_s(), 0.0)
         braking = p.parachute_speed_m_s / p.inflation_s * np.exp(-hanging / p.inflation_s) + p.gravity_m_s2
@@ -215,26 +206,19 @@ class Approach:
     def _deploy_s(self) -> float:
         return self.end_s - self.parameters.parachute_s
 
-    def _entry_s(self) -> float:
-        return self._deploy_s() - self.parameters.entry_s
-
     def _spin_rate(self) -> float:
         return float(2.0 * np.pi * self.parameters.spin_rpm / 60.0)
 
-    def _spun(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+    def _spin_angle(self, times_s: Times) -> Times:
         return np.asarray(self._spin_rate() * (np.minimum(times_s, self._deploy_s()) - self.start_s))
 
-    def _turn_axis(self) -> Float64[np.ndarray, "3"]:
+    def _turn_axis(self) -> Vector:
         # tilts nadir towards the heading: (0, 0, -1) x (sin a, cos a, 0)
         heading = np.radians(self.parameters.heading_deg)
-        return np.asarray(np.array([np.cos(heading), -np.sin(heading), 0.0]))
+        return np.array([np.cos(heading), -np.sin(heading), 0.0])
 
-    def _knots(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
+    def _knots(self) -> tuple[Vector, Vector]:
         """Times at which the turn rate of the flight direction changes, and its angle from nadir there."""
         p = self.parameters
-        times = np.array([self._entry_s(), self._deploy_s(), self._deploy_s() + p.upright_s])
+        times = self._deploy_s() + np.array([-p.entry_s, 0.0, p.upright_s])
         return times, np.radians([p.entry_off_nadir_deg, p.deploy_off_nadir_deg, 0.0])
-
-    def _off_nadir(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
-        times, angles = self._knots()
-        return np.asarray(np.interp(times_s, times, angles))

@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 import scipy  # scipy.signal is slow to import: it is loaded at its first use
 from jaxtyping import Float64
+from numpy.random import Generator
 from pydantic import Field
 from scipy.interpolate import make_interp_spline
 
@@ -16,6 +17,7 @@ from marsyard.sim.parameters import Parameters
 #: Knots per correlation time. Linear interpolation between them loses at most 1 % of the variance.
 KNOTS_PER_CORRELATION = 50
 _Deviation = Annotated[float, Field(ge=0.0, le=10.0)]
+Times = Float64[np.ndarray, "n"]  #: One time per row, seconds.
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,7 @@ class Readings:
     marks a missing reading.
     """
 
-    times_s: Float64[np.ndarray, "n"]
+    times_s: Times
     values: Float64[np.ndarray, "n *quantity"]
 
 
@@ -38,17 +40,17 @@ class Sampling:
     phase_s: float
 
     @classmethod
-    def drawn(cls, rate_hz: float, rng: np.random.Generator) -> Sampling:
+    def drawn(cls, rate_hz: float, rng: Generator) -> Sampling:
         """Draw a uniformly distributed phase."""
         return cls(rate_hz, float(rng.random()) / rate_hz)
 
-    def within(self, start_s: float, end_s: float) -> Float64[np.ndarray, "n"]:
+    def within(self, start_s: float, end_s: float) -> Times:
         """Return the true times of all samples from start to end."""
         first = np.ceil((start_s - self.phase_s) * self.rate_hz)
         last = np.floor((end_s - self.phase_s) * self.rate_hz)
         return np.asarray(self.phase_s + np.arange(first, last + 1.0) / self.rate_hz)
 
-    def latest(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+    def latest(self, times_s: Times) -> Times:
         """Return the true time of the last sample at or before each time."""
         return np.asarray(self.phase_s + np.floor((times_s - self.phase_s) * self.rate_hz) / self.rate_hz)
 
@@ -69,11 +71,11 @@ class Clock:
     offset_s: float
 
     @classmethod
-    def drawn(cls, parameters: ClockParameters, rng: np.random.Generator) -> Clock:
+    def drawn(cls, parameters: ClockParameters, rng: Generator) -> Clock:
         """Draw the constant offset."""
         return cls(parameters, parameters.offset_s + parameters.offset_sd_s * float(rng.standard_normal()))
 
-    def tags(self, times_s: Float64[np.ndarray, "n"], rng: np.random.Generator) -> Float64[np.ndarray, "n"]:
+    def tags(self, times_s: Times, rng: Generator) -> Times:
         """Return the time tags of events at true times."""
         jitter = self.parameters.jitter_sd_s * rng.standard_normal(times_s.size)
         return np.asarray(times_s + self.offset_s + jitter)
@@ -88,11 +90,7 @@ class GaussMarkov:
 
     @classmethod
     def drawn(
-        cls,
-        sd: Float64[np.ndarray, "channels"],
-        correlation_s: float,
-        span_s: tuple[float, float],
-        rng: np.random.Generator,
+        cls, sd: Float64[np.ndarray, "channels"], correlation_s: float, span_s: tuple[float, float], rng: Generator
     ) -> GaussMarkov:
         """Draw a realisation by standard deviations and correlation time. Raises ValueError for an invalid span."""
         first, last = span_s
@@ -103,12 +101,10 @@ class GaussMarkov:
         decay = np.exp(-step / correlation_s)
         innovations = rng.standard_normal((count, sd.size))
         innovations[1:] *= np.sqrt(1.0 - decay**2)
-        values: Float64[np.ndarray, "knots channels"] = sd * scipy.signal.lfilter(
-            [1.0], [1.0, -decay], innovations, axis=0
-        )
-        return cls(first + step * np.arange(count), values)
+        values = scipy.signal.lfilter([1.0], [1.0, -decay], innovations, axis=0)
+        return cls(first + step * np.arange(count), sd * values)
 
-    def at(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n channels"]:
+    def at(self, times_s: Times) -> Float64[np.ndarray, "n channels"]:
         """Interpolate the process. Raises ValueError if a time is outside the span."""
         if times_s.size and (times_s.min() < self.knots_s[0] or times_s.max() > self.knots_s[-1]):
             raise ValueError(

@@ -49,14 +49,9 @@ def velocity_at(field: Array, step: float, row: float, column: float) -> tuple[f
     """Interpolate the velocity bilinearly at a pixel, rows and columns per second; constant beyond the grid."""
     y = min(max(row / step, 0.0), field.shape[0] - 1.0)
     x = min(max(column / step, 0.0), field.shape[1] - 1.0)
-    i = min(int(y), field.shape[0] - 2)
-    j = min(int(x), field.shape[1] - 2)
-    fy = y - i
-    fx = x - j
-    a = (1.0 - fy) * (1.0 - fx)
-    b = (1.0 - fy) * fx
-    c = fy * (1.0 - fx)
-    d = fy * fx
+    i, j = min(int(y), field.shape[0] - 2), min(int(x), field.shape[1] - 2)
+    fy, fx = y - i, x - j
+    a, b, c, d = (1.0 - fy) * (1.0 - fx), (1.0 - fy) * fx, fy * (1.0 - fx), fy * fx
     return (
         a * field[i, j, 0] + b * field[i, j + 1, 0] + c * field[i + 1, j, 0] + d * field[i + 1, j + 1, 0],
         a * field[i, j, 1] + b * field[i, j + 1, 1] + c * field[i + 1, j, 1] + d * field[i + 1, j + 1, 1],
@@ -82,14 +77,11 @@ def path_kernel(row_path: float, column_path: float, reach: int, kernel: Array) 
     """
     kernel[:] = 0.0
     count = max(1, math.ceil(STEPS_PER_PX * math.sqrt(row_path * row_path + column_path * column_path)))
-    down = np.empty(4)
-    right = np.empty(4)
+    down, right = np.empty(4), np.empty(4)
     for n in range(count):
         fraction = (n + 0.5) / count - 0.5
-        y = fraction * row_path
-        x = fraction * column_path
-        i = math.floor(y)
-        j = math.floor(x)
+        y, x = fraction * row_path, fraction * column_path
+        i, j = math.floor(y), math.floor(x)
         _cubic(y - i, down)
         _cubic(x - j, right)
         for p in range(4):
@@ -105,8 +97,7 @@ def _tap_groups(kernel: Array, groups: NDArray[np.int64]) -> int:
         q = 0
         while q < kernel.shape[1] - 3:
             if abs(kernel[p, q]) > MIN_TAP:
-                groups[count, 0] = p
-                groups[count, 1] = q
+                groups[count, 0], groups[count, 1] = p, q
                 count += 1
                 q += 4
             else:
@@ -138,10 +129,8 @@ def blur(padded: Array32, pad: int, field: Array, step: float, exposure_s: float
                 line[:] = 0.0
                 for n in range(count):
                     p, q = groups[n]
-                    a = np.float32(kernel[p, q])
-                    b = np.float32(kernel[p, q + 1])
-                    c = np.float32(kernel[p, q + 2])
-                    d = np.float32(kernel[p, q + 3])
+                    a, b = np.float32(kernel[p, q]), np.float32(kernel[p, q + 1])
+                    c, d = np.float32(kernel[p, q + 2]), np.float32(kernel[p, q + 3])
                     source = padded[r + p, left + q : left + q + width + 3]
                     for k in range(width):
                         line[k] += a * source[k] + b * source[k + 1] + c * source[k + 2] + d * source[k + 3]
@@ -170,21 +159,15 @@ def _add_moved(
     """
     i, fy = _split(y, shape[0])
     j, fx = _split(x, shape[1] - width)
-    one, next_to = np.float32(1.0), np.uint64(1)
-    a = factor * (one - fy) * (one - fx)
-    b = factor * (one - fy) * fx
-    c = factor * fy * (one - fx)
-    d = factor * fy * fx
+    one, shift = np.float32(1.0), np.uint64(1)
+    a, b = factor * (one - fy) * (one - fx), factor * (one - fy) * fx
+    c, d = factor * fy * (one - fx), factor * fy * fx
     upper = np.uint64(i * shape[1] + j)
     lower = np.uint64((i + 1) * shape[1] + j)
     for n in range(width):
         k = np.uint64(n)
-        line[n] += (
-            a * source[upper + k]
-            + b * source[upper + k + next_to]
-            + c * source[lower + k]
-            + d * source[lower + k + next_to]
-        )
+        above, below = a * source[upper + k] + b * source[upper + k + shift], c * source[lower + k]
+        line[n] += above + below + d * source[lower + k + shift]
 
 
 @njit(cache=True)
@@ -235,8 +218,7 @@ def gather_blocks(transfer: Transfer, prefix: Array32, response: Array32) -> Arr
             for left in range(0, columns, TILE):
                 width = min(TILE, columns - left)
                 by_row, by_column = velocity_at(transfer.field, transfer.step, middle - 0.5, left + 0.5 * (width - 1))
-                y = pad - by_row * time
-                x = pad + left - by_column * time
+                y, x = pad - by_row * time, pad + left - by_column * time
                 line[:] = 0.0
                 _add_moved(sums, prefix.shape, edges[block + 1] + y, x, np.float32(1.0), line, width)
                 _add_moved(sums, prefix.shape, edges[block] + y, x, np.float32(-1.0), line, width)
@@ -257,8 +239,7 @@ def add_smear(transfer: Transfer, gathered: Array32, charge: Array32) -> None:
     seconds = np.float32(transfer.row_s)
     scene, weights, total = padded.reshape(-1), response.reshape(-1), charge.reshape(-1)
     moved = np.empty((np.max(np.diff(edges)), TILE), dtype=np.float32)
-    own = np.empty(TILE, dtype=np.float32)
-    before = np.empty(TILE, dtype=np.float32)
+    own, before = np.empty(TILE, dtype=np.float32), np.empty(TILE, dtype=np.float32)
     change = np.empty(TILE, dtype=np.float32)
     for block in range(len(edges) - 1):
         first, last = edges[block], edges[block + 1]
@@ -267,10 +248,8 @@ def add_smear(transfer: Transfer, gathered: Array32, charge: Array32) -> None:
             width = min(TILE, columns - left)
             middle = 0.5 * (first + last - 1)
             by_row, by_column = velocity_at(transfer.field, transfer.step, middle, left + 0.5 * (width - 1))
-            y = pad - by_row * time
-            x = pad + left - by_column * time
-            moved[:] = 0.0
-            own[:] = 0.0
+            y, x = pad - by_row * time, pad + left - by_column * time
+            moved[:], own[:] = 0.0, 0.0
             for k in range(width):
                 before[k] = gathered[block, left + k]
                 change[k] = gathered[block + 1, left + k] - before[k]

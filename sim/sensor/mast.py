@@ -29,6 +29,7 @@ from marsyard.sim.sensor.presets import preset
 
 Degrees = Annotated[float, Field(ge=0.0, le=10.0)]
 Pixels = Annotated[float, Field(ge=0.0, le=50.0)]
+Angles = Float64[np.ndarray, "2"]  #: Azimuth and elevation.
 
 #: MER's mast: azimuth axis at (0.457, -0.026) m; the elevation axis crosses it 1.096 m above the rover frame of the
 #: labels, which lies 0.29 m above the ground (Opportunity's PDS labels 1N491020376 and 1N491020519; Maki et al. 2003:
@@ -83,8 +84,8 @@ class MastState:
 
     readings_rad: tuple[float, float]
     true_rad: tuple[float, float]
-    axes_rad: Float64[np.ndarray, "2"]
-    motors_rad: Float64[np.ndarray, "2"]
+    axes_rad: Angles
+    motors_rad: Angles
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class Mast:
 
     parameters: PointingParameters
     geometry: MastGeometry
-    zeros_rad: Float64[np.ndarray, "2"]
+    zeros_rad: Angles
 
     @classmethod
     def drawn(cls, parameters: PointingParameters, geometry: MastGeometry, rng: np.random.Generator) -> Mast:
@@ -122,13 +123,12 @@ class Mast:
         """True pose of the head in the rover frame."""
         return self.geometry.rover_from_head(*state.true_rad)
 
-    def _state(self, motors_rad: Float64[np.ndarray, "2"], axes_rad: Float64[np.ndarray, "2"]) -> MastState:
+    def _state(self, motors_rad: Angles, axes_rad: Angles) -> MastState:
         count = np.radians(self.parameters.count_deg)
         readings = count * np.rint(motors_rad / count) if count > 0.0 else motors_rad
         true = axes_rad - self.zeros_rad
-        return MastState(
-            (float(readings[0]), float(readings[1])), (float(true[0]), float(true[1])), axes_rad, motors_rad
-        )
+        read, actual = ((float(angles[0]), float(angles[1])) for angles in (readings, true))
+        return MastState(read, actual, axes_rad, motors_rad)
 
 
 @dataclass(frozen=True)
@@ -139,11 +139,8 @@ class StereoHead:
     calibrated: MastCalibration
 
     @classmethod
-    def drawn(
-        cls, design: MastCalibration, parameters: StereoCalibrationParameters, rng: np.random.Generator
-    ) -> StereoHead:
+    def drawn(cls, design: MastCalibration, p: StereoCalibrationParameters, rng: np.random.Generator) -> StereoHead:
         """Draw the calibration errors of a pair."""
-        p = parameters
         disparity = p.disparity_error_px * rng.uniform(-1.0, 1.0)
         across = p.epipolar_error_px * rng.standard_normal()
         common = Rotation.from_rotvec(np.radians(p.alignment_deg) * rng.standard_normal(3))
@@ -157,15 +154,17 @@ class StereoHead:
             rotation = Rotation.from_rotvec(turn)
             # about the camera's own centre
             pose = rigid(rotation, camera.c - rotation.apply(camera.c.copy()))
-            cameras.append(camera.magnified(float(scale)).moved(pose))
-        left, right = (camera.moved(rigid(common, np.zeros(3))) for camera in cameras)
-        return cls(design, replace(design, left=left, right=right))
+            cameras.append(camera.magnified(float(scale)).moved(pose).moved(rigid(common, np.zeros(3))))
+        return cls(design, replace(design, left=cameras[0], right=cameras[1]))
 
     def disparity_error_px(self, range_m: float) -> float:
         """Calibrated less true disparity of a point at this range straight ahead of each pair."""
-        pairs = [(mast.left, mast.right) for mast in (self.calibrated, self.true)]
-        calibrated, true = (_disparity_px(left, right, range_m) for left, right in pairs)
-        return calibrated - true
+        disparities_px = []
+        for mast in (self.calibrated, self.true):
+            ahead = mast.left.boresight() + mast.right.boresight()
+            point = 0.5 * (mast.left.c + mast.right.c) + range_m * ahead / np.linalg.norm(ahead)
+            disparities_px.append(float(mast.left.project(point)[0][0] - mast.right.project(point)[0][0]))
+        return disparities_px[0] - disparities_px[1]
 
 
 #: From a body whose camera looks along -z, its columns along x, to a head whose cameras look along x, columns along -y.
@@ -190,10 +189,3 @@ def stereo_mast(name: str) -> MastCalibration:
         raise ValueError(f"no mast carries cameras called {name!r}; allowed: {', '.join(MASTS)}")
     left, right = preset(name).cameras()
     return MastCalibration(MASTS[name], left, right)
-
-
-def _disparity_px(left: CameraModel, right: CameraModel, range_m: float) -> float:
-    """Disparity of a point straight ahead of the middle between two cameras."""
-    ahead = left.boresight() + right.boresight()
-    point = 0.5 * (left.c + right.c) + range_m * ahead / np.linalg.norm(ahead)
-    return float(left.project(point)[0][0] - right.project(point)[0][0])

@@ -15,24 +15,17 @@ from jaxtyping import Float, Float32, Float64
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.camera import CameraModel
+from marsyard.sim.sensor.imu import Vector
 from marsyard.sim.sensor.kernels import Transfer, add_smear, block_means, blur, gather_blocks, sums_before
+from marsyard.sim.sensor.optics import Picture
 
-#: Spacing of the velocity grid's nodes, pixels.
-GRID_STEP_PX = 32.0
-#: Distance of points without range (the sky), metres.
-FAR_M = 1e9
-#: Motion below which a picture is still, pixels.
-STILL_PX = 0.01
+GRID_STEP_PX = 32.0  #: Spacing of the velocity grid's nodes, pixels.
+FAR_M = 1e9  #: Distance of points without range (the sky), metres.
+STILL_PX = 0.01  #: Motion below which a picture is still, pixels.
 #: Motion within a block of rows of the transfer, pixels, and minimum and maximum number of rows in a block.
 BLOCK_PX, BLOCK_ROWS = 0.25, (4, 32)
-
-
 #: The padded scene, the response and the charge, which is changed in place.
-_Pictures = tuple[
-    Float32[np.ndarray, "padded_rows padded_columns"],
-    Float32[np.ndarray, "rows columns"],
-    Float32[np.ndarray, "rows columns"],
-]
+_Pictures = tuple[Float32[np.ndarray, "padded_rows padded_columns"], Picture, Picture]
 
 
 @dataclass(frozen=True)
@@ -51,8 +44,8 @@ class ImageMotion:
         camera: CameraModel,
         range_m: Float[np.ndarray, "rows columns"],
         world_from_body: RigidTransform,
-        velocity_m_s: Float64[np.ndarray, "3"],
-        rate_rad_s: Float64[np.ndarray, "3"],
+        velocity_m_s: Vector,
+        rate_rad_s: Vector,
     ) -> ImageMotion:
         """Compute the image motion of a camera (body frame) on a moving body over a static world.
 
@@ -75,7 +68,7 @@ class ImageMotion:
     @property
     def max_px_s(self) -> float:
         """Maximum speed of the nodes, pixels per second."""
-        return float(np.hypot(self.velocity_px_s[..., 0], self.velocity_px_s[..., 1]).max())
+        return float(np.hypot(*np.moveaxis(self.velocity_px_s, -1, 0)).max())
 
     def is_still(self, duration_s: float) -> bool:
         """Whether all motion within this time is below `STILL_PX`."""
@@ -88,13 +81,8 @@ def _nodes(extent: int) -> Float64[np.ndarray, "nodes"]:
 
 
 def moving_exposure(
-    scene: Float32[np.ndarray, "rows columns"],
-    response: Float32[np.ndarray, "rows columns"],
-    motion: ImageMotion,
-    exposure_s: float,
-    transfer_row_s: float,
-    clear_row_s: float,
-) -> Float32[np.ndarray, "rows columns"]:
+    scene: Picture, response: Picture, motion: ImageMotion, exposure_s: float, transfer_row_s: float, clear_row_s: float
+) -> Picture:
     """Compute the exposure of every pixel to a moving scene including clearing and transfer, radiance x seconds.
 
     Beyond the frame's border the scene is constant. At 60 deg/s, 4.9 pixels in an exposure of the descent camera, the
@@ -114,11 +102,11 @@ def moving_exposure(
     blur(inner, near, motion.velocity_px_s, GRID_STEP_PX, exposure_s, charge)
     charge *= np.float32(exposure_s)
     charge *= response
-    start_s = 0.5 * exposure_s
+    pictures = (padded, response, charge)
     if transfer_row_s > 0.0:
-        _add_smear((padded, response, charge), motion, start_s, transfer_row_s)
+        _add_smear(pictures, motion, 0.5 * exposure_s, transfer_row_s)
     if clear_row_s > 0.0:
-        _add_clearing((padded, response, charge), motion, start_s, clear_row_s)
+        _add_clearing(pictures, motion, 0.5 * exposure_s, clear_row_s)
     return charge
 
 

@@ -1,16 +1,12 @@
 """Pose estimation of a rover: wheel odometry with an inertial unit, and optional visual odometry.
 
 Attitude (Ali et al. 2005, as on MER). Accelerometers measure the tilt at each stop, gyros the heading along a drive:
-
-    R_estimated = Rz(heading error) A R_true B N
-
-B is a misalignment of the accelerometers, constant in a run; A, a rotation of the world, makes the estimate exact at
-the start, so that B has an effect only when the rover turns or tilts; N is the noise of a stop. The heading error is
-the sum of a fraction of the turns, a drift along the path and a random walk.
+``R_estimated = Rz(heading error) A R_true B N``. B is a misalignment of the accelerometers, constant in a run. A, a
+rotation of the world, makes the estimate exact at the start: B has an effect only when the rover turns or tilts. N is
+the noise of a stop. The heading error is the sum of a fraction of the turns, a drift along the path and a random walk.
 
 Position by wheels. Each part of a drive adds the commanded path in the estimated axes; slip is not observed:
-
-    dp = R_estimated ((1 + scale) path_commanded + noise)
+``dp = R_estimated ((1 + scale) path_commanded + noise)``.
 
 Position by visual odometry (paper, section 4.2: "roughly 2% of the rover travel distance"). Each drive adds its true
 motion with an own scale error, a random walk and a floor; the attitude is the inertial unit's. If it does not converge,
@@ -22,7 +18,7 @@ start by definition. The estimate assumes flat ground between stops: climbed roc
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated
 
@@ -140,20 +136,20 @@ class Odometer:
         wheels, walk, *tilt = np.split(rng.standard_normal(8), [2, 3, 5])
         fails = bool(rng.random() < p.visual.failure_share)
         if visual and not fails:
-            moved = self._visual_displacement(estimate, driven, tilt[1])
+            start, end = driven.start.world_from_rover, driven.end.world_from_rover
+            error = np.hypot(p.visual.walk_m * np.sqrt(driven.length_m), p.visual.floor_m) * tilt[1]
+            path = (1.0 + self.visual_scale) * (start.inv() * end).translation + error
+            displacement = self._attitude(start, estimate.heading_error_rad).apply(path)
         else:
-            moved = self._wheel_displacement(estimate, driven, p.walk_m * np.sqrt(driven.command.length_m) * wheels)
+            noise_m = p.walk_m * np.sqrt(driven.command.length_m) * wheels
+            displacement = self._wheel_displacement(estimate, driven, noise_m)
         heading = estimate.heading_error_rad + self.heading_scale * driven.turn_left_rad
         heading += self.heading_drift_rad_m * driven.length_m
         heading += float(np.radians(p.heading_walk_deg) * np.sqrt(driven.length_m) * walk[0])
         noise = Rotation.from_rotvec(np.radians(p.tilt_noise_deg) * np.array([*tilt[0], 0.0]))
         attitude = self._attitude(driven.end.world_from_rover, heading) * noise
-        position = estimate.world_from_rover.translation + moved
-        return replace(
-            estimate,
-            world_from_rover=rigid(attitude, position),
-            heading_error_rad=heading,
-            visual_failed=visual and fails,
+        return PoseEstimate(
+            rigid(attitude, estimate.world_from_rover.translation + displacement), heading, visual and fails
         )
 
     @cached_property
@@ -178,14 +174,3 @@ class Odometer:
         true = Rotation.concatenate([part.before.world_from_rover.rotation for part in driven.parts])
         turn = Rotation.from_rotvec([0.0, 0.0, estimate.heading_error_rad]) * self._anchor
         return np.asarray((turn * true * self.misalignment).apply(paths).sum(axis=0))
-
-    def _visual_displacement(
-        self, estimate: PoseEstimate, driven: Drive, draws: Float64[np.ndarray, "3"]
-    ) -> Float64[np.ndarray, "3"]:
-        """Displacement by visual odometry, world axes."""
-        p = self.parameters.visual
-        start, end = driven.start.world_from_rover, driven.end.world_from_rover
-        motion = (start.inv() * end).translation
-        error = np.hypot(p.walk_m * np.sqrt(driven.length_m), p.floor_m) * draws
-        attitude = self._attitude(start, estimate.heading_error_rad)
-        return np.asarray(attitude.apply((1.0 + self.visual_scale) * motion + error))

@@ -1,9 +1,8 @@
 """Optics and radiometry of a camera: sunlight to electrons, point spread, natural fall-off and dust on the lens.
 
 A surface of radiance factor I/F under the solar photon irradiance E shows the radiance (I/F) E / pi. Behind a lens of
-f-number N and transmission T a pixel of area A gathers on axis
-
-    rate = (I/F) A T / (4 N^2)  integral of E(wavelength) T_filter(wavelength) QE(wavelength)      electrons per second
+f-number N and transmission T a pixel of area A gathers, on axis, electrons per second at the rate
+``(I/F) A T / (4 N^2)  integral of E(wavelength) T_filter(wavelength) QE(wavelength)``.
 
 The sun is a black body of 5772 K and of its true size (IAU 2015 Resolution B3): 1361 W/m2 at 1 AU. Between 400 and
 1100 nm that is within a few per cent of the measured spectrum, less than the uncertainty of quantum efficiency and lens
@@ -35,12 +34,11 @@ _SUN_K, _SUN_RADIUS_M, _AU_M = 5772.0, 6.957e8, 1.495978707e11
 
 #: Calibrated: signal for an SNR of 103 without dark current at `DARKEST_RADIANCE_FACTOR`; window and losses included.
 LENS_TRANSMISSION = 0.519
-#: Calibrated: dark current of a 12 um pixel at 0 deg C, electrons per second (0.018 nA/cm2).
-DARK_E_S = 159.0
-#: Radiance factor of the darkest terrain: albedo 0.1 under an afternoon sun.
-DARKEST_RADIANCE_FACTOR = 0.07
-#: Optical density of reflection at the two surfaces of a plate of index 1.51.
-REFLECTION_DENSITY = -2.0 * float(np.log10(1.0 - (0.51 / 2.51) ** 2))
+DARK_E_S = 159.0  #: Calibrated: dark current of a 12 um pixel at 0 deg C, electrons per second (0.018 nA/cm2).
+DARKEST_RADIANCE_FACTOR = 0.07  #: Radiance factor of the darkest terrain: albedo 0.1 under an afternoon sun.
+#: Optical densities of the paper's filters (III.B.2), weighted by the detector's solar response, with the reflection at
+#: both surfaces: 1.44 mm of NG4 in flight, 1.35 mm of NG3 in the field test.
+NG4_FLIGHT, NG3_FIELD = 0.67, 0.97
 #: Assumed: relative change of a neutral glass' density per 100 nm. Filters of the paper's densities then transmit the
 #: paper's 22 % and 11 % (a flat density would give 21.4 % and 10.7 %).
 DENSITY_SLOPE_PER_100_NM = -0.085
@@ -50,11 +48,12 @@ _QE_NM = np.arange(400.0, 1101.0, 50.0)
 _QE = np.array([15.0, 22.0, 28.0, 33.0, 38.0, 42.0, 43.0, 40.0, 34.0, 27.0, 19.0, 11.0, 5.0, 2.0, 0.0]) / 100.0
 #: Default exposure: a radiance factor of 0.3 fills 60 % of the full well.
 BRIGHT_RADIANCE_FACTOR, BRIGHT_FILL = 0.3, 0.6
-#: Half size of the point spread's kernel, pixels.
-REACH_PX = 6
+REACH_PX = 6  #: Half size of the point spread's kernel, pixels.
+Picture = Float32[np.ndarray, "rows columns"]
 #: Fraction of the field angle by which a fisheye's pupil is foreshortened: a MER front hazcam's, measured on the sky of
 #: Opportunity's picture 1F483288473EFFCMUFP1214L0M1 from 60 to 85 deg off axis (not flat-fielded; to 10 %).
 PUPIL_FRACTION = 0.95
+Spectrum = Float64[np.ndarray, "n"]  #: One value per wavelength.
 
 
 def bright_exposure_s(full_well_e: float, responsivity_e_s: float) -> float:
@@ -63,30 +62,11 @@ def bright_exposure_s(full_well_e: float, responsivity_e_s: float) -> float:
 
 
 @dataclass(frozen=True)
-class NeutralDensity:
-    """A neutral-density filter of a glass; the density per millimetre is weighted by the detector's solar response."""
-
-    glass: str
-    thickness_mm: float
-    density_per_mm: float
-
-    @property
-    def optical_density(self) -> float:
-        """Spectrally weighted optical density, including the reflection at both surfaces."""
-        return REFLECTION_DENSITY + self.density_per_mm * self.thickness_mm
-
-
-#: The paper's filters (III.B.2); densities per millimetre are calibrated to its optical densities 0.67 and 0.97.
-NG4_FLIGHT = NeutralDensity("NG4", 1.44, (0.67 - REFLECTION_DENSITY) / 1.44)
-NG3_FIELD = NeutralDensity("NG3", 1.35, (0.97 - REFLECTION_DENSITY) / 1.35)
-
-
-@dataclass(frozen=True)
 class LightPath:
     """The light path from the sun to a pixel's electrons.
 
     - band_nm: first and last wavelength of the passband
-    - neutral_density: filter before the lens, or None
+    - neutral_density: optical density of the filter before the lens, or None
     - transmission: of the lens
     - quantum_efficiency: wavelengths, nm, and electrons per photon at these, linear between and zero outside; None for
       a front-illuminated silicon CCD
@@ -95,48 +75,42 @@ class LightPath:
     f_number: float
     pixel_pitch_um: float
     band_nm: tuple[float, float]
-    neutral_density: NeutralDensity | None = None
+    neutral_density: float | None = None
     transmission: float = LENS_TRANSMISSION
     quantum_efficiency: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def responsivity_e_s(self, sun_distance_au: float) -> float:
         """Compute the electrons per second in a pixel on axis at radiance factor 1."""
-        wavelength_nm, electrons = self._electrons_per_m2()
-        passed = electrons * self._filter(wavelength_nm, electrons)
+        wavelength_nm, passed = self._filtered_electrons()
         area = (self.pixel_pitch_um * 1e-6) ** 2
         flux = float(np.trapezoid(passed, wavelength_nm)) / sun_distance_au**2
         return area * self.transmission * flux / (4.0 * self.f_number**2)
 
     def diffraction_px(self) -> float:
         """Compute the mean wavelength of the detected photons times f-number over the pixel pitch."""
-        wavelength_nm, electrons = self._electrons_per_m2()
-        mean_nm = float(np.average(wavelength_nm, weights=electrons * self._filter(wavelength_nm, electrons)))
-        return 1e-3 * mean_nm * self.f_number / self.pixel_pitch_um
+        wavelength_nm, passed = self._filtered_electrons()
+        return 1e-3 * float(np.average(wavelength_nm, weights=passed)) * self.f_number / self.pixel_pitch_um
 
-    def _electrons_per_m2(self) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
-        """Wavelengths, and electrons per second, m2 and nm at 1 AU without lens and filter."""
+    def _filtered_electrons(self) -> tuple[Spectrum, Spectrum]:
+        """Wavelengths, and electrons per second, m2 and nm at 1 AU behind the filter, without the lens."""
         wavelength_nm = np.linspace(*self.band_nm, 281)
         if self.quantum_efficiency is None:
             efficiency = np.interp(wavelength_nm, _QE_NM, _QE)
         else:
             efficiency = np.interp(wavelength_nm, *self.quantum_efficiency, left=0.0, right=0.0)
-        return wavelength_nm, solar_photons(wavelength_nm) * efficiency
-
-    def _filter(
-        self, wavelength_nm: Float64[np.ndarray, "n"], weights: Float64[np.ndarray, "n"]
-    ) -> Float64[np.ndarray, "n"]:
+        electrons = solar_photons(wavelength_nm) * efficiency
         if self.neutral_density is None:
-            return np.ones_like(wavelength_nm)
-        middle = np.average(wavelength_nm, weights=weights)
+            return wavelength_nm, electrons
+        middle = np.average(wavelength_nm, weights=electrons)
         tilt = 1.0 + DENSITY_SLOPE_PER_100_NM * (wavelength_nm - middle) / 100.0
-        return np.asarray(10.0 ** (-self.neutral_density.optical_density * tilt))
+        return wavelength_nm, electrons * 10.0 ** (-self.neutral_density * tilt)
 
 
-def solar_photons(wavelength_nm: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+def solar_photons(wavelength_nm: Spectrum) -> Spectrum:
     """Compute the photons of sunlight per second, m2 and nm at 1 AU."""
     wavelength = wavelength_nm * 1e-9
     occupation = 1.0 / np.expm1(_PLANCK * _LIGHT / (wavelength * _BOLTZMANN * _SUN_K))
-    photons: Float64[np.ndarray, "n"] = 2.0 * np.pi * _LIGHT / wavelength**4 * occupation
+    photons: Spectrum = 2.0 * np.pi * _LIGHT / wavelength**4 * occupation
     return photons * (_SUN_RADIUS_M / _AU_M) ** 2 * 1e-9
 
 
@@ -175,9 +149,7 @@ def line_spread(parameters: OpticsParameters) -> Float32[np.ndarray, "taps"]:
     return weights
 
 
-def apply_point_spread(
-    radiance: Float32[np.ndarray, "rows columns"], parameters: OpticsParameters
-) -> Float32[np.ndarray, "rows columns"]:
+def apply_point_spread(radiance: Picture, parameters: OpticsParameters) -> Picture:
     """Blur a scene by the lens and charge diffusion, without loss or shift; the scene is mirrored at the border."""
     if parameters.diffraction_px == 0.0 and parameters.diffusion_px == 0.0 and not parameters.pixel_aperture:
         return radiance
@@ -185,7 +157,7 @@ def apply_point_spread(
     return np.asarray(cv2.sepFilter2D(radiance, cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT))
 
 
-def natural_fall_off(camera: CameraModel) -> Float32[np.ndarray, "rows columns"]:
+def natural_fall_off(camera: CameraModel) -> Picture:
     """Compute the relative brightness of each pixel behind an unvignetted lens, 1 at the brightest.
 
     It is proportional to the pixel's solid angle and to the projected area of the entrance pupil:
@@ -195,27 +167,21 @@ def natural_fall_off(camera: CameraModel) -> Float32[np.ndarray, "rows columns"]
     `PUPIL_FRACTION`.
     """
     _origins, directions = camera.rays(camera.pixel_grid())
-    down = np.gradient(directions, axis=0, edge_order=2)
-    right = np.gradient(directions, axis=1, edge_order=2)
+    down, right = np.gradient(directions, axis=(0, 1), edge_order=2)
     solid_angle = np.linalg.norm(np.cross(down, right), axis=-1)
     axis, fraction = (camera.o, PUPIL_FRACTION) if isinstance(camera, Cahvore) else (camera.a, 1.0)
     off_axis = np.arccos(np.clip(directions @ (axis / np.linalg.norm(axis)), -1.0, 1.0))
-    pupil = np.clip(np.cos(fraction * off_axis), 0.0, None)
-    brightness: Float64[np.ndarray, "rows columns"] = solid_angle * pupil
+    brightness = solid_angle * np.clip(np.cos(fraction * off_axis), 0.0, None)
     # pixels that no ray reaches are dark
-    fall_off = np.nan_to_num(brightness / np.nanmax(brightness)).astype(np.float32)
-    return np.asarray(fall_off)
+    return np.asarray(np.nan_to_num(brightness / np.nanmax(brightness)).astype(np.float32))
 
 
-def dust_transmission(
-    shape: tuple[int, int], parameters: OpticsParameters, rng: np.random.Generator
-) -> Float32[np.ndarray, "rows columns"]:
+def dust_transmission(shape: tuple[int, int], parameters: OpticsParameters, rng: np.random.Generator) -> Picture:
     """Draw the transmission of dust on the lens: soft absorbing discs at random positions."""
-    rows, columns = shape
     transmission = np.ones(shape, dtype=np.float32)
-    row, column = np.arange(rows)[:, None], np.arange(columns)[None, :]
+    row, column = np.ogrid[: shape[0], : shape[1]]
     for _ in range(parameters.dust_discs):
-        middle = rng.uniform(0.0, 1.0, 2) * (rows, columns)
+        middle = rng.uniform(0.0, 1.0, 2) * shape
         radius = parameters.dust_radius_px * rng.uniform(2.0 / 3.0, 4.0 / 3.0)
         distance = np.hypot(row - middle[0], column - middle[1]) / radius
         inside = np.clip((1.0 + parameters.dust_softness - distance) / (2.0 * parameters.dust_softness), 0.0, 1.0)

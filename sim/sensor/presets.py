@@ -7,26 +7,8 @@ a frame with x forward, y left and z up, with its origin between the two cameras
 Sources: the field-test paper III.B; the target tracking paper section 3 (research rover); the landing paper section 5;
 Maki et al. 2003, "Mars Exploration Rover Engineering Cameras" (MER). Assumed values are marked.
 
-Datasheets are TOML files with the manufacturer's values and the lens before the detector:
-
-    name = "Sony IMX265, 16 mm f/4"
-    pixel_pitch_um = 3.45
-    full_well_e = 10500
-    read_noise_e = 2.4
-    bits = 12
-    quantum_efficiency = 0.65           # mean over the band; or a table of wavelength_nm and efficiency
-    dark_current_e_s = 1.0              # of a pixel at dark_temperature_c
-    dark_temperature_c = 20.0
-    prnu = 0.005
-    rows = 1536
-    readout_s = 0.05                    # of a whole frame
-
-    [lens]
-    f_number = 4.0
-    band_nm = [420.0, 680.0]
-
-The values are those of EMVA 1288: saturation capacity, temporal dark noise, quantum efficiency, dark current, photo
-response non-uniformity.
+Datasheets are TOML files with the manufacturer's values (those of EMVA 1288: saturation capacity, temporal dark noise,
+quantum efficiency, dark current, photo response non-uniformity) and the lens before the detector: see `Datasheet`.
 """
 
 from __future__ import annotations
@@ -36,7 +18,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -45,26 +26,17 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
 from marsyard.sim.files import open_regular
-from marsyard.sim.parameters import NonNegative, Parameters, Positive
+from marsyard.sim.parameters import NonNegative, Parameters, Positive, merge_settings
+from marsyard.sim.sensor import optics
 from marsyard.sim.sensor.detector import DetectorParameters
-from marsyard.sim.sensor.optics import (
-    DARK_E_S,
-    LENS_TRANSMISSION,
-    NG3_FIELD,
-    NG4_FLIGHT,
-    LightPath,
-    OpticsParameters,
-    bright_exposure_s,
-)
+from marsyard.sim.sensor.optics import LENS_TRANSMISSION, LightPath, OpticsParameters, bright_exposure_s
 
 #: Distance of Mars from the sun at the MER landings (the paper's "1.5 AU": 44 % of Earth's sunlight), AU.
 MARS_AU = 1.5
-#: Distortion of Opportunity's left navcam (its PDS label), R of CAHVOR.
-NAVCAM_RADIAL = (0.00096, -0.002183, 0.018547)
+NAVCAM_RADIAL = (0.00096, -0.002183, 0.018547)  #: Distortion of Opportunity's left navcam (its PDS label), R of CAHVOR.
 #: Barrel distortion of a small C-mount lens, R of CAHVOR: 1.8 % in the corner of the XC-55's picture; assumed.
 C_MOUNT_RADIAL = (0.0, -0.08, 0.025)
-#: Maximum size of a datasheet.
-_MAX_BYTES = 1 << 20
+_MAX_BYTES = 1 << 20  #: Maximum size of a datasheet.
 
 
 @dataclass(frozen=True)
@@ -105,10 +77,9 @@ class CameraDesign:
             axis=np.array([0.0, 0.0, -1.0]) if self.down else turn.apply([1.0, 0.0, 0.0]),
             right=np.array([1.0, 0.0, 0.0]) if self.down else turn.apply([0.0, -1.0, 0.0]),
         )
-        radial = np.array(self.radial)
         if self.linearity is None:
-            return Cahvor.from_cahv(pinhole, r=radial)
-        return Cahvore.from_cahv(pinhole, r=radial, linearity=self.linearity)
+            return Cahvor.from_cahv(pinhole, r=np.array(self.radial))
+        return Cahvore.from_cahv(pinhole, r=np.array(self.radial), linearity=self.linearity)
 
 
 @dataclass(frozen=True)
@@ -129,7 +100,7 @@ def _mer(design: CameraDesign, light: LightPath, sun_au: float, **changes: float
     settings = {
         "responsivity_e_s": light.responsivity_e_s(sun_au),
         "sun_au": sun_au,
-        "dark_e_s": DARK_E_S,
+        "dark_e_s": optics.DARK_E_S,
         "optics": OpticsParameters(diffraction_px=light.diffraction_px()),
     }
     return Preset(design, light, DetectorParameters.model_validate(settings | changes))
@@ -137,24 +108,23 @@ def _mer(design: CameraDesign, light: LightPath, sun_au: float, **changes: float
 
 _DESCENT = CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, down=True)
 _FLIGHT_EXPOSURE_S = 0.004
-#: Passbands (Maki et al. 2003), nm.
-_DESCENT_BAND, _ROVER_BAND = (400.0, 1100.0), (600.0, 800.0)
+_DESCENT_BAND, _ROVER_BAND = (400.0, 1100.0), (600.0, 800.0)  #: Passbands (Maki et al. 2003), nm.
 
 
 def _mer_descent_flown() -> Preset:
-    light = LightPath(12.0, 12.0, _DESCENT_BAND, NG4_FLIGHT)
+    light = LightPath(12.0, 12.0, _DESCENT_BAND, optics.NG4_FLIGHT)
     return _mer(_DESCENT, light, MARS_AU, exposure_s=_FLIGHT_EXPOSURE_S, temperature_c=-34.0)
 
 
 def _mer_descent_field() -> Preset:
     """Under Earth's sun, with the exposure time that gives as many electrons from the same ground as in flight."""
-    light = LightPath(12.0, 12.0, _DESCENT_BAND, NG3_FIELD)
+    light = LightPath(12.0, 12.0, _DESCENT_BAND, optics.NG3_FIELD)
     flown = _mer_descent_flown().detector.responsivity_e_s
     exposure = _FLIGHT_EXPOSURE_S * flown / light.responsivity_e_s(1.0)
     return _mer(_DESCENT, light, 1.0, exposure_s=exposure, temperature_c=0.0)
 
 
-def _mer_rover_camera(design: CameraDesign, f_number: float) -> Preset:
+def _mer_rover(design: CameraDesign, f_number: float) -> Preset:
     """Rows are not summed; the temperature is assumed."""
     light = LightPath(f_number, design.pixel_pitch_um, _ROVER_BAND)
     exposure = bright_exposure_s(170000.0, light.responsivity_e_s(MARS_AU))
@@ -179,32 +149,26 @@ def _interline(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
         offset_dn=4.0 * 2 ** (bits - 8),
         bits=bits,
         temperature_c=20.0,
-        dark_e_s=DARK_E_S * (design.pixel_pitch_um / 12.0) ** 2,
+        dark_e_s=optics.DARK_E_S * (design.pixel_pitch_um / 12.0) ** 2,
         optics=OpticsParameters(diffraction_px=light.diffraction_px()),
     )
     return Preset(design, light, detector)
 
 
-PRESETS: Mapping[str, Callable[[], Preset]] = MappingProxyType(
-    {
-        "mer-descent-flown": _mer_descent_flown,
-        "mer-descent-field": _mer_descent_field,
-        "mer-navcam": partial(
-            _mer_rover_camera, CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, baseline_m=0.20), 12.0
-        ),
-        # an equidistant fisheye without distortion, its pupil fixed: both assumed
-        "mer-hazcam": partial(
-            _mer_rover_camera, CameraDesign(5.58, 12.0, (1024, 1024), linearity=0.0, baseline_m=0.10), 15.0
-        ),
-        "research-navcam": partial(_interline, CameraDesign(6.0, 4.65, (1024, 768), baseline_m=0.20), 13000.0, 10),
-        # the toe-in is assumed, that of MER's pancams: parallel cameras would see a point at 2 m 516 px apart
-        "research-pancam": partial(
-            _interline, CameraDesign(16.0, 4.65, (1024, 768), baseline_m=0.30, toe_in_deg=1.0), 13000.0, 10
-        ),
-        # the lens is assumed: 6 mm, 43 deg, with some distortion
-        "xc-55": partial(_interline, CameraDesign(6.0, 7.4, (640, 480), C_MOUNT_RADIAL, down=True), 20000.0, 8),
-    }
-)
+PRESETS: Mapping[str, Callable[[], Preset]] = {
+    "mer-descent-flown": _mer_descent_flown,
+    "mer-descent-field": _mer_descent_field,
+    "mer-navcam": partial(_mer_rover, CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, baseline_m=0.20), 12.0),
+    # an equidistant fisheye without distortion, its pupil fixed: both assumed
+    "mer-hazcam": partial(_mer_rover, CameraDesign(5.58, 12.0, (1024, 1024), linearity=0.0, baseline_m=0.10), 15.0),
+    "research-navcam": partial(_interline, CameraDesign(6.0, 4.65, (1024, 768), baseline_m=0.20), 13000.0, 10),
+    # the toe-in is assumed, that of MER's pancams: parallel cameras would see a point at 2 m 516 px apart
+    "research-pancam": partial(
+        _interline, CameraDesign(16.0, 4.65, (1024, 768), baseline_m=0.30, toe_in_deg=1.0), 13000.0, 10
+    ),
+    # the lens is assumed: 6 mm, 43 deg, with some distortion
+    "xc-55": partial(_interline, CameraDesign(6.0, 7.4, (640, 480), C_MOUNT_RADIAL, down=True), 20000.0, 8),
+}
 
 
 def preset(name: str) -> Preset:
@@ -223,10 +187,9 @@ class QuantumEfficiency(Parameters):
     @model_validator(mode="after")
     def _check_curve(self) -> QuantumEfficiency:
         if len(self.wavelength_nm) != len(self.efficiency):
-            raise ValueError(
-                f"{len(self.wavelength_nm)} wavelengths and {len(self.efficiency)} efficiencies; as many of each"
-            )
-        if any(later <= sooner for sooner, later in zip(self.wavelength_nm, self.wavelength_nm[1:], strict=False)):
+            counts = f"{len(self.wavelength_nm)} wavelengths and {len(self.efficiency)} efficiencies"
+            raise ValueError(f"{counts}; as many of each")
+        if np.any(np.diff(self.wavelength_nm) <= 0.0):
             raise ValueError("wavelength_nm must increase")
         return self
 
@@ -253,9 +216,7 @@ class Datasheet(Parameters):
     full_well_e: Annotated[Positive, Field(description="saturation capacity, electrons")]
     read_noise_e: Annotated[NonNegative, Field(description="temporal dark noise, electrons")]
     bits: Annotated[int, Field(ge=8, le=16)]
-    gain_e_dn: Annotated[
-        Positive | None, Field(description="electrons per count; default: the full well over all counts")
-    ] = None
+    gain_e_dn: Annotated[Positive | None, Field(description="electrons per count; default: full well/all")] = None
     black_level_dn: NonNegative = 0.0
     quantum_efficiency: Annotated[float, Field(gt=0.0, le=1.0)] | QuantumEfficiency
     dark_current_e_s: Annotated[NonNegative, Field(description="of a pixel at dark_temperature_c, electrons per s")]
@@ -267,9 +228,9 @@ class Datasheet(Parameters):
     transfer_row_s: Annotated[NonNegative, Field(description="frame transfer: time under each row")] = 0.0
     rows: Annotated[int, Field(ge=16, le=16384, description="rows of a frame")]
     readout_s: Annotated[NonNegative, Field(description="to read out a frame, s")]
-    exposure_s: Annotated[
-        float | None, Field(gt=0.0, le=10.0, description="default: 60 % of the full well at radiance factor 0.3")
-    ] = None
+    exposure_s: Annotated[float | None, Field(gt=0.0, le=10.0, description="default: 60 % of full well at I/F 0.3")] = (
+        None
+    )
     sun_au: Annotated[float, Field(gt=0.1, le=100.0, description="distance of the sun in use; sets exposure_s")] = 1.5
     lens: Lens
 
@@ -281,35 +242,26 @@ class Datasheet(Parameters):
 
     def light(self) -> LightPath:
         """Create the light path from the sun to electrons."""
-        efficiency, band = self.quantum_efficiency, self.lens.band_nm
-        curve = (
-            (band, (efficiency, efficiency))
-            if isinstance(efficiency, float)
-            else (efficiency.wavelength_nm, efficiency.efficiency)
-        )
-        f_number, transmission = self.lens.f_number, self.lens.transmission
-        return LightPath(f_number, self.pixel_pitch_um, band, transmission=transmission, quantum_efficiency=curve)
+        q, lens = self.quantum_efficiency, self.lens
+        curve = (lens.band_nm, (q, q)) if isinstance(q, float) else (q.wavelength_nm, q.efficiency)
+        return LightPath(lens.f_number, self.pixel_pitch_um, lens.band_nm, None, lens.transmission, curve)
 
     def parameters(self) -> DetectorParameters:
         """Create the parameters of the simulated detector, which reads every pixel."""
         light = self.light()
         responsivity = light.responsivity_e_s(self.sun_au)
+        equal = {"sun_au", "transfer_row_s", "full_well_e", "read_noise_e", "bits", "dark_doubling_c"}
         return DetectorParameters(
+            **self.model_dump(include=equal),
             exposure_s=self.exposure_s or bright_exposure_s(self.full_well_e, responsivity),
             responsivity_e_s=responsivity,
-            sun_au=self.sun_au,
             rows_summed=1,
-            transfer_row_s=self.transfer_row_s,
             clear_row_s=0.0,
             readout_row_s=self.readout_s / self.rows,
-            full_well_e=self.full_well_e,
             gain_e_dn=self.full_well_e / 2**self.bits if self.gain_e_dn is None else self.gain_e_dn,
-            read_noise_e=self.read_noise_e,
             offset_dn=self.black_level_dn,
-            bits=self.bits,
             temperature_c=self.dark_temperature_c if self.temperature_c is None else self.temperature_c,
             dark_e_s=self.dark_current_e_s * 2.0 ** (-self.dark_temperature_c / self.dark_doubling_c),
-            dark_doubling_c=self.dark_doubling_c,
             response_spread=self.prnu,
             optics=OpticsParameters(diffraction_px=light.diffraction_px()),
         )
@@ -336,15 +288,6 @@ def read_datasheet(path: str | Path) -> Datasheet:
         raise ValueError(f"{path}: {where}: {first['msg'].removeprefix('Value error, ')}") from fault
 
 
-def _merge(base: dict[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge changes into nested settings."""
-    merged = dict(base)
-    for key, value in changes.items():
-        below = merged.get(key)
-        merged[key] = _merge(below, value) if isinstance(below, dict) and isinstance(value, Mapping) else value
-    return merged
-
-
 def _resolve_detector(settings: object) -> object:
     """Merge settings into those of a preset or a datasheet, if they name one."""
     if isinstance(settings, str):
@@ -358,8 +301,8 @@ def _resolve_detector(settings: object) -> object:
     changes = {key: value for key, value in settings.items() if key not in ("preset", "file")}
     if "file" in settings:
         file = str(settings["file"])
-        return _merge({**read_datasheet(file).parameters().model_dump(), "file": file}, changes)
-    return _merge(preset(str(settings["preset"])).detector.model_dump(), changes)
+        return merge_settings({**read_datasheet(file).parameters().model_dump(), "file": file}, changes)
+    return merge_settings(preset(str(settings["preset"])).detector.model_dump(), changes)
 
 
 #: Detector parameters of a campaign, stated by values or by changes to a preset or a datasheet:

@@ -12,24 +12,24 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
+from numpy.random import Generator
 from pydantic import Field, model_validator
 from scipy.optimize import brentq
 
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.parameters import Parameters
-from marsyard.sim.sensor.instrument import Clock, ClockParameters, Readings, Sampling
+from marsyard.sim.sensor.imu import Vector
+from marsyard.sim.sensor.instrument import Clock, ClockParameters, Readings, Sampling, Times
 from marsyard.sim.terrain import Surface
 
 #: Pointing of an altimeter in body axes: down at the identity attitude, as the descent camera.
 DOWN = np.array([0.0, 0.0, -1.0])
-#: Minimum number of points along a laser ray at which it is compared with the ground.
-MIN_POINTS = 64
+MIN_POINTS = 64  #: Minimum number of points along a laser ray at which it is compared with the ground.
 #: Radar: step of the coarsest grid over the height, refinement of each further grid, and number of grids.
 COARSEST_STEP, REFINEMENT, PASSES = 1.0 / 64.0, 5, 3
 #: Ground around a node may be nearer than the node by this plus the node's slope, times the step.
 RELIEF_PER_STEP = 0.2
-#: Maximum slope of the ground in the radar's search.
-MAX_SLOPE = 3.0
+MAX_SLOPE = 3.0  #: Maximum slope of the ground in the radar's search.
 
 _Fraction = Annotated[float, Field(ge=0.0, le=0.2)]
 _Metres = Annotated[float, Field(ge=0.0, le=100.0)]
@@ -50,9 +50,8 @@ class RangingParameters(Parameters):
     @model_validator(mode="after")
     def _check_range_limits(self) -> RangingParameters:
         if self.min_range_m >= self.max_range_m:
-            raise ValueError(
-                f"min_range_m is {self.min_range_m}; allowed: less than max_range_m, which is {self.max_range_m}"
-            )
+            limit = self.max_range_m
+            raise ValueError(f"min_range_m is {self.min_range_m}; allowed: less than max_range_m, which is {limit}")
         return self
 
 
@@ -91,18 +90,13 @@ class RangingUnit:
     scale: float
 
     @classmethod
-    def drawn(cls, parameters: RangingParameters, rng: np.random.Generator) -> RangingUnit:
+    def drawn(cls, parameters: RangingParameters, rng: Generator) -> RangingUnit:
         """Draw the constant errors."""
-        return cls(
-            parameters,
-            Sampling.drawn(parameters.rate_hz, rng),
-            Clock.drawn(parameters.clock, rng),
-            1.0 + parameters.scale_error * float(rng.standard_normal()),
-        )
+        p = parameters
+        sampling, clock = Sampling.drawn(p.rate_hz, rng), Clock.drawn(p.clock, rng)
+        return cls(p, sampling, clock, 1.0 + p.scale_error * float(rng.standard_normal()))
 
-    def readings(
-        self, times_s: Float64[np.ndarray, "n"], ranges_m: Float64[np.ndarray, "n"], rng: np.random.Generator
-    ) -> Readings:
+    def readings(self, times_s: Times, ranges_m: Float64[np.ndarray, "n"], rng: Generator) -> Readings:
         """Simulate readings of true ranges (infinite without a return) at true times."""
         p = self.parameters
         tags = self.clock.tags(times_s, rng)
@@ -114,9 +108,7 @@ class RangingUnit:
         return Readings(tags, np.where(valid, values, np.nan))
 
 
-def range_along(
-    surface: Surface, position_m: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], max_range_m: float
-) -> float:
+def range_along(surface: Surface, position_m: Vector, axis: Vector, max_range_m: float) -> float:
     """Intersect a ray with the terrain, compared at least once per sample; return the range, or infinity."""
     horizontal_m = float(np.hypot(axis[0], axis[1])) * max_range_m
     count = MIN_POINTS + int(np.ceil(horizontal_m / surface.spacing_m))
@@ -143,7 +135,7 @@ class RadarAltimeter:
     unit: RangingUnit
 
     @classmethod
-    def drawn(cls, parameters: RadarParameters, surface: Surface, rng: np.random.Generator) -> RadarAltimeter:
+    def drawn(cls, parameters: RadarParameters, surface: Surface, rng: Generator) -> RadarAltimeter:
         """Draw the constant errors."""
         return cls(parameters, surface, RangingUnit.drawn(parameters, rng))
 
@@ -152,7 +144,7 @@ class RadarAltimeter:
         """Sampling times."""
         return self.unit.sampling
 
-    def measure(self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"], rng: np.random.Generator) -> Readings:
+    def measure(self, trajectory: Trajectory, times_s: Times, rng: Generator) -> Readings:
         """Read one range to the nearest ground within the beam per true time."""
         motion, p = trajectory.motion(times_s), self.parameters
         axes = motion.attitudes.apply(DOWN.copy())
@@ -165,11 +157,7 @@ class RadarAltimeter:
 
 
 def first_return(
-    surface: Surface,
-    position_m: Float64[np.ndarray, "3"],
-    axis: Float64[np.ndarray, "3"],
-    half_angle_rad: float,
-    max_range_m: float,
+    surface: Surface, position_m: Vector, axis: Vector, half_angle_rad: float, max_range_m: float
 ) -> float:
     """Compute the range to the nearest ground within a cone; infinite if it is beyond the maximum range.
 
@@ -197,19 +185,20 @@ def first_return(
 
 
 def _search(
-    surface: Surface,
-    position_m: Float64[np.ndarray, "3"],
-    axis: Float64[np.ndarray, "3"],
-    half_angle_rad: float,
-    step_m: float,
-    half_side_m: float,
+    surface: Surface, position_m: Vector, axis: Vector, half_angle_rad: float, step_m: float, half_side_m: float
 ) -> float:
     """Range to the nearest ground within a cone and, in plan view, within a square; infinite if there is none."""
     line = np.arange(-np.ceil(half_side_m / step_m), np.ceil(half_side_m / step_m) + 1.0) * step_m
     offsets = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     nearest = np.inf
     for number in range(PASSES):
-        ranges, angles = _ranges_and_angles(surface, position_m, axis, offsets, step_m)
+        # range to the ground at the offsets, smoothed to the step, and its angle from the axis
+        level = int(min(np.floor(np.log2(max(step_m / surface.spacing_m, 1.0))), len(surface.levels) - 1))
+        x, y = position_m[0] + offsets[:, 0], position_m[1] + offsets[:, 1]
+        down = position_m[2] - surface.height(x, y, level)
+        ranges = np.sqrt(offsets[:, 0] ** 2 + offsets[:, 1] ** 2 + down**2)
+        along = offsets[:, 0] * axis[0] + offsets[:, 1] * axis[1] - down * axis[2]
+        angles = np.arccos(np.clip(along / ranges, -1.0, 1.0))
         inside = angles <= half_angle_rad
         if inside.any():
             nearest = float(ranges[inside].min())
@@ -219,10 +208,9 @@ def _search(
         candidates = (angles <= half_angle_rad + step_m / ranges) & (
             ranges <= nearest + (RELIEF_PER_STEP + MAX_SLOPE) * step_m
         )
-        offsets, ranges = offsets[candidates], ranges[candidates]
-        x, y = position_m[0] + offsets[:, 0], position_m[1] + offsets[:, 1]
-        slopes = np.linalg.norm(surface.gradient(x, y, _level(surface, step_m)), axis=-1)
-        offsets = offsets[ranges <= nearest + (RELIEF_PER_STEP + slopes) * step_m]
+        slopes = np.linalg.norm(surface.gradient(x[candidates], y[candidates], level), axis=-1)
+        near = ranges[candidates] <= nearest + (RELIEF_PER_STEP + slopes) * step_m
+        offsets = offsets[candidates][near]
         # each node with its neighbours of a finer grid
         step_m /= REFINEMENT
         fine = (np.arange(REFINEMENT) - 0.5 * (REFINEMENT - 1)) * step_m
@@ -231,28 +219,6 @@ def _search(
         if not offsets.size:
             return nearest
     return nearest
-
-
-def _ranges_and_angles(
-    surface: Surface,
-    position_m: Float64[np.ndarray, "3"],
-    axis: Float64[np.ndarray, "3"],
-    offsets_m: Float64[np.ndarray, "n 2"],
-    step_m: float,
-) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
-    """Range to the ground at horizontal offsets, and its angle from an axis; the ground is smoothed to the step."""
-    level = _level(surface, step_m)
-    x, y = position_m[0] + offsets_m[:, 0], position_m[1] + offsets_m[:, 1]
-    down = position_m[2] - surface.height(x, y, level)
-    ranges = np.sqrt(offsets_m[:, 0] ** 2 + offsets_m[:, 1] ** 2 + down**2)
-    along = offsets_m[:, 0] * axis[0] + offsets_m[:, 1] * axis[1] - down * axis[2]
-    return ranges, np.arccos(np.clip(along / ranges, -1.0, 1.0))
-
-
-def _level(surface: Surface, step_m: float) -> int:
-    """Pyramid level with a sample spacing of about a step, or less."""
-    level = np.floor(np.log2(max(step_m / surface.spacing_m, 1.0)))
-    return int(min(level, len(surface.levels) - 1))
 
 
 def height_above_ground(surface: Surface, positions_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:

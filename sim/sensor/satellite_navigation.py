@@ -12,15 +12,16 @@ from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float64
+from numpy.random import Generator
 from pydantic import Field, model_validator
 
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.parameters import Fraction, Parameters, Positive
-from marsyard.sim.sensor.instrument import Clock, ClockParameters, GaussMarkov, Readings, Sampling
+from marsyard.sim.sensor.imu import Vectors
+from marsyard.sim.sensor.instrument import Clock, ClockParameters, GaussMarkov, Readings, Sampling, Times
 
 NonNegative = Annotated[float, Field(ge=0.0, le=1000.0)]
-#: East, north, up.
-PerAxis = tuple[NonNegative, NonNegative, NonNegative]
+PerAxis = tuple[NonNegative, NonNegative, NonNegative]  #: East, north, up.
 
 
 class GpsParameters(Parameters):
@@ -53,14 +54,14 @@ class Gps:
     wander: GaussMarkov
 
     @classmethod
-    def drawn(cls, parameters: GpsParameters, span_s: tuple[float, float], rng: np.random.Generator) -> Gps:
+    def drawn(cls, parameters: GpsParameters, span_s: tuple[float, float], rng: Generator) -> Gps:
         """Draw the errors for use within a time span."""
         p = parameters
         sd = np.array([p.horizontal_wander_m, p.horizontal_wander_m, p.vertical_wander_m])
         sampling, clock = Sampling.drawn(p.rate_hz, rng), Clock.drawn(p.clock, rng)
         return cls(p, sampling, clock, GaussMarkov.drawn(sd, p.correlation_s, span_s, rng))
 
-    def measure(self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"], rng: np.random.Generator) -> Readings:
+    def measure(self, trajectory: Trajectory, times_s: Times, rng: Generator) -> Readings:
         """Measure one position per true time, world axes; it is delivered `latency_s` after that time."""
         p = self.parameters
         tags = self.clock.tags(times_s, rng)
@@ -82,6 +83,10 @@ class SolutionErrors(Parameters):
         return np.hypot(self.wander_m, self.noise_m)
 
 
+_FIXED = SolutionErrors(wander_m=(0.01, 0.01, 0.02), noise_m=(0.008, 0.008, 0.015), correlation_s=120.0)
+_FLOATING = SolutionErrors(wander_m=(0.42, 0.55, 0.8), noise_m=(0.03, 0.03, 0.05), correlation_s=120.0)
+
+
 class Outage(Parameters):
     """An interval without solutions."""
 
@@ -98,12 +103,8 @@ class RtkParameters(Parameters):
 
     rate_hz: Annotated[Positive, Field(le=100.0, description="solutions per second")] = 10.0
     latency_s: Annotated[float, Field(ge=0.0, le=2.0, description="from a solution's time to its delivery, s")] = 0.07
-    fixed: SolutionErrors = SolutionErrors(
-        wander_m=(0.01, 0.01, 0.02), noise_m=(0.008, 0.008, 0.015), correlation_s=120.0
-    )
-    floating: SolutionErrors = SolutionErrors(
-        wander_m=(0.42, 0.55, 0.8), noise_m=(0.03, 0.03, 0.05), correlation_s=120.0
-    )
+    fixed: SolutionErrors = _FIXED
+    floating: SolutionErrors = _FLOATING
     float_share: Annotated[Fraction, Field(description="fraction of the time with a floating solution")] = 0.1
     float_s: Annotated[Positive, Field(description="mean duration of a floating solution, s")] = 60.0
     velocity_noise_m_s: Annotated[PerAxis, Field(description="of velocity, new in every solution")] = (0.03, 0.03, 0.05)
@@ -129,10 +130,10 @@ class RtkSolutions:
     - fixed: whether the solution is fixed
     """
 
-    times_s: Float64[np.ndarray, "n"]
-    positions_m: Float64[np.ndarray, "n 3"]
-    velocities_m_s: Float64[np.ndarray, "n 3"]
-    reported_m: Float64[np.ndarray, "n 3"]
+    times_s: Times
+    positions_m: Vectors
+    velocities_m_s: Vectors
+    reported_m: Vectors
     fixed: Bool[np.ndarray, "n"]
 
 
@@ -151,42 +152,33 @@ class RtkReceiver:
     floating_wander: GaussMarkov
     velocity_wander: GaussMarkov
     first_floating: bool
-    changes_s: Float64[np.ndarray, "changes"] = field(repr=False)
+    changes_s: Times = field(repr=False)
     reported_factor: float
 
     @classmethod
-    def drawn(cls, parameters: RtkParameters, span_s: tuple[float, float], rng: np.random.Generator) -> RtkReceiver:
+    def drawn(cls, parameters: RtkParameters, span_s: tuple[float, float], rng: Generator) -> RtkReceiver:
         """Draw the errors for use within a time span."""
         p = parameters
         floating = bool(rng.random() < p.float_share)
-        wanders = [
+        fixed, unfixed, velocity = (
             GaussMarkov.drawn(np.array(sd), time, span_s, rng)
             for sd, time in (
                 (p.fixed.wander_m, p.fixed.correlation_s),
                 (p.floating.wander_m, p.floating.correlation_s),
                 (p.velocity_wander_m_s, p.velocity_correlation_s),
             )
-        ]
-        return cls(
-            parameters=p,
-            sampling=Sampling.drawn(p.rate_hz, rng),
-            clock=Clock.drawn(p.clock, rng),
-            fixed_wander=wanders[0],
-            floating_wander=wanders[1],
-            velocity_wander=wanders[2],
-            first_floating=floating,
-            changes_s=_changes(p, floating, span_s, rng),
-            reported_factor=float(np.exp(p.reported_spread * rng.standard_normal())),
         )
+        sampling, clock = Sampling.drawn(p.rate_hz, rng), Clock.drawn(p.clock, rng)
+        changes = _draw_changes(p, floating, span_s, rng)
+        factor = float(np.exp(p.reported_spread * rng.standard_normal()))
+        return cls(p, sampling, clock, fixed, unfixed, velocity, floating, changes, factor)
 
-    def floats(self, times_s: Float64[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+    def floats(self, times_s: Times) -> Bool[np.ndarray, "n"]:
         """Return whether the solution floats at true times."""
         changed = np.searchsorted(self.changes_s, times_s, side="right") % 2 == 1
         return np.asarray(changed != self.first_floating)
 
-    def measure(
-        self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"], rng: np.random.Generator
-    ) -> RtkSolutions:
+    def measure(self, trajectory: Trajectory, times_s: Times, rng: Generator) -> RtkSolutions:
         """Compute one solution per true time."""
         p = self.parameters
         motion, floating = trajectory.motion(times_s), self.floats(times_s)[:, None]
@@ -203,9 +195,7 @@ class RtkReceiver:
         return RtkSolutions(tags, positions, velocities, reported, ~floating[:, 0])
 
 
-def _changes(
-    p: RtkParameters, floating: bool, span_s: tuple[float, float], rng: np.random.Generator
-) -> Float64[np.ndarray, "changes"]:
+def _draw_changes(p: RtkParameters, floating: bool, span_s: tuple[float, float], rng: Generator) -> Times:
     """Draw the times at which the type of solution changes: exponential durations, a stationary process."""
     if p.float_share in (0.0, 1.0):
         return np.zeros(0)

@@ -18,13 +18,13 @@ from pydantic import Field
 
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.parameters import NonNegative, Parameters
-from marsyard.sim.sensor.instrument import Clock, ClockParameters, Sampling
+from marsyard.sim.sensor.imu import Vectors
+from marsyard.sim.sensor.instrument import Clock, ClockParameters, Sampling, Times
 
 Degrees = Annotated[NonNegative, Field(le=90.0)]
-#: Steps of the lag per second: twenty within the default time constant.
-LAG_STEPS_PER_S = 100.0
-#: Settling time in time constants: a residual of 6e-6.
-SETTLED = 12.0
+LAG_STEPS_PER_S = 100.0  #: Steps of the lag per second: twenty within the default time constant.
+SETTLED = 12.0  #: Settling time in time constants: a residual of 6e-6.
+Readings = Float64[np.ndarray, "n *one"]
 
 
 class TiltCompassParameters(Parameters):
@@ -57,8 +57,8 @@ class TiltCompassReadings:
     - headings_rad: azimuth of the body's x axis, clockwise from north, in [0, 2 pi)
     """
 
-    times_s: Float64[np.ndarray, "n"]
-    up_body: Float64[np.ndarray, "n 3"]
+    times_s: Times
+    up_body: Vectors
     headings_rad: Float64[np.ndarray, "n"]
 
 
@@ -91,33 +91,31 @@ class TiltCompass:
             iron_rad=np.radians(iron) * rng.standard_normal(4),
         )
 
-    def measure(
-        self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"], rng: np.random.Generator
-    ) -> TiltCompassReadings:
+    def measure(self, trajectory: Trajectory, times_s: Times, rng: np.random.Generator) -> TiltCompassReadings:
         """Measure one reading per true time; times must not decrease. The unit is settled at the trajectory's start."""
         p = self.parameters
         lagged = self._lagged_up(trajectory, times_s)
         tags = self.clock.tags(times_s, rng)
         shocks = rng.standard_normal((times_s.size, 3))
-        levelled = _with_offset(lagged, self.tilt_bias_rad)
-        headings = self._headings(trajectory, times_s, levelled)
-        up = _with_offset(levelled, np.radians(p.tilt_noise_deg) * shocks[:, :2])
-        headings = headings + np.radians(p.heading_noise_deg) * shocks[:, 2]
+        levelled = _add_offset(lagged, self.tilt_bias_rad)
+        # azimuths from the magnetic field, levelled by the measured directions
+        dip = np.radians(p.dip_deg)
+        attitudes = trajectory.motion(times_s).attitudes
+        magnetic = attitudes.inv().apply(np.array([0.0, np.cos(dip), -np.sin(dip)]))
+        north = _normalize(magnetic - np.sum(magnetic * levelled, axis=1)[:, None] * levelled)
+        azimuths = np.arctan2(np.cross(north, levelled)[:, 0], north[:, 0])
+        headings = azimuths + self.deviation_rad(azimuths) + np.radians(p.heading_noise_deg) * shocks[:, 2]
         if p.count_deg > 0.0:
             headings = np.radians(p.count_deg) * np.rint(headings / np.radians(p.count_deg))
-        return TiltCompassReadings(
-            tags,
-            _hold(up, times_s, p.tilt_stuck_s),
-            _hold(np.mod(headings, 2.0 * np.pi), times_s, p.heading_stuck_s),
-        )
+        up = _hold(_add_offset(levelled, np.radians(p.tilt_noise_deg) * shocks[:, :2]), times_s, p.tilt_stuck_s)
+        return TiltCompassReadings(tags, up, _hold(np.mod(headings, 2.0 * np.pi), times_s, p.heading_stuck_s))
 
     def deviation_rad(self, azimuths_rad: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
         """Noise-free heading error of a level unit at rest, at true azimuths."""
-        a = azimuths_rad
-        harmonics = np.stack([np.sin(a), np.cos(a), np.sin(2.0 * a), np.cos(2.0 * a)])
+        harmonics = np.stack([f(k * azimuths_rad) for k in (1.0, 2.0) for f in (np.sin, np.cos)])
         return np.asarray(self.heading_bias_rad + self.iron_rad @ harmonics)
 
-    def _lagged_up(self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
+    def _lagged_up(self, trajectory: Trajectory, times_s: Times) -> Vectors:
         """Directions of the pendulums: the specific force's with a lag."""
         if times_s.size == 0:
             return np.zeros((0, 3))
@@ -125,7 +123,7 @@ class TiltCompass:
         start = max(trajectory.span_s[0], float(times_s[0]) - SETTLED * lag)
         steps = max(int(np.ceil((times_s[-1] - start) * LAG_STEPS_PER_S)), 1)
         grid = np.linspace(start, float(times_s[-1]), steps + 1) if times_s[-1] > start else np.array([start])
-        force = _unit(trajectory.motion(grid).specific_forces_m_s2)
+        force = _normalize(trajectory.motion(grid).specific_forces_m_s2)
         if grid.size == 1:
             return np.repeat(force, times_s.size, axis=0)
         # exact for a force that is constant in each step
@@ -133,36 +131,21 @@ class TiltCompass:
         middle = 0.5 * (force[1:] + force[:-1])
         filtered, _ = scipy.signal.lfilter([1.0 - decay], [1.0, -decay], middle, axis=0, zi=decay * force[:1])
         filtered = np.concatenate([force[:1], filtered])
-        columns = [np.interp(times_s, grid, filtered[:, axis]) for axis in range(3)]
-        return _unit(np.stack(columns, axis=1))
-
-    def _headings(
-        self, trajectory: Trajectory, times_s: Float64[np.ndarray, "n"], up: Float64[np.ndarray, "n 3"]
-    ) -> Float64[np.ndarray, "n"]:
-        """Azimuths from the magnetic field levelled by these directions, with bias and iron errors."""
-        dip = np.radians(self.parameters.dip_deg)
-        attitudes = trajectory.motion(times_s).attitudes
-        magnetic = attitudes.inv().apply(np.array([0.0, np.cos(dip), -np.sin(dip)]))
-        north = _unit(magnetic - np.sum(magnetic * up, axis=1)[:, None] * up)
-        east = np.cross(north, up)
-        azimuths = np.arctan2(east[:, 0], north[:, 0])
-        return np.asarray(azimuths + self.deviation_rad(azimuths))
+        return _normalize(np.stack([np.interp(times_s, grid, column) for column in filtered.T], axis=1))
 
 
-def _unit(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+def _normalize(vectors: Vectors) -> Vectors:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
-def _with_offset(up: Float64[np.ndarray, "n 3"], offset: Float64[np.ndarray, "*any 2"]) -> Float64[np.ndarray, "n 3"]:
+def _add_offset(up: Vectors, offset: Float64[np.ndarray, "*any 2"]) -> Vectors:
     """Add an offset to the x and y components of unit vectors and normalise them."""
     tilted = up.copy()
     tilted[:, :2] += offset
-    return _unit(tilted)
+    return _normalize(tilted)
 
 
-def _hold(
-    values: Float64[np.ndarray, "n *one"], times_s: Float64[np.ndarray, "n"], stuck_s: float | None
-) -> Float64[np.ndarray, "n *one"]:
+def _hold(values: Readings, times_s: Times, stuck_s: float | None) -> Readings:
     """Repeat the last value before a time (or the first) at all later times."""
     if stuck_s is None or values.size == 0:
         return values

@@ -10,15 +10,13 @@ from pathlib import Path
 from weakref import WeakValueDictionary
 
 import numpy as np
-from jaxtyping import Float32
 
 from marsyard.sim.cache import CacheWarning, cache_directory, evict_files, load_array, save_array, touch
 from marsyard.sim.terrain.imported import blend_into_ground, detail_below_posting, embed
-from marsyard.sim.terrain.landforms.ground import Ground
+from marsyard.sim.terrain.landforms.ground import Ground, Spectrum, substream
 from marsyard.sim.terrain.landforms.kernels import pack, stamp_craters
 from marsyard.sim.terrain.landforms.relief import EJECTA_REACH_RADII, draw_craters
 from marsyard.sim.terrain.parameters import LANDFORMS, TerrainParameters
-from marsyard.sim.terrain.random_fields import Spectrum, substream
 from marsyard.sim.terrain.rocks.field import RockField
 from marsyard.sim.terrain.surface import SMALLEST_LEVEL, Surface
 
@@ -88,14 +86,18 @@ class TerrainBank:
         if flat is not None and flat.size == self._size():
             touch(path)
         else:
-            flat = self._build(number, path)
+            flat = np.concatenate([one.reshape(-1) for one in synthesise(self.parameters, self._rng(number)).levels])
+            try:
+                evict_files(path.parent, 4 * self._size(), set(_IN_USE))
+                flat = save_array(path, flat)
+            except OSError as error:
+                warnings.warn(f"terrain {number} is not kept: {path}: {error.strerror}", CacheWarning, stacklevel=2)
+                flat.flags.writeable = False
         _IN_USE[path] = flat
-        levels, start = [], 0
-        for side in self._sides():
-            stop = start + 2 * side**2
-            levels.append(flat[start:stop].reshape(side, side, 2))
-            start = stop
-        return Surface(tuple(levels), self.parameters.spacing_m)
+        sides = self._sides()
+        parts = np.split(flat, np.cumsum([2 * side**2 for side in sides])[:-1])
+        levels = tuple(part.reshape(side, side, 2) for part, side in zip(parts, sides, strict=True))
+        return Surface(levels, self.parameters.spacing_m)
 
     def missing_bytes(self, number: int) -> int:
         """Return the bytes that a terrain would add on disk, except for some hundred; 0 where it is stored."""
@@ -111,28 +113,12 @@ class TerrainBank:
         return np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=(number,))))
 
     def _path(self, number: int) -> Path:
-        parameters = self.parameters.model_dump_json(exclude={"rocks"})
-        identity = f"{parameters} {self.seed} {number} {_code_version()} {self._source_hashes()}"
+        # with hashes of the real terrain's files, whose content may change under the same name
+        source, parameters = self.parameters.source, self.parameters.model_dump_json(exclude={"rocks"})
+        paths = [Path(name) for name in source.input_files()] if source else []
+        hashes = " ".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.exists())
+        identity = f"{parameters} {self.seed} {number} {_code_version()} {hashes}"
         return cache_directory("terrain") / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.npy"
-
-    def _source_hashes(self) -> str:
-        """Hashes of the real terrain's files, whose content may change under the same name."""
-        source = self.parameters.source
-        if source is None:
-            return ""
-        paths = [path for path in (source.dtm, source.ortho) if path is not None and path.exists()]
-        return " ".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths)
-
-    def _build(self, number: int, path: Path) -> Float32[np.ndarray, "samples"]:
-        built = synthesise(self.parameters, self._rng(number))
-        flat = np.concatenate([level.reshape(-1) for level in built.levels])
-        try:
-            evict_files(path.parent, 4 * self._size(), set(_IN_USE))
-            return save_array(path, flat)
-        except OSError as error:
-            warnings.warn(f"terrain {number} is not kept: {path}: {error.strerror}", CacheWarning, stacklevel=2)
-            flat.flags.writeable = False
-            return flat
 
     def _sides(self) -> list[int]:
         """Samples along a side of each level."""

@@ -13,7 +13,12 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, spline_filter
 
 from marsyard.sim.parameters import Parameters
-from marsyard.sim.terrain.landforms.ground import Ground, refined
+from marsyard.sim.terrain.landforms.ground import Ground, refine
+
+Grid = Float64[np.ndarray, "rows columns"]
+Line = Float64[np.ndarray, "n"]
+Part = Float32[np.ndarray, "rows columns"]
+Mask = Bool[np.ndarray, "rows columns"]
 
 
 class TerrainFileError(ValueError):
@@ -21,7 +26,7 @@ class TerrainFileError(ValueError):
 
 
 class RealTerrain(Parameters):
-    """A digital terrain model (DTM) from a file, in place of the fractal ground where it reaches.
+    """A digital terrain model (DTM) from a file, that replaces the fractal ground within its borders.
 
     The file is a GeoTIFF (rows from north to south, projected, metres; needs the extra `geo`) or an ``.npz`` with
     ``dem`` (heights, m, row 0 in the north) and ``dem_gsd`` (m), and optionally ``ortho``, ``ortho_gsd`` and
@@ -34,20 +39,11 @@ class RealTerrain(Parameters):
     dtm: Annotated[Path, Field(description="GeoTIFF or .npz with the heights")]
     ortho: Annotated[Path | None, Field(description="GeoTIFF with the picture; an .npz has its own")] = None
     use_ortho: Annotated[bool, Field(description="whether brightness is taken from the picture")] = True
-    ortho_east_m: Annotated[
-        float, Field(description="how far east of the DTM the picture lies, m; it is moved back")
-    ] = 0.0
+    ortho_east_m: Annotated[float, Field(description="how far east of the DTM the picture lies, m")] = 0.0
     ortho_north_m: Annotated[float, Field(description="how far north of the DTM the picture lies, m")] = 0.0
-    border_m: Annotated[
-        float, Field(gt=0.0, description="width of the seam within the DTM over which it blends into its surround, m")
-    ] = 20.0
-    max_hole_fraction: Annotated[
-        float,
-        Field(ge=0.0, lt=1.0, description="fraction of the DTM's posts without height above which it is refused"),
-    ] = 0.05
-    roughen: Annotated[
-        bool, Field(description="add the fractal ground's detail finer than twice the DTM's posting")
-    ] = True
+    border_m: Annotated[float, Field(gt=0.0, description="width of the seam to the surround, in the DTM, m")] = 20.0
+    max_hole_fraction: Annotated[float, Field(ge=0.0, lt=1.0, description="maximum fraction without height")] = 0.05
+    roughen: Annotated[bool, Field(description="add fractal detail finer than twice the DTM's posting")] = True
 
     def input_files(self) -> tuple[str, ...]:
         """Paths of the files that the terrain is made from."""
@@ -58,7 +54,7 @@ class RealTerrain(Parameters):
 class Raster:
     """A grid of values, row 0 in the south, NaN where missing; cell (0, 0) is centred at `west_m`, `south_m`."""
 
-    values: Float64[np.ndarray, "rows columns"]
+    values: Grid
     posting_m: float
     west_m: float
     south_m: float
@@ -77,7 +73,7 @@ def read_rasters(source: RealTerrain) -> tuple[Raster, Raster | None]:
     return heights, ortho if source.use_ortho else None
 
 
-def check_holes(source: RealTerrain, heights: Float64[np.ndarray, "rows columns"]) -> None:
+def check_holes(source: RealTerrain, heights: Grid) -> None:
     """Raise TerrainFileError where more heights are missing (not finite) than the source allows."""
     fraction = float(np.mean(~np.isfinite(heights)))
     if fraction == 1.0:
@@ -94,9 +90,8 @@ def _read_npz(path: Path) -> tuple[Raster, Raster | None]:
     with np.load(path, allow_pickle=False) as file:
         missing = [key for key in ("dem", "dem_gsd") if key not in file]
         if missing:
-            raise TerrainFileError(
-                f"{path} lacks {', '.join(missing)}; allowed: dem, dem_gsd, ortho, ortho_gsd, ortho_valid"
-            )
+            allowed = "dem, dem_gsd, ortho, ortho_gsd, ortho_valid"
+            raise TerrainFileError(f"{path} lacks {', '.join(missing)}; allowed: {allowed}")
         heights = _from_north(file["dem"], float(file["dem_gsd"]), path)
         if "ortho" not in file:
             return heights, None
@@ -135,12 +130,12 @@ def _read_geotiff(path: Path) -> Raster:
     return Raster(raster.values, posting, transform.c * factor + raster.west_m, transform.f * factor + raster.south_m)
 
 
-def filled(values: Float64[np.ndarray, "rows columns"]) -> tuple[Float64[np.ndarray, "rows columns"], int]:
+def fill_holes(values: Grid) -> tuple[Grid, int]:
     """Fill holes smoothly from their rims; return the values, and how many were missing.
 
     Every missing value starts as its nearest valid one; then Laplace's equation is relaxed.
     """
-    missing: Bool[np.ndarray, "rows columns"] = np.isnan(values)
+    missing: Mask = np.isnan(values)
     holes = int(missing.sum())
     if holes == 0:
         return values, 0
@@ -153,12 +148,9 @@ def filled(values: Float64[np.ndarray, "rows columns"]) -> tuple[Float64[np.ndar
     return whole, holes
 
 
-#: Side of the grid on which the surround is deformed to meet the real terrain.
-MEMBRANE_SIDE = 128
-#: Largest number of samples along a side of a terrain.
-MAX_SIDE = 8192
-#: Pixels next to missing ones that resampling has mixed with black.
-TORN_EDGE_PX = 3
+MEMBRANE_SIDE = 128  #: Side of the grid on which the surround is deformed to meet the real terrain.
+MAX_SIDE = 8192  #: Largest number of samples along a side of a terrain.
+TORN_EDGE_PX = 3  #: Pixels next to missing ones that resampling has mixed with black.
 
 
 @dataclass(frozen=True)
@@ -194,10 +186,10 @@ class Embedded:
 
     rows: slice
     columns: slice
-    height: Float32[np.ndarray, "rows columns"]
-    tone: Float32[np.ndarray, "rows columns"] | None
-    weight: Float32[np.ndarray, "rows columns"]
-    real: Bool[np.ndarray, "rows columns"]
+    height: Part
+    tone: Part | None
+    weight: Part
+    real: Mask
     extent: RealExtent
 
     def real_samples(self, side: int) -> Bool[np.ndarray, "side side"]:
@@ -208,7 +200,7 @@ class Embedded:
         """Mask of the whole terrain's samples in filled holes of the DTM."""
         return self._mask(side, ~self.real)
 
-    def _mask(self, side: int, part: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "side side"]:
+    def _mask(self, side: int, part: Mask) -> Bool[np.ndarray, "side side"]:
         samples = np.zeros((side, side), dtype=np.bool_)
         samples[self.rows, self.columns] = part
         return samples
@@ -229,7 +221,7 @@ def embed(source: RealTerrain, side: int, spacing_m: float) -> Embedded:
         raise TerrainFileError(
             f"{source.dtm} covers {width:g} m x {length:g} m; a border of {source.border_m:g} m leaves nothing of it"
         )
-    heights, holes = filled(raster.values)
+    heights, holes = fill_holes(raster.values)
     # aligned with the grid, so that posts coincide with samples where the postings allow it
     west, south = (round(0.5 * (period - span) / spacing_m) * spacing_m for span in (width, length))
     i = np.arange(int(np.ceil(south / spacing_m)), int(np.floor((south + length) / spacing_m)) + 1)
@@ -242,12 +234,9 @@ def embed(source: RealTerrain, side: int, spacing_m: float) -> Embedded:
     inward_y, inward_x = np.minimum(y - south, south + length - y), np.minimum(x - west, west + width - x)
     fraction = np.clip(np.minimum(inward_y[:, None], inward_x[None, :]) / source.border_m, 0.0, 1.0)
     weight = (fraction * fraction * (3.0 - 2.0 * fraction)).astype(np.float32)
-    tone, ortho_holes = None, 0
-    if ortho is not None:
-        tone, ortho_holes = _tone(source, raster, ortho, x - west, y - south)
-    extent = RealExtent(
-        west, south, west + width, south + length, raster.posting_m, holes, ortho_holes, holes / heights.size
-    )
+    tone, ortho_holes = (None, 0) if ortho is None else _log_brightness(source, raster, ortho, x - west, y - south)
+    borders = (west, south, west + width, south + length)
+    extent = RealExtent(*borders, raster.posting_m, holes, ortho_holes, holes / heights.size)
     nearest = (
         np.clip(np.rint(offset / raster.posting_m).astype(int), 0, count - 1)
         for offset, count in ((y - south, rows), (x - west, columns))
@@ -256,13 +245,7 @@ def embed(source: RealTerrain, side: int, spacing_m: float) -> Embedded:
     return Embedded(slice(i[0], i[-1] + 1), slice(j[0], j[-1] + 1), control, tone, weight, real, extent)
 
 
-def _tone(
-    source: RealTerrain,
-    raster: Raster,
-    ortho: Raster,
-    x: Float64[np.ndarray, "columns"],
-    y: Float64[np.ndarray, "rows"],
-) -> tuple[Float32[np.ndarray, "rows columns"], int]:
+def _log_brightness(source: RealTerrain, raster: Raster, ortho: Raster, x: Line, y: Line) -> tuple[Part, int]:
     """Log brightness of the image over its mean at positions relative to the DTM's south-western post; missing pixels.
 
     The image's own shading remains: it is taken for albedo. Black is limited to a fifth of the mean.
@@ -271,7 +254,7 @@ def _tone(
     holes = int(missing.sum())
     if holes:
         missing = binary_dilation(missing, iterations=TORN_EDGE_PX)
-    brightness, _ = filled(np.where(missing, np.nan, ortho.values))
+    brightness, _ = fill_holes(np.where(missing, np.nan, ortho.values))
     logarithm = np.log(np.maximum(brightness / float(brightness.mean()), 0.2))
     rows, columns = logarithm.shape
     posts_x = ortho.west_m - raster.west_m - source.ortho_east_m + ortho.posting_m * np.arange(columns)
@@ -288,16 +271,14 @@ def choose_grid(source: RealTerrain) -> tuple[int, float]:
     """
     raster, _ = read_rasters(source)
     longest = max(raster.values.shape)
-    samples = 64
-    while samples < 1.5 * longest:
-        samples *= 2
+    samples = max(64, 1 << int(np.ceil(np.log2(1.5 * longest))))
     if samples > MAX_SIDE:
         raise TerrainFileError(f"{source.dtm} has {longest} posts along a side; at most 5461 fit")
     return samples, raster.posting_m
 
 
 #: Heights and tones finer than a DTM's posting.
-Detail = tuple[Float32[np.ndarray, "rows columns"], Float32[np.ndarray, "rows columns"]]
+Detail = tuple[Part, Part]
 
 
 def detail_below_posting(ground: Ground, real: Embedded) -> Detail:
@@ -306,10 +287,8 @@ def detail_below_posting(ground: Ground, real: Embedded) -> Detail:
     The remainder of a Gaussian low-pass whose amplitude is a half at that wavelength.
     """
     sigma = real.extent.posting_m * np.sqrt(2.0 * np.log(2.0)) / np.pi / ground.spacing_m
-    height, tone = (
-        (grid - gaussian_filter(grid, sigma, mode="wrap"))[real.rows, real.columns]
-        for grid in (ground.height, ground.tone)
-    )
+    grids = (ground.height, ground.tone)
+    height, tone = ((grid - gaussian_filter(grid, sigma, mode="wrap"))[real.rows, real.columns] for grid in grids)
     return height, tone
 
 
@@ -326,7 +305,7 @@ def blend_into_ground(ground: Ground, real: Embedded, detail: Detail | None) -> 
     difference = np.zeros((ground.side, ground.side), dtype=np.float32)
     difference[real.rows, real.columns] = real.height - ground.height[real.rows, real.columns]
     membrane = _membrane(difference[::step, ::step].astype(np.float64), known[::step, ::step])
-    np.add(ground.height, refined(membrane.astype(np.float32), ground.side), out=ground.height)
+    np.add(ground.height, refine(membrane.astype(np.float32), ground.side), out=ground.height)
     area = ground.height[real.rows, real.columns]
     area += real.weight * (height - area)
     if real.tone is not None:

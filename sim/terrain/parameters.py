@@ -7,10 +7,10 @@ from typing import Annotated, Any, get_args
 
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
-from marsyard.sim.parameters import Parameters, Positive
+from marsyard.sim.parameters import Fraction, Parameters, Positive, bounded, merge_settings
 from marsyard.sim.terrain.imported import RealTerrain
 from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell
-from marsyard.sim.terrain.rocks.population import RockParameters
+from marsyard.sim.terrain.rocks.field import RockParameters
 
 
 class TerrainParameters(Parameters):
@@ -19,29 +19,17 @@ class TerrainParameters(Parameters):
     samples: Annotated[int, Field(ge=64, le=8192, description="samples along each side, a power of two")] = 4096
     spacing_m: Annotated[float, Field(gt=0.0, le=100.0, description="distance between samples, m")] = 1.5
     hurst: Annotated[float, Field(gt=0.0, lt=1.0, description="Hurst exponent of the fractal ground's heights")] = 0.8
-    rms_slope_deg: Annotated[
-        float,
-        Field(ge=0.0, le=30.0, description="RMS slope of the fractal ground along a line over the slope baseline, deg"),
-    ] = 2.0
+    rms_slope_deg: Annotated[float, bounded(0.0, 30.0, "RMS slope along a line over the slope baseline, deg")] = 2.0
     slope_baseline_m: Annotated[Positive, Field(description="baseline of the RMS slope, m")] = 30.0
     outer_scale_m: Annotated[Positive, Field(description="wavelength above which relief stops growing, m")] = 3000.0
-    craters_per_km2: Annotated[
-        float, Field(ge=0.0, le=2.0e6, description="craters per square kilometre above the smallest diameter")
-    ] = 60.0
+    craters_per_km2: Annotated[float, bounded(0.0, 2.0e6, "craters above the smallest diameter per km2")] = 60.0
     crater_exponent: Annotated[Positive, Field(description="exponent of the cumulative size-frequency power law")] = 2.0
     crater_diameter_min_m: Annotated[Positive, Field(description="smallest crater diameter, m")] = 12.0
     crater_diameter_max_m: Annotated[Positive, Field(description="largest crater diameter, m")] = 600.0
-    crater_ejecta_contrast: Annotated[
-        float, Field(ge=0.0, le=1.0, description="log albedo of the freshest craters' ejecta, brighter or darker")
-    ] = 0.12
+    crater_ejecta_contrast: Annotated[Fraction, Field(description="log albedo of the freshest ejecta, + or -")] = 0.12
     albedo: Annotated[float, Field(gt=0.0, lt=1.0, description="mean albedo")] = 0.2
-    albedo_contrast: Annotated[
-        float, Field(ge=0.0, le=1.0, description="RMS of the logarithm of the fractal albedo over all scales")
-    ] = 0.12
-    albedo_hurst: Annotated[
-        float,
-        Field(ge=-0.5, lt=1.0, description="Hurst exponent of the albedo; 0: equal contrast in each octave"),
-    ] = 0.0
+    albedo_contrast: Annotated[Fraction, Field(description="RMS of the fractal albedo's logarithm, all scales")] = 0.12
+    albedo_hurst: Annotated[float, Field(ge=-0.5, lt=1.0, description="Hurst exponent; 0: equal in all octaves")] = 0.0
     playa: Annotated[Playa | None, Field(description="desiccation polygons")] = None
     fans: Annotated[Fans | None, Field(description="alluvial fans around a playa")] = None
     lava: Annotated[Lava | None, Field(description="pahoehoe flows and a'a")] = None
@@ -50,12 +38,7 @@ class TerrainParameters(Parameters):
     swell: Annotated[Swell | None, Field(description="broad relief")] = None
     ramp: Annotated[Ramp | None, Field(description="an even slope")] = None
     gullies: Annotated[Gullies | None, Field(description="steep-walled gullies")] = None
-    source: Annotated[
-        RealTerrain | None,
-        Field(
-            description="real terrain in the middle; all else then is its surround, and its detail below the posting"
-        ),
-    ] = None
+    source: Annotated[RealTerrain | None, Field(description="real terrain; all else is its surround")] = None
     rocks: Annotated[RockParameters | None, Field(description="rocks on the ground")] = None
 
     @field_validator("samples")
@@ -74,7 +57,7 @@ class TerrainParameters(Parameters):
         """
         _check_names(TerrainParameters, changes, "")
         try:
-            return TerrainParameters.model_validate(_merged(self.model_dump(), changes))
+            return TerrainParameters.model_validate(merge_settings(self.model_dump(), changes))
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"])
@@ -95,11 +78,3 @@ def _check_names(model: type[BaseModel], changes: Mapping[str, Any], where: str)
             for kind in get_args(model.model_fields[name].annotation):
                 if isinstance(kind, type) and issubclass(kind, BaseModel):
                     _check_names(kind, value, f"{where}.{name}")
-
-
-def _merged(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(values)
-    for name, change in changes.items():
-        before = merged.get(name)
-        merged[name] = _merged(before, change) if isinstance(before, dict) and isinstance(change, Mapping) else change
-    return merged

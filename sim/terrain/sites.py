@@ -15,10 +15,8 @@ from pydantic import Field
 from marsyard.sim.parameters import Parameters, Positive
 from marsyard.sim.terrain.parameters import TerrainParameters
 
-#: Lowest sine of the sun's elevation for which a plane-parallel atmosphere is used.
-LOWEST_SUN_SINE = 0.05
-#: Angular radius of the sun at 1 AU.
-SUN_RADIUS_AT_1_AU_RAD = 0.00465
+LOWEST_SUN_SINE = 0.05  #: Lowest sine of the sun's elevation for which a plane-parallel atmosphere is used.
+SUN_RADIUS_AT_1_AU_RAD = 0.00465  #: Angular radius of the sun at 1 AU.
 
 
 class Environment(Parameters):
@@ -27,13 +25,9 @@ class Environment(Parameters):
     planet: Annotated[str, Field(description="which planet")] = "Mars"
     gravity_m_s2: Annotated[Positive, Field(description="gravity, m/s2")] = 3.72
     rotation_rad_s: Annotated[float, Field(ge=0.0, description="sidereal rotation rate, rad/s")] = 7.0882e-5
-    solar_irradiance: Annotated[
-        Positive, Field(description="sunlight above the air over that at 1 AU; 0.44 at 1.5 AU")
-    ] = 0.44
+    solar_irradiance: Annotated[Positive, Field(description="sunlight above the air over that at 1 AU")] = 0.44
     optical_depth: Annotated[float, Field(ge=0.0, le=10.0, description="extinction optical depth of the air")] = 0.5
-    single_scattering_albedo: Annotated[
-        float, Field(ge=0.0, lt=1.0, description="share of the extinction that is scattering")
-    ] = 0.94
+    single_scattering_albedo: Annotated[float, Field(ge=0.0, lt=1.0, description="scattering over extinction")] = 0.94
     asymmetry: Annotated[float, Field(gt=-1.0, lt=1.0, description="mean cosine of the scattering angle")] = 0.65
 
     @property
@@ -68,12 +62,8 @@ class Environment(Parameters):
         # down at the top (I + 2/3 I1 = 0) nor up from the ground (I - 2/3 I1 = 0)
         two_thirds = 2.0 / 3.0
         fade = np.exp(-tau / mu)
-        system = np.array(
-            [
-                [1.0 + two_thirds * p, 1.0 - two_thirds * p],
-                [(1.0 - two_thirds * p) * np.exp(-k * tau), (1.0 + two_thirds * p) * np.exp(k * tau)],
-            ]
-        )
+        more, less = 1.0 + two_thirds * p, 1.0 - two_thirds * p
+        system = np.array([[more, less], [less * np.exp(-k * tau), more * np.exp(k * tau)]])
         c1, c2 = np.linalg.solve(system, [alpha + two_thirds * beta, (alpha - two_thirds * beta) * fade])
         mean = c1 * np.exp(-k * tau) + c2 * np.exp(k * tau) - alpha * fade
         slant = p * (c1 * np.exp(-k * tau) - c2 * np.exp(k * tau)) - beta * fade
@@ -108,7 +98,7 @@ class SiteTexture(Parameters):
 
 
 class Site(Parameters):
-    """A place to land, drive or fly.
+    """A site to land, drive or fly.
 
     `descent` is its terrain from parachute heights (posts of metres over kilometres), `ground` from a mast or a
     helicopter (posts of centimetres over 100-200 m); a site has at least one.
@@ -158,12 +148,6 @@ PAPER: dict[str, PaperFigures] = {
 }
 
 
-def _texture(coarsest_m: float, amplitude: float, decay: float) -> SiteTexture:
-    """Octaves down to a millimetre, each `decay` times as strong as the one before."""
-    octaves = int(np.log2(coarsest_m / 0.001)) + 1
-    return SiteTexture(coarsest_m=coarsest_m, amplitudes=tuple(round(amplitude * decay**n, 5) for n in range(octaves)))
-
-
 @cache
 def sites() -> dict[str, Site]:
     """Return all sites of ``sites.toml`` by name."""
@@ -174,7 +158,11 @@ def sites() -> dict[str, Site]:
         for scale in {"descent", "ground"} & set(entry):
             entry[scale] = _with_base(entry[scale], tables["grounds"])
         for texture, coarsest_m in (("ground_texture", 3.0), ("rock_texture", 0.2)):
-            entry[texture] = _texture(coarsest_m, **entry[texture])
+            # octaves down to a millimetre, each `decay` times as strong as the one before
+            strongest, decay = entry[texture]["amplitude"], entry[texture]["decay"]
+            octaves = range(int(np.log2(coarsest_m / 0.001)) + 1)
+            amplitudes = tuple(round(strongest * decay**n, 5) for n in octaves)
+            entry[texture] = SiteTexture(coarsest_m=coarsest_m, amplitudes=amplitudes)
         found[name] = Site(name=name, **entry)
     return found
 

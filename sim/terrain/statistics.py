@@ -12,15 +12,14 @@ from marsyard.sim.terrain.surface import ALBEDO, HEIGHT, Surface
 
 #: Illumination for which contrast is stated: the sun's elevation, and the fraction of diffuse light.
 CONTRAST_SUN_ELEVATION_DEG = 45.0
-CONTRAST_SKY_SHARE = 0.15
-#: Fraction of Lommel-Seeliger reflection (McEwen 1991).
-CONTRAST_LUNAR_SHARE = 0.55
+CONTRAST_SKY_FRACTION = 0.15
+CONTRAST_LUNAR_FRACTION = 0.55  #: Fraction of Lommel-Seeliger reflection (McEwen 1991).
 #: Distance between pixels of a descent image of 1024 x 1024 over 45 deg, binned four times as DIMES uses it, 2 km
 #: above the ground: 4 * 2 * 2000 m * tan(22.5 deg) / 1024.
 CONTRAST_PIXEL_M = 6.5
 
-#: Mask of a terrain's samples.
-Samples = Bool[np.ndarray, "side side"]
+Samples = Bool[np.ndarray, "side side"]  #: Mask of a terrain's samples.
+Heights = Float32[np.ndarray, "side side"]
 #: A cubic B-spline's value at a knot from the three control values there.
 _SPLINE_AT_KNOTS = np.array([1.0, 4.0, 1.0]) / 6.0
 
@@ -48,7 +47,7 @@ def terrain_statistics(surface: Surface, samples: Samples | None = None) -> Terr
     )
 
 
-def _heights(surface: Surface) -> Float32[np.ndarray, "side side"]:
+def _heights(surface: Surface) -> Heights:
     """Heights of the surface at its samples: the spline's values, not its control values."""
     heights = surface.levels[0][..., HEIGHT]
     for axis in (0, 1):
@@ -67,15 +66,15 @@ def mean_slope_deg(surface: Surface, baseline_m: float, samples: Samples | None 
     return _slope_deg(_heights(surface), surface.spacing_m, baseline_m, samples)
 
 
-def _slope_deg(
-    heights: Float32[np.ndarray, "side side"], spacing_m: float, baseline_m: float, samples: Samples | None
-) -> float:
+def _slope_deg(heights: Heights, spacing_m: float, baseline_m: float, samples: Samples | None) -> float:
     step = 1
     while spacing_m * 2 * step <= baseline_m / 8.0:
         step *= 2
     z, mask = heights[::step, ::step], None if samples is None else samples[::step, ::step]
     if mask is not None:
-        box = _bounding_box(mask)
+        # within the bounding box of the samples
+        occupied = [np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0)]
+        box = tuple(slice(int(some[0]), int(some[-1]) + 1) if some.size else slice(0) for some in occupied)
         z, mask = z[box], mask[box]
     lag = round(baseline_m / (spacing_m * step))
     if lag < 1 or 2 * lag > min(z.shape):
@@ -91,12 +90,6 @@ def _slope_deg(
         return float("nan")
     length = lag * spacing_m * step
     return float(np.mean([np.degrees(np.arctan(np.abs(rise) / length)).mean(dtype=np.float64) for rise in rises]))
-
-
-def _bounding_box(mask: Samples) -> tuple[slice, slice]:
-    occupied = [np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0)]
-    rows, columns = (slice(int(some[0]), int(some[-1]) + 1) if some.size else slice(0) for some in occupied)
-    return rows, columns
 
 
 def image_contrast(surface: Surface, pixel_m: float, samples: Samples | None = None) -> float:
@@ -121,12 +114,9 @@ def nadir_picture(
     height = field[..., HEIGHT]
     slope_x, slope_y = ((np.roll(height, -1, axis) - np.roll(height, 1, axis)) / (2.0 * spacing) for axis in (1, 0))
     cos_e = 1.0 / np.sqrt(1.0 + slope_x**2 + slope_y**2)
-    horizontal = np.cos(sun_elevation_rad)
-    towards_sun = (
-        np.sin(sun_elevation_rad)
-        - slope_x * np.sin(sun_azimuth_rad) * horizontal
-        - slope_y * np.cos(sun_azimuth_rad) * horizontal
-    )
+    east, north = np.sin(sun_azimuth_rad), np.cos(sun_azimuth_rad)
+    horizontal, up = np.cos(sun_elevation_rad), np.sin(sun_elevation_rad)
+    towards_sun = up - slope_x * east * horizontal - slope_y * north * horizontal
     cos_i = np.maximum(towards_sun * cos_e, 0.0)
-    direct = 2.0 * CONTRAST_LUNAR_SHARE * cos_i / (cos_i + cos_e) + (1.0 - CONTRAST_LUNAR_SHARE) * cos_i
-    return np.asarray(field[..., ALBEDO] * (direct + CONTRAST_SKY_SHARE * 0.5 * (1.0 + cos_e)))
+    direct = 2.0 * CONTRAST_LUNAR_FRACTION * cos_i / (cos_i + cos_e) + (1.0 - CONTRAST_LUNAR_FRACTION) * cos_i
+    return np.asarray(field[..., ALBEDO] * (direct + CONTRAST_SKY_FRACTION * 0.5 * (1.0 + cos_e)))

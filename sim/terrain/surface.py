@@ -15,12 +15,9 @@ from jaxtyping import Float, Float32
 
 from marsyard.sim.terrain.kernels import block_ceilings, evaluate_field, reduce_level
 
-#: Channels of the stored samples.
-HEIGHT, ALBEDO = 0, 1
-#: One coordinate or many, metres.
-Coordinate = Float[np.ndarray, "*batch"] | float
-#: Samples along each side of the coarsest level kept.
-SMALLEST_LEVEL = 16
+HEIGHT, ALBEDO = 0, 1  #: Channels of the stored samples.
+Coordinate = Float[np.ndarray, "*batch"] | float  #: One coordinate or many, metres.
+SMALLEST_LEVEL = 16  #: Samples along each side of the coarsest level kept.
 
 
 @dataclass(frozen=True)
@@ -40,9 +37,8 @@ class Surface:
         """Build the pyramid over level 0, a square whose side is a power of two of at least 16; else ValueError."""
         side = samples.shape[0]
         if samples.shape[1] != side or side < SMALLEST_LEVEL or side & (side - 1):
-            raise ValueError(
-                f"terrain samples have shape {samples.shape}; a square with a power of two of at least 16 is needed"
-            )
+            needed = "a square with a power of two of at least 16 is needed"
+            raise ValueError(f"terrain samples have shape {samples.shape}; {needed}")
         levels = [np.ascontiguousarray(samples)]
         while levels[-1].shape[0] > SMALLEST_LEVEL:
             levels.append(reduce_level(levels[-1]))
@@ -74,7 +70,5 @@ class Surface:
 
     def _evaluate(self, x: Coordinate, y: Coordinate, level: int) -> Float[np.ndarray, "*batch 4"]:
         x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
-        values = evaluate_field(
-            self.levels[level], self.spacing_m * 2.0**level, np.ascontiguousarray(x.ravel()), y.ravel().copy()
-        )
+        values = evaluate_field(self.levels[level], self.spacing_m * 2.0**level, x.ravel().copy(), y.ravel().copy())
         return np.asarray(values.reshape(*x.shape, 4))

@@ -25,7 +25,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.frames import rigid
 from marsyard.sim.parameters import Parameters, Positive
-from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, STANDARD_GRAVITY_M_S2, ImuIncrements, ImuParameters
+from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, MILLI_G, STANDARD_GRAVITY_M_S2, ImuIncrements, ImuParameters
 from marsyard.sim.sensor.navigation import kernels
 from marsyard.sim.sensor.satellite_navigation import RtkParameters, RtkSolutions, SolutionErrors
 from marsyard.sim.sensor.tilt_compass import TiltCompassParameters, TiltCompassReadings
@@ -123,21 +123,30 @@ class NavigationFilter:
         valid = np.flatnonzero(np.isfinite(solutions.positions_m[:, 0]))
         if valid.size == 0 or readings.times_s.size == 0:
             raise ValueError("the filter needs a solution of the receiver and a reading of the compass to start at")
-        p = self.parameters
+        p, i, c = self.parameters, self.imu, self.compass
         state = np.zeros(kernels.STATE)
-        attitude = _attitude(readings.up_body[0], readings.headings_rad[0])
+        up = readings.up_body[0]
+        pitch, roll = -np.arcsin(np.clip(up[0], -1.0, 1.0)), np.arctan2(up[1], up[2])
+        attitude = Rotation.from_euler("ZYX", np.array([0.5 * np.pi - readings.headings_rad[0], pitch, roll]))
         state[: kernels.STATE_GYRO_BIAS] = np.concatenate(
             [solutions.positions_m[valid[0]], solutions.velocities_m_s[valid[0]], attitude.as_quat()]
         )
+        gyro_bias = float(np.hypot(i.gyro_bias_deg_h, i.gyro_wander_deg_h) * DEG_H)
+        # with scale and misalignment errors under gravity: 1 ppm is 1e-3 mg, 1 mrad is 1 mg
+        scale_mg, misalignment_mg = 1e-3 * i.accelerometer_scale_ppm, i.accelerometer_misalignment_mrad
+        biases_mg = [i.accelerometer_bias_mg, i.accelerometer_wander_mg, scale_mg, misalignment_mg]
+        accelerometer_bias = float(np.linalg.norm(np.array(biases_mg))) * 1e-3 * STANDARD_GRAVITY_M_S2
+        tilted = float(c.tilt_bias_deg * np.tan(np.radians(c.dip_deg)))
+        heading_biases_deg = [c.heading_bias_deg, c.hard_iron_deg, c.soft_iron_deg, tilted]
         # in the order of the error vector
         deviations = np.concatenate(
             [
                 np.repeat([p.first_place_m, p.first_speed_m_s], 3),
                 np.radians([p.first_tilt_deg, p.first_tilt_deg, p.first_heading_deg]),
-                np.repeat([self._gyro_bias_rad_s(), self._accelerometer_bias_m_s2(), 1.0], 3),
+                np.repeat([gyro_bias, accelerometer_bias, 1.0], 3),
                 self.rtk.velocity_wander_m_s,
-                [self._heading_bias_rad()],
-                np.full(2, np.radians(self.compass.tilt_bias_deg)),
+                [float(np.radians(np.linalg.norm(np.array(heading_biases_deg))))],
+                np.full(2, np.radians(c.tilt_bias_deg)),
             ]
         )
         return FilterState(state, np.diag(deviations**2), np.array([-1.0, 0.0, 0.0, 0.0, 0.0]))
@@ -166,20 +175,20 @@ class NavigationFilter:
         )
         tuning = self._tuning(increments.period_s)
         states, covariances, deviations, log = kernels.run(inputs, start.state, covariance, memory, tuning)
-        quaternions = states[:, kernels.QUATERNION : kernels.QUATERNION + 4]
+        blocks = [kernels.VELOCITY, kernels.QUATERNION, kernels.STATE_GYRO_BIAS, kernels.STATE_ACCELEROMETER_BIAS]
+        positions, velocities, quaternions, gyro_biases, accelerometer_biases = np.split(states, blocks, axis=1)
+        kinds, axes = log[:, 1:3].astype(np.int64).T
         return NavigationSolution(
             increments=increments,
-            positions_m=states[:, kernels.POSITION : kernels.POSITION + 3],
-            velocities_m_s=states[:, kernels.VELOCITY : kernels.VELOCITY + 3],
+            positions_m=positions,
+            velocities_m_s=velocities,
             attitudes=Rotation.from_quat(quaternions),
-            gyro_biases_rad_s=states[:, kernels.STATE_GYRO_BIAS : kernels.STATE_ACCELEROMETER_BIAS],
-            accelerometer_biases_m_s2=states[:, kernels.STATE_ACCELEROMETER_BIAS : kernels.STATE],
+            gyro_biases_rad_s=gyro_biases,
+            accelerometer_biases_m_s2=accelerometer_biases,
             deviations=deviations,
             kept_at=kept_at,
             covariances=covariances,
-            innovations=Innovations(
-                log[:, 0], log[:, 1].astype(np.int64), log[:, 2].astype(np.int64), log[:, 3], log[:, 4] == 1.0
-            ),
+            innovations=Innovations(log[:, 0], kinds, axes, log[:, 3], log[:, 4] == 1.0),
             end=FilterState(states[-1].copy(), covariance, memory),
         )
 
@@ -198,35 +207,17 @@ class NavigationFilter:
     def _tilt_rows(self, r: TiltCompassReadings) -> Float64[np.ndarray, "n 5"]:
         """Readings in the kernels' columns."""
         rows = np.column_stack([r.times_s, r.up_body, 0.5 * np.pi - r.headings_rad])
-        max_repeats = self.parameters.most_repeats
-        rows[_stuck(r.up_body, max_repeats), kernels.UP] = np.nan
-        rows[_stuck(r.headings_rad[:, None], max_repeats), kernels.YAW] = np.nan
+        for column, values in ((kernels.UP, r.up_body), (kernels.YAW, r.headings_rad[:, None])):
+            rows[_stuck(values, self.parameters.most_repeats), column] = np.nan
         return rows
 
-    def _gyro_bias_rad_s(self) -> float:
-        return float(np.hypot(self.imu.gyro_bias_deg_h, self.imu.gyro_wander_deg_h) * DEG_H)
-
-    def _accelerometer_bias_m_s2(self) -> float:
-        """Including scale and misalignment errors under gravity: 1 ppm is 1e-3 mg, 1 mrad is 1 mg."""
-        p = self.imu
-        biases = [p.accelerometer_bias_mg, p.accelerometer_wander_mg]
-        parts = [*biases, 1e-3 * p.accelerometer_scale_ppm, p.accelerometer_misalignment_mrad]
-        return float(np.linalg.norm(np.array(parts))) * 1e-3 * STANDARD_GRAVITY_M_S2
-
-    def _heading_bias_rad(self) -> float:
-        p = self.compass
-        tilted = p.tilt_bias_deg * np.tan(np.radians(p.dip_deg))
-        parts = [p.heading_bias_deg, p.hard_iron_deg, p.soft_iron_deg, float(tilted)]
-        return float(np.radians(np.linalg.norm(np.array(parts))))
-
     def _tuning(self, step_s: float) -> kernels.Tuning:
-        i, r, c = self.imu, self.rtk, self.compass
-        p, milli_g = self.parameters, 1e-3 * STANDARD_GRAVITY_M_S2
-        force_wander = i.accelerometer_wander_mg * milli_g
+        i, r, c, p = self.imu, self.rtk, self.compass, self.parameters
+        force_wander = i.accelerometer_wander_mg * MILLI_G
         return kernels.Tuning(
             gravity_m_s2=self.gravity_m_s2,
             attitude_density=i.angular_random_walk_deg_sqrt_h * DEG_SQRT_H,
-            velocity_density=1e-3 * i.velocity_random_walk_ug_sqrt_hz * milli_g,
+            velocity_density=1e-3 * i.velocity_random_walk_ug_sqrt_hz * MILLI_G,
             # a Gauss-Markov bias is a random walk of this density over times much shorter than its correlation time
             gyro_bias_density=i.gyro_wander_deg_h * DEG_H * float(np.sqrt(2.0 / i.gyro_wander_s)),
             accelerometer_bias_density=force_wander * float(np.sqrt(2.0 / i.accelerometer_wander_s)),
@@ -251,15 +242,7 @@ class NavigationFilter:
 
 def _fraction(errors: SolutionErrors, part: str) -> Float64[np.ndarray, "3"]:
     """Fraction of a solution's standard deviation that is wander or noise; 0 for solutions without errors."""
-    total = np.maximum(errors.total_m, np.finfo(float).tiny)
-    return np.asarray(np.array(getattr(errors, part)) / total)
-
-
-def _attitude(up_body: Float64[np.ndarray, "3"], heading_rad: float) -> Rotation:
-    """Attitude with a direction upwards and an azimuth of the body's x axis."""
-    pitch = -np.arcsin(np.clip(up_body[0], -1.0, 1.0))
-    roll = np.arctan2(up_body[1], up_body[2])
-    return Rotation.from_euler("ZYX", np.array([0.5 * np.pi - heading_rad, pitch, roll]))
+    return np.asarray(np.array(getattr(errors, part)) / np.maximum(errors.total_m, np.finfo(float).tiny))
 
 
 def _stuck(values: Float64[np.ndarray, "n columns"], max_repeats: int) -> Bool[np.ndarray, "n"]:

@@ -33,8 +33,7 @@ POSITION_FIX, VELOCITY_FIX, COMPASS, INCLINOMETER = range(4)
 #: Memory between runs: whether the receiver's last solution was fixed (-1: none yet), the filtered acceleration in
 #: world axes, and how many solutions in a row were rejected.
 LAST_FIX, FILTERED_ACCELERATION, REJECTED, MEMORY = 0, 1, 4, 5
-#: Columns of an innovation: time, type, axis, normalised by its standard deviation, whether it was used.
-INNOVATION = 5
+INNOVATION = 5  #: Columns of an innovation: time, type, axis, normalised by its deviation, whether it was used.
 
 
 class Tuning(NamedTuple):
@@ -89,15 +88,9 @@ class Estimate(NamedTuple):
 def matrix_of(q: Array, matrix: Array) -> None:
     """Write the rotation matrix of a quaternion."""
     x, y, z, w = q[0], q[1], q[2], q[3]
-    matrix[0, 0] = 1.0 - 2.0 * (y * y + z * z)
-    matrix[0, 1] = 2.0 * (x * y - z * w)
-    matrix[0, 2] = 2.0 * (x * z + y * w)
-    matrix[1, 0] = 2.0 * (x * y + z * w)
-    matrix[1, 1] = 1.0 - 2.0 * (x * x + z * z)
-    matrix[1, 2] = 2.0 * (y * z - x * w)
-    matrix[2, 0] = 2.0 * (x * z - y * w)
-    matrix[2, 1] = 2.0 * (y * z + x * w)
-    matrix[2, 2] = 1.0 - 2.0 * (x * x + y * y)
+    matrix[0, 0], matrix[0, 1], matrix[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)
+    matrix[1, 0], matrix[1, 1], matrix[1, 2] = 2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)
+    matrix[2, 0], matrix[2, 1], matrix[2, 2] = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)
 
 
 @njit(cache=True)
@@ -146,9 +139,8 @@ def apply_transition(m: Array, matrix: Array, force: Array, kept: float, velocit
         for i in range(3):
             velocity[i] = turn[i] = 0.0
             for k in range(3):
-                velocity[i] += (
-                    force[i, k] * m[ATTITUDE_ERROR + k, j] - step * matrix[i, k] * m[ACCELEROMETER_BIAS + k, j]
-                )
+                bias = step * matrix[i, k] * m[ACCELEROMETER_BIAS + k, j]
+                velocity[i] += force[i, k] * m[ATTITUDE_ERROR + k, j] - bias
                 turn[i] += matrix[i, k] * m[GYRO_BIAS + k, j]
         for i in range(3):
             m[POSITION + i, j] += step * (m[VELOCITY + i, j] + 0.5 * velocity[i])
@@ -229,8 +221,7 @@ def _reset_errors(p: Array, block: int, size: float, added: float) -> None:
     """Replace a block of three errors by uncorrelated ones of this deviation, plus `added` times their variance."""
     for i in range(block, block + 3):
         variance = added * p[i, i] + size * size
-        p[i, :] = 0.0
-        p[:, i] = 0.0
+        p[i, :], p[:, i] = 0.0, 0.0
         p[i, i] = variance
 
 
@@ -316,8 +307,7 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, t: Tuning) -> tup
     states = np.empty((times.size, STATE))
     # position and velocity from the inertial unit alone, since the run's start
     inertial = np.zeros((times.size, 6))
-    covariances = np.empty((kept_at.size, ESTIMATED, ESTIMATED))
-    deviations = np.empty((times.size, ESTIMATED))
+    covariances, deviations = np.empty((kept_at.size, ESTIMATED, ESTIMATED)), np.empty((times.size, ESTIMATED))
     log = np.empty((6 * gps.shape[0] + 3 * tilts.shape[0], INNOVATION))
     logged = fix = tilt = kept = 0
     states[0] = start

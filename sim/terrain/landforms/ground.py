@@ -1,16 +1,19 @@
-"""The work grids of a terrain that is being synthesised."""
+"""Work grids of a terrain that is being synthesised, named random substreams, and random fields on periodic grids."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
+import scipy.fft
+from jaxtyping import Float32, Float64
+from numpy.random import Generator
 
+from marsyard.sim.streams import hash_words
 from marsyard.sim.terrain.landforms.kernels import add_refined
 
-#: Smallest side of a grid on which a landform is made.
-SMALLEST_SIDE = 16
+SMALLEST_SIDE = 16  #: Smallest side of a grid on which a landform is made.
+Grid = Float32[np.ndarray, "side side"]
 
 
 @dataclass(frozen=True)
@@ -21,8 +24,8 @@ class Ground:
     - tone: natural logarithm of albedo over its mean
     """
 
-    height: Float32[np.ndarray, "side side"]
-    tone: Float32[np.ndarray, "side side"]
+    height: Grid
+    tone: Grid
     spacing_m: float
 
     @property
@@ -52,11 +55,11 @@ class Ground:
             if grid.shape == total.shape:
                 total += grid
             else:
-                add_refined(total, refined(grid, total.shape[0] // 2))
+                add_refined(total, refine(grid, total.shape[0] // 2))
 
 
-def refined(coarse: Float32[np.ndarray, "coarse coarse"], side: int) -> Float32[np.ndarray, "side side"]:
-    """Control values of the same surface on a grid of this side: the coarse one's times a power of two."""
+def refine(coarse: Float32[np.ndarray, "coarse coarse"], side: int) -> Float32[np.ndarray, "side side"]:
+    """Return control values of the same surface on a grid of this side: the coarse one's times a power of two."""
     while coarse.shape[0] < side:
         doubled = np.zeros((2 * coarse.shape[0], 2 * coarse.shape[0]), dtype=np.float32)
         add_refined(doubled, np.ascontiguousarray(coarse))
@@ -64,14 +67,14 @@ def refined(coarse: Float32[np.ndarray, "coarse coarse"], side: int) -> Float32[
     return coarse
 
 
-def resampled(field: Float32[np.ndarray, "own own"], side: int) -> Float32[np.ndarray, "side side"]:
-    """A smooth field on a grid of this side: refined, or decimated."""
+def resample(field: Float32[np.ndarray, "own own"], side: int) -> Float32[np.ndarray, "side side"]:
+    """Return a smooth field on a grid of this side: refined, or decimated."""
     step = max(field.shape[0] // side, 1)
-    return refined(np.ascontiguousarray(field[::step, ::step]), side)
+    return refine(np.ascontiguousarray(field[::step, ::step]), side)
 
 
-def smooth_pair(
-    period_m: float, length_across_m: float, length_along_m: float, azimuth_rad: float, rng: np.random.Generator
+def draw_smooth_fields(
+    period_m: float, length_across_m: float, length_along_m: float, azimuth_rad: float, rng: Generator
 ) -> Float32[np.ndarray, "side side 2"]:
     """Draw two independent smooth random fields whose squares sum to a unit mean: control values on their own grid.
 
@@ -90,3 +93,73 @@ def smooth_pair(
     noise = rng.standard_normal((side, side, 2)) @ np.array([1.0, 1.0j])
     field = np.fft.ifft2(noise * amplitude) * side**2 / np.sqrt(2.0 * np.sum(amplitude**2))
     return np.stack([field.real, field.imag], axis=-1).astype(np.float32)
+
+
+def substream(rng: Generator, name: str) -> Generator:
+    """Derive the generator of this name from the seed of `rng`.
+
+    It depends on that seed and the name alone, not on draws or spawns from `rng`, which stays unchanged. Raises
+    TypeError for a generator that was not made from a `SeedSequence`.
+    """
+    seed = rng.bit_generator.seed_seq
+    if not isinstance(seed, np.random.SeedSequence):
+        raise TypeError(f"a generator seeded by a SeedSequence is needed, not by {type(seed).__name__}")
+    key = (*seed.spawn_key, *hash_words(name))
+    child = np.random.SeedSequence(seed.entropy, spawn_key=key, pool_size=seed.pool_size)
+    return Generator(np.random.PCG64(child))
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """A power-law spectrum on a periodic grid, from which random fields of unit expected variance are drawn.
+
+    `amplitude` holds the modes of the half spectrum; `column_power` is the sum of their squares along y for each
+    wavenumber along x, conjugate modes included.
+    """
+
+    amplitude: Float32[np.ndarray, "samples half"]
+    spacing_m: float
+    column_power: Float64[np.ndarray, "half"]
+
+    @classmethod
+    def power_law(cls, samples: int, spacing_m: float, hurst: float, outer_scale_m: float) -> Spectrum:
+        """Power spectral density ``(k**2 + k0**2)**-(hurst + 1)`` with k0 the wavenumber of the outer scale.
+
+        Above k0 the field is self-affine with the Hurst exponent; below it is white.
+        """
+        along_y = (2.0 * np.pi * scipy.fft.fftfreq(samples, spacing_m)).astype(np.float32)
+        along_x = (2.0 * np.pi * scipy.fft.rfftfreq(samples, spacing_m)).astype(np.float32)
+        squared = along_y[:, None] ** 2 + along_x[None, :] ** 2 + np.float32((2.0 * np.pi / outer_scale_m) ** 2)
+        amplitude = np.exp(np.float32(-(hurst + 1.0) / 2.0) * np.log(squared))
+        amplitude[0, 0] = 0.0
+        power = np.einsum("ij,ij->j", amplitude, amplitude, dtype=np.float64)
+        # a mode of the half spectrum counts for itself and its conjugate, except in the first and the last column
+        power[1:-1] *= 2.0
+        return cls(amplitude, spacing_m, power)
+
+    def field(self, rng: Generator, scale: float) -> Float32[np.ndarray, "samples samples"]:
+        """Draw a Gaussian field of expected variance ``scale**2``: white noise shaped in the frequency domain.
+
+        The variance is normalised by its expectation, so it varies from draw to draw. One thread, so the bytes do not
+        depend on the number of threads.
+        """
+        samples, half = self.amplitude.shape
+        noise = rng.standard_normal((samples, half, 2), dtype=np.float32).view(np.complex64)[..., 0]
+        noise *= self.amplitude
+        # irfft2 keeps the real part only of these two columns: half the power of their modes
+        noise[:, 0] *= np.float32(np.sqrt(2.0))
+        noise[:, -1] *= np.float32(np.sqrt(2.0))
+        field = scipy.fft.irfft2(noise, s=(samples, samples), workers=1, overwrite_x=True)
+        # complex noise has variance 2; irfft2 divides by samples**2
+        field *= np.float32(scale * samples**2 / np.sqrt(2.0 * self.column_power.sum()))
+        return np.asarray(field)
+
+    def line_slope_rms(self, baseline_m: float) -> float:
+        """Expected RMS slope over a baseline along a line of a unit-variance field.
+
+        ``E[(z(x + L) - z(x))**2] = 2 sum P (1 - cos k L) / sum P``.
+        """
+        k = 2.0 * np.pi * scipy.fft.rfftfreq(self.amplitude.shape[0], self.spacing_m)
+        # 1 - cos without cancellation
+        square = np.sum(self.column_power * 4.0 * np.sin(0.5 * k * baseline_m) ** 2) / self.column_power.sum()
+        return float(np.sqrt(square) / baseline_m)

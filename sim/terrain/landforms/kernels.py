@@ -131,13 +131,7 @@ def _arctan2(x: float, y: float) -> float:
 # Without Python's check for a division by zero, and without calls, the loop is compiled to vector instructions.
 @njit(cache=True, error_model="numpy")
 def _add_row_of_dunes(
-    height: Line,
-    tone: Line,
-    real: Array,
-    imaginary: Array,
-    first_phase: float,
-    spacing: float,
-    dunes: Bedforms,
+    height: Line, tone: Line, real: Array, imaginary: Array, first_phase: float, spacing: float, dunes: Bedforms
 ) -> None:
     """Add dunes along a row, given the modulation at its samples and the plane wave's phase at the first."""
     phase_step, crest, contrast = dunes.wave_x * spacing, dunes.crest_m, dunes.contrast
@@ -172,9 +166,7 @@ def add_dunes(height: Grid, tone: Grid, spacing: float, modulation: Level, dunes
     weights = np.empty((step, 4))
     for k in range(step):
         weights[k] = bspline_weights(k / step)[:4]
-    along = np.empty((cells, 2))
-    real = np.empty(side)
-    imaginary = np.empty(side)
+    along, real, imaginary = np.empty((cells, 2)), np.empty(side), np.empty(side)
     for i in range(side):
         # on one row the modulation is a spline of x alone
         collapse(modulation, i / step, along)
@@ -228,9 +220,8 @@ def add_cracks(
     positions = np.empty((count + 2, count + 2, 2))
     for row in range(-1, count + 1):
         for column in range(-1, count + 1):
-            point = points[row % count, column % count]
-            positions[row + 1, column + 1, 0] = column + point[0]
-            positions[row + 1, column + 1, 1] = row + point[1]
+            x, y = points[row % count, column % count]
+            positions[row + 1, column + 1, 0], positions[row + 1, column + 1, 1] = column + x, row + y
     for i in range(height.shape[0]):
         y = i * spacing / cell
         row = int(y)
@@ -288,10 +279,8 @@ def raise_cones(
         for j in range(side):
             total = 0.0
             for n in range(apexes.shape[0]):
-                dx = abs(j * spacing - apexes[n, 0])
-                dy = abs(i * spacing - apexes[n, 1])
-                dx = min(dx, period - dx)
-                dy = min(dy, period - dy)
+                dx, dy = abs(j * spacing - apexes[n, 0]), abs(i * spacing - apexes[n, 1])
+                dx, dy = min(dx, period - dx), min(dy, period - dy)
                 far = math.sqrt(dx * dx + dy * dy + rounding * rounding) - rounding
                 rest = 1.0 - far / apexes[n, 2]
                 if rest > 0.0:

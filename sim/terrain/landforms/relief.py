@@ -1,24 +1,32 @@
-"""Dunes, lava flows, swells, ramps and impact craters."""
+"""Landforms: dunes, lava flows, swells, ramps, impact craters, gullies, and the fans and playa of a desert basin."""
 
 from __future__ import annotations
 
+from itertools import product
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float64
+from numpy.random import Generator
 from pydantic import Field
+from scipy.signal import lfilter
 
-from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive
-from marsyard.sim.terrain.landforms.ground import Ground, resampled, smooth_pair
-from marsyard.sim.terrain.landforms.kernels import Bedforms, add_dunes, stamp_lobes
+from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded
+from marsyard.sim.terrain.landforms.ground import Ground, draw_smooth_fields, refine, resample
+from marsyard.sim.terrain.landforms.kernels import (
+    Bedforms,
+    add_cracks,
+    add_dunes,
+    cut_channels,
+    raise_cones,
+    stamp_lobes,
+)
 
 if TYPE_CHECKING:
     from marsyard.sim.terrain.parameters import TerrainParameters
 
-#: Samples a slip face should have along its slope.
-SAMPLES_ON_SLIP_FACE = 2.1
-#: RMS displacement of a lobe's outline, in half widths.
-CRENULATION = 0.28
+SAMPLES_ON_SLIP_FACE = 2.1  #: Samples a slip face should have along its slope.
+CRENULATION = 0.28  #: RMS displacement of a lobe's outline, in half widths.
 #: RMS of a cubic B-spline over that of its control values, where these are independent: 151/315.
 SPLINE_OF_NOISE_RMS = 151.0 / 315.0
 EJECTA_REACH_RADII = 3.0
@@ -28,12 +36,13 @@ FRESH_DEPTH, DEGRADED_DEPTH = 0.2, 0.04
 #: Height of the rim crest above the surroundings over diameter: 0.04 fresh (Pike 1977); diffusion lowers it faster
 #: than the bowl.
 FRESH_RIM, DEGRADED_RIM = 0.04, 0.004
-#: Height over which the rim is rounded, as a fraction of the depth.
-SHARPEST_RIM, ROUNDEST_RIM = 0.08, 0.9
-#: Fraction of the original bowl's depth that is filled in the most degraded craters.
-DEEPEST_FILL = 0.45
-#: Freshness above which ejecta keep their own brightness.
-BRIGHT_ABOVE = 0.75
+SHARPEST_RIM, ROUNDEST_RIM = 0.08, 0.9  #: Height over which the rim is rounded, as a fraction of the depth.
+DEEPEST_FILL = 0.45  #: Fraction of the original bowl's depth that is filled in the most degraded craters.
+BRIGHT_ABOVE = 0.75  #: Freshness above which ejecta keep their own brightness.
+APEX_ROUNDING = 0.06  #: Rounding of a fan's apex, as a fraction of its radius.
+CONE_DETAIL = 1.0 / 50.0  #: Scale of the smallest detail of the fans' broad shape, as a fraction of their radius.
+Channels = Float64[np.ndarray, "channels"]  #: One value per channel.
+Points = Float64[np.ndarray, "channels 2"]
 
 
 class Dunes(Parameters):
@@ -50,23 +59,20 @@ class Dunes(Parameters):
     repose_deg: Annotated[float, Field(ge=10.0, le=36.0, description="slope of the faces away from the wind")] = 32.0
     crest_length: Annotated[float, Field(ge=0.5, le=50.0, description="length of crests, wavelengths")] = 4.0
     regularity: Annotated[float, Field(ge=0.3, le=20.0, description="wavelengths over which spacing persists")] = 1.5
-    albedo_contrast: Annotated[
-        float, Field(ge=-1.0, le=1.0, description="logarithm of crests' albedo over troughs'")
-    ] = 0.05
+    albedo_contrast: Annotated[float, bounded(-1.0, 1.0, "logarithm of crests' albedo over troughs'")] = 0.05
 
-    def apply(self, ground: Ground, rng: np.random.Generator) -> None:
+    def apply(self, ground: Ground, rng: Generator) -> None:
         """Add the dunes. The wave is the nearest one, in length and direction, that fits into the period."""
         # the wave travels downwind; azimuth is clockwise from north, x is east
         downwind = np.radians(90.0 - (self.wind_from_deg + 180.0))
         waves = ground.period_m / self.wavelength_m * np.array([np.cos(downwind), np.sin(downwind)])
         whole = np.round(waves)
         if not whole.any():
-            raise ValueError(
-                f"dunes.wavelength_m is {self.wavelength_m:g}; the terrain's side is {ground.period_m:g} m"
-            )
+            side = f"{ground.period_m:g} m"
+            raise ValueError(f"dunes.wavelength_m is {self.wavelength_m:g}; the terrain's side is {side}")
         wave = 2.0 * np.pi * whole / ground.period_m
         across, along = (length * self.wavelength_m / np.sqrt(2.0) for length in (self.crest_length, self.regularity))
-        modulation = smooth_pair(ground.period_m, across, along, float(downwind), rng)
+        modulation = draw_smooth_fields(ground.period_m, across, along, float(downwind), rng)
         step = max(modulation.shape[0] // ground.side, 1)
         modulation = np.ascontiguousarray(modulation[::step, ::step])
         steepest = float(np.tan(np.radians(self.repose_deg)))
@@ -88,46 +94,42 @@ class Lava(Parameters):
     lobe_thickness_m: Annotated[NonNegative, Field(description="median thickness of a lobe, m")] = 1.5
     flow_to_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth the flows run to")] = 280.0
     lobe_contrast: Annotated[Fraction, Field(description="RMS of the lobes' log albedo")] = 0.05
-    aa_share: Annotated[Fraction, Field(description="share of the ground under a'a")] = 0.25
+    aa_share: Annotated[Fraction, Field(description="fraction of the ground under a'a")] = 0.25
     aa_block_m: Annotated[Positive, Field(description="size of its blocks, m")] = 6.0
     aa_relief_m: Annotated[NonNegative, Field(description="RMS height of its blocks, m")] = 0.45
     aa_contrast: Annotated[float, Field(ge=-1.0, le=1.0, description="log albedo of a'a over pahoehoe's")] = -0.06
-    pahoehoe_relief_m: Annotated[
-        NonNegative, Field(description="RMS height of hummocks of the blocks' size on pahoehoe, m")
-    ] = 0.05
+    pahoehoe_relief_m: Annotated[NonNegative, Field(description="RMS height of hummocks on pahoehoe, m")] = 0.05
 
-    def apply(self, ground: Ground, rng: np.random.Generator) -> None:
+    def apply(self, ground: Ground, rng: Generator) -> None:
         """Add the flows, then the blocks."""
         part = ground.coarser(max(self.lobe_length_m / 36.0, self.lobe_thickness_m))
         crenulation = self.lobe_length_m / 12.0
-        warp = np.float32(CRENULATION) * smooth_pair(ground.period_m, crenulation, crenulation, 0.0, rng)
-        lobes = self._lobes(ground.period_m, rng)
-        warp_x, warp_y = (resampled(warp[..., axis], part.side) for axis in (0, 1))
-        stamp_lobes(part.height, part.tone, part.spacing_m, lobes, warp_x, warp_y)
-        ground.add(part)
-        self._add_blocks(ground, rng)
-
-    def _lobes(self, period_m: float, rng: np.random.Generator) -> np.ndarray:
-        """Rows of `stamp_lobes`, in random order: log-normal lengths, two to four times as long as wide."""
+        warp = np.float32(CRENULATION) * draw_smooth_fields(ground.period_m, crenulation, crenulation, 0.0, rng)
+        # log-normal lengths, two to four times as long as wide, in random order
         spread = 0.5
         mean_area = np.pi / 4.0 * self.lobe_length_m**2 * np.exp(2.0 * spread**2) * 0.38
-        count = int(rng.poisson(self.layers * period_m**2 / mean_area))
+        count = int(rng.poisson(self.layers * ground.period_m**2 / mean_area))
         half_length = 0.5 * self.lobe_length_m * np.exp(spread * rng.standard_normal(count))
         half_width = half_length / rng.uniform(2.0, 4.0, count)
         thickness = self.lobe_thickness_m * np.exp(0.35 * rng.standard_normal(count))
         heading = np.radians(90.0 - self.flow_to_deg) + 0.45 * rng.standard_normal(count)
-        position = rng.uniform(0.0, period_m, (count, 2))
+        position = rng.uniform(0.0, ground.period_m, (count, 2))
         tone = self.lobe_contrast * rng.standard_normal(count)
-        return np.column_stack([position, half_length, half_width, thickness, np.cos(heading), np.sin(heading), tone])
+        outline = (half_length, half_width, thickness, np.cos(heading), np.sin(heading), tone)
+        lobes = np.column_stack([position, *outline])
+        warp_x, warp_y = (resample(warp[..., axis], part.side) for axis in (0, 1))
+        stamp_lobes(part.height, part.tone, part.spacing_m, lobes, warp_x, warp_y)
+        ground.add(part)
+        self._add_blocks(ground, rng)
 
-    def _add_blocks(self, ground: Ground, rng: np.random.Generator) -> None:
+    def _add_blocks(self, ground: Ground, rng: Generator) -> None:
         """Add noise of the blocks' size, strong in patches bounded by a level line of a smooth field."""
         blocks = ground.coarser(self.aa_block_m / 2.0)
         patches = np.zeros((blocks.side, blocks.side), dtype=np.float32)
         for scale, strength in ((1.0, 1.0), (0.35, 0.45), (0.12, 0.2)):
             size = scale * self.lobe_length_m
-            field = smooth_pair(ground.period_m, size, size, 0.0, rng)[..., 0]
-            patches += np.float32(strength) * resampled(field, blocks.side)
+            field = draw_smooth_fields(ground.period_m, size, size, 0.0, rng)[..., 0]
+            patches += np.float32(strength) * resample(field, blocks.side)
         threshold = float(np.quantile(patches[::4, ::4], 1.0 - self.aa_share))
         cover = np.clip((patches - np.float32(threshold)) * np.float32(6.0) + np.float32(0.5), 0.0, 1.0)
         relief = np.float32(self.pahoehoe_relief_m) + np.float32(self.aa_relief_m - self.pahoehoe_relief_m) * cover
@@ -144,15 +146,13 @@ class Swell(Parameters):
     relief_m: Annotated[Positive, Field(description="lowest to highest, m")] = 200.0
     waves: Annotated[int, Field(ge=1, le=8, description="most waves along a side")] = 1
 
-    def apply(self, ground: Ground, rng: np.random.Generator) -> None:
+    def apply(self, ground: Ground, rng: Generator) -> None:
         """Add the swell."""
         part = ground.coarser(ground.period_m / 64.0)
         phase = 2.0 * np.pi * np.arange(part.side) / part.side
         field = np.zeros((part.side, part.side))
-        for m in range(self.waves + 1):
-            for n in range(-self.waves, self.waves + 1):
-                if (m, n) <= (0, 0):
-                    continue
+        for m, n in product(range(self.waves + 1), range(-self.waves, self.waves + 1)):
+            if (m, n) > (0, 0):
                 strength = rng.uniform(0.7, 1.0) / (m * m + n * n) ** 1.25
                 shift = rng.uniform(0.0, 2.0 * np.pi)
                 field += strength * np.cos(m * phase[None, :] + n * phase[:, None] + shift)
@@ -174,7 +174,7 @@ class Ramp(Parameters):
     length_m: Annotated[Positive, Field(description="horizontal length of the even slope, m")] = 30.0
     uphill: Annotated[Literal["east", "north"], Field(description="direction in which the first slope climbs")] = "east"
 
-    def apply(self, ground: Ground, rng: np.random.Generator) -> None:
+    def apply(self, ground: Ground, rng: Generator) -> None:
         """Add the ramp."""
         period = ground.period_m
         longest = 0.45 * period
@@ -192,7 +192,7 @@ class Ramp(Parameters):
         np.add(ground.height, profile[None, :] if self.uphill == "east" else profile[:, None], out=ground.height)
 
 
-def draw_craters(parameters: TerrainParameters, rng: np.random.Generator) -> Float64[np.ndarray, "craters 15"]:
+def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.ndarray, "craters 15"]:
     """Draw impact craters, the largest first, as rows of `kernels.stamp_craters`.
 
     Their number is Poisson; diameters follow the truncated power law ``N(>D) ~ D**-exponent``. Freshness is ``u**2``,
@@ -200,9 +200,8 @@ def draw_craters(parameters: TerrainParameters, rng: np.random.Generator) -> Flo
     """
     smallest, largest = parameters.crater_diameter_min_m, parameters.crater_diameter_max_m
     if largest <= smallest:
-        raise ValueError(
-            f"crater_diameter_max_m is {largest:g}; it must be larger than crater_diameter_min_m, {smallest:g}"
-        )
+        limit = f"crater_diameter_min_m, {smallest:g}"
+        raise ValueError(f"crater_diameter_max_m is {largest:g}; it must be larger than {limit}")
     period = parameters.samples * parameters.spacing_m
     count = int(rng.poisson(parameters.craters_per_km2 * (period / 1000.0) ** 2))
     exponent = parameters.crater_exponent
@@ -219,3 +218,165 @@ def draw_craters(parameters: TerrainParameters, rng: np.random.Generator) -> Flo
     outline = rng.standard_normal((count, 6)) * np.repeat([0.025, 0.02, 0.012], 2)
     phase = rng.uniform(0.0, 2.0 * np.pi, count)
     return np.column_stack([position, diameter / 2.0, depth, rim, rounding, fill, bright, outline, phase])
+
+
+def draw_channels(
+    start: Points, heading: Channels, length: Channels, width: Channels, depth: Channels, wander: float, rng: Generator
+) -> Float64[np.ndarray, "discs 4"]:
+    """Draw winding channels as rows of discs (x, y, half width, depth), a quarter of their width apart.
+
+    Each swings about its heading (radians, counter-clockwise from x): the deviation is a first-order Gauss-Markov
+    process of RMS `wander` per width travelled, correlated over about eight widths. Channels begin and end narrow and
+    shallow.
+    """
+    parts = [np.empty((0, 4))]
+    for origin, mean_heading, reach, wide, deep in zip(start, heading, length, width, depth, strict=True):
+        step = 0.25 * wide
+        count = max(int(reach / step), 2)
+        correlation = np.exp(-step / (8.0 * wide))
+        noise = 2.0 * wander * np.sqrt(step / wide) * rng.standard_normal(count)
+        swing = np.asarray(lfilter([1.0], [1.0, -correlation], noise))
+        steps = np.column_stack([np.cos(mean_heading + swing), np.sin(mean_heading + swing)]) * step
+        along = (np.arange(count) + 0.5) / count
+        taper = np.sqrt(np.minimum(1.0, 8.0 * along) * np.minimum(1.0, 5.0 * (1.0 - along)))
+        position = origin + np.cumsum(steps, axis=0)
+        parts.append(np.column_stack([position, 0.5 * wide * np.maximum(taper, 0.3), deep * taper]))
+    return np.concatenate(parts)
+
+
+class Gullies(Parameters):
+    """Steep-walled gullies, hazards to a landing: trunks with tributaries, walls at a stated slope."""
+
+    per_km2: Annotated[NonNegative, Field(description="trunks per square kilometre")] = 200.0
+    width_m: Annotated[Positive, Field(description="median width of a trunk from rim to rim, m")] = 6.0
+    wall_slope_deg: Annotated[float, Field(gt=0.0, le=60.0, description="steepest slope of the walls")] = 35.0
+    length_m: Annotated[Positive, Field(description="mean length of a trunk, m")] = 90.0
+    tributaries: Annotated[int, Field(ge=0, le=50, description="tributaries of a trunk")] = 4
+    downhill_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth they run to")] = 90.0
+    contrast: Annotated[float, bounded(-1.0, 1.0, "log albedo of their floors over the ground's")] = -0.1
+
+    def apply(self, ground: Ground, rng: Generator) -> None:
+        """Cut the gullies."""
+        part = ground.coarser(self.width_m / 12.0)
+        count = int(rng.poisson(self.per_km2 * (ground.period_m / 1000.0) ** 2))
+        heading = np.radians(90.0 - self.downhill_deg) + 0.3 * rng.standard_normal(count)
+        width = self.width_m * np.exp(0.3 * rng.standard_normal(count))
+        length = self.length_m * rng.uniform(0.6, 1.4, count)
+        start = rng.uniform(0.0, ground.period_m, (count, 2))
+        trunks = draw_channels(start, heading, length, width, width * self._depth(1.0), 0.15, rng)
+        # depth (1 - (d / w)**1.5) is steepest at the rim: 1.5 depth / w
+        cut_channels(part.tone, part.spacing_m, trunks, 1.5)
+        if self.tributaries and trunks.size:
+            mouths = rng.integers(0, trunks.shape[0], count * self.tributaries)
+            heading = np.radians(90.0 - self.downhill_deg) + np.pi + rng.choice([-0.7, 0.7], mouths.size)
+            width = trunks[mouths, 2] * 2.0 * rng.uniform(0.35, 0.6, mouths.size)
+            length = 6.0 * width + 0.1 * self.length_m
+            branches = draw_channels(trunks[mouths, :2], heading, length, width, width * self._depth(1.0), 0.15, rng)
+            cut_channels(part.tone, part.spacing_m, branches, 1.5)
+        part.height[...] = -part.tone
+        part.tone[...] *= np.float32(self.contrast / (0.5 * self._depth(self.width_m)))
+        np.clip(part.tone, -abs(self.contrast), abs(self.contrast), out=part.tone)
+        ground.add(part)
+
+    def _depth(self, width: float) -> float:
+        return float(0.5 * width * np.tan(np.radians(self.wall_slope_deg)) / 1.5)
+
+
+class Playa(Parameters):
+    """Desiccation polygons: fissures of a stated spacing, dark or bright, and a finer net between them.
+
+    Giant polygons, tens to hundreds of metres wide with fissures about a metre wide whose fills look different from
+    above, are known from many playas of the Great Basin (Neal, Langer & Kerr 1968).
+    """
+
+    polygon_m: Annotated[Positive, Field(description="width of the polygons, m")] = 60.0
+    fissure_m: Annotated[Positive, Field(description="half width over which a fissure fades, m")] = 3.0
+    fissure_depth_m: Annotated[NonNegative, Field(description="depth of a fissure, m")] = 0.1
+    contrast: Annotated[float, Field(ge=-2.0, le=2.0, description="log albedo of fissures over the plates'")] = -0.12
+
+    def apply(self, ground: Ground, rng: Generator) -> None:
+        """Add the fissures, everywhere."""
+        ground.add(self.fissures(ground, rng))
+
+    def fissures(self, ground: Ground, rng: Generator) -> Ground:
+        """Return the fissures alone."""
+        part = ground.coarser(self.fissure_m)
+        for scale in (1.0, 0.4):
+            cells = max(round(ground.period_m / (scale * self.polygon_m)), 3)
+            points = rng.uniform(0.1, 0.9, (cells, cells, 2))
+            width = max(scale * self.fissure_m, part.spacing_m)
+            depth, contrast = scale * self.fissure_depth_m, scale * self.contrast
+            cell_m = ground.period_m / cells
+            add_cracks(part.height, part.tone, part.spacing_m, points, cell_m, width, depth, contrast)
+        return part
+
+
+class Fans(Parameters):
+    """Alluvial fans that run down from a divide to an almost level playa.
+
+    One divide lies along y = 0, so fans face north and south and the playa lies around y = period / 2; further divides
+    are spaced evenly. Radial profiles flatten towards the toe; slopes of 1-5 deg are usual (Blair & McPherson 1994).
+    Washes spread from the apexes. The fans keep the relief from before; the playa keeps `playa_relief` of it, and may
+    have polygons.
+    """
+
+    slope_deg: Annotated[float, Field(gt=0.0, le=15.0, description="slope at the apex")] = 4.5
+    divides: Annotated[int, Field(ge=1, le=20, description="number of divides, hence of playas")] = 2
+    radius_m: Annotated[Positive, Field(description="mean distance from apex to toe, m")] = 1300.0
+    apex_spacing_m: Annotated[Positive, Field(description="distance between apexes, m")] = 600.0
+    concavity: Annotated[float, Field(ge=1.0, le=3.0, description="1: straight profile; larger: flatter toe")] = 1.15
+    playa_relief: Annotated[float, Field(ge=0.0, le=1.0, description="relief left on the playa")] = 0.05
+    washes_per_fan: Annotated[int, Field(ge=0, le=500, description="channels on a fan")] = 50
+    wash_width_m: Annotated[Positive, Field(description="median width of a wash, m")] = 9.0
+    wash_depth_m: Annotated[NonNegative, Field(description="median depth of a wash, m")] = 0.7
+    wash_contrast: Annotated[float, Field(ge=-1.0, le=1.0, description="log albedo of washes over the fan's")] = 0.06
+    fan_contrast: Annotated[float, Field(ge=-2.0, le=2.0, description="log albedo of fans over the playa's")] = -0.12
+
+    polygons: Annotated[Playa | None, Field(description="desiccation polygons on the playa")] = None
+
+    def apply(self, ground: Ground, rng: Generator) -> None:
+        """Add the fans and their washes; flatten the playa."""
+        count = max(round(ground.period_m / self.apex_spacing_m), 1)
+        along = (np.tile(np.arange(count), self.divides) + rng.uniform(-0.3, 0.3, count * self.divides)) / count
+        across = np.repeat(np.arange(self.divides), count) / self.divides
+        offset = rng.uniform(-0.06, 0.06, along.size) * self.radius_m
+        radius = self.radius_m * rng.uniform(0.85, 1.15, along.size)
+        y = (across * ground.period_m + offset) % ground.period_m
+        apexes = np.column_stack([along * ground.period_m, y, radius])
+        broad = ground.coarser(CONE_DETAIL * self.radius_m)
+        slope = float(np.tan(np.radians(self.slope_deg)))
+        rounding = APEX_ROUNDING * self.radius_m
+        raise_cones(broad.height, broad.tone, broad.spacing_m, apexes, slope, self.concavity, rounding)
+        if self.polygons is not None:
+            fissures = self.polygons.fissures(ground, rng)
+            bare = np.float32(1.0) - resample(broad.tone, fissures.side)
+            np.multiply(fissures.height, bare, out=fissures.height)
+            np.multiply(fissures.tone, bare, out=fissures.tone)
+        relief = np.float32(self.playa_relief) + np.float32(1.0 - self.playa_relief) * broad.tone
+        kept = refine(relief, ground.side)
+        np.multiply(ground.height, kept, out=ground.height)
+        np.multiply(ground.tone, kept, out=ground.tone)
+        broad.tone[...] *= np.float32(self.fan_contrast)
+        ground.add(broad)
+        if self.polygons is not None:
+            ground.add(fissures)
+        if self.washes_per_fan:
+            self._add_washes(ground, apexes, rng)
+
+    def _add_washes(self, ground: Ground, apexes: Float64[np.ndarray, "fans 3"], rng: Generator) -> None:
+        part = ground.coarser(self.wash_width_m / 3.0)
+        count = self.washes_per_fan
+        for apex in apexes:
+            # half of them to either side of the divide, within 30 deg of straight down
+            heading = rng.choice([-1.0, 1.0], count) * np.pi / 2.0 + rng.uniform(-0.52, 0.52, count)
+            begin = apex[2] * rng.uniform(0.02, 0.5, count)
+            width = self.wash_width_m * np.exp(0.5 * rng.standard_normal(count))
+            depth = self.wash_depth_m * np.exp(0.4 * rng.standard_normal(count))
+            start = apex[:2] + begin[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
+            length = apex[2] * rng.uniform(0.9, 1.05, count) - begin
+            discs = draw_channels(start, heading, np.maximum(length, width), width, depth, 0.06, rng)
+            cut_channels(part.tone, part.spacing_m, discs, 2.0)
+        part.height[...] = -part.tone
+        part.tone[...] *= np.float32(self.wash_contrast / max(self.wash_depth_m, 1e-6))
+        np.clip(part.tone, -0.5, 0.5, out=part.tone)
+        ground.add(part)

@@ -1,6 +1,5 @@
-"""Rocks: shapes, sizes and places, and their triangles for the renderer."""
+"""Rocks: shapes, sizes and positions, and their triangles for the renderer."""
 
-from marsyard.sim.terrain.rocks.field import RockField, RockMesh
-from marsyard.sim.terrain.rocks.population import PlacedRock, RockParameters
+from marsyard.sim.terrain.rocks.field import PlacedRock, RockField, RockMesh, RockParameters
 
 __all__ = ["PlacedRock", "RockField", "RockMesh", "RockParameters"]

@@ -1,33 +1,101 @@
-"""The rocks of a terrain: positions, sizes, and their triangles around a position."""
+"""The rocks of a terrain: parameters, size-frequency distribution, positions, and triangles around a position."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from types import MappingProxyType
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float64, Int32, Int64
+from numpy.random import Generator
+from pydantic import Field, model_validator
 
-from marsyard.sim.terrain.random_fields import substream
+from marsyard.sim.parameters import Parameters, Positive
+from marsyard.sim.terrain.landforms.ground import substream
+from marsyard.sim.terrain.rocks import shapes
 from marsyard.sim.terrain.rocks.kernels import Placements, assemble, place_discs
-from marsyard.sim.terrain.rocks.population import PlacedRock, RockParameters, draw_diameters
-from marsyard.sim.terrain.rocks.shapes import (
-    COARSE,
-    FINEST,
-    FORMS,
-    SHAPES,
-    SHAPES_OF_FORM,
-    UNIT_HEIGHT,
-    max_pixels,
-    rock_shapes,
-)
+from marsyard.sim.terrain.rocks.shapes import FINEST, SHAPES_OF_FORM, max_pixels, rock_shapes
 from marsyard.sim.terrain.surface import Surface
 
-#: Side of the cells in which placement searches for neighbours, over the mean diameter.
-CELL_OVER_DIAMETER = 3.0
-#: Random positions tried for a rock; even at k = 0.4 a handful suffices.
-MAX_TRIES = 20000
+MAX_ROCKS = 2_000_000  #: Largest number of rocks on one terrain; more are an error of the configuration.
+CELL_OVER_DIAMETER = 3.0  #: Side of the cells in which placement searches for neighbours, over the mean diameter.
+MAX_TRIES = 20000  #: Random positions tried for a rock; even at k = 0.4 a handful suffices.
+Positions = Float64[np.ndarray, "found 3"]
+Sizes = Float64[np.ndarray, "rocks"]
+Numbers = Int64[np.ndarray, "found"]
+
+
+class PlacedRock(Parameters):
+    """A rock at a stated position: a rover's target, a landing hazard."""
+
+    name: Annotated[str, Field(min_length=1, description="what scenarios call it; unique on its terrain")]
+    east_m: Annotated[float, Field(description="x of its centre, m, on the periodic terrain")]
+    north_m: Annotated[float, Field(description="y of its centre, m, on the periodic terrain")]
+    diameter_m: Annotated[float, Field(gt=0.0, le=50.0, description="mean of longest and shortest diameter, m")]
+    height_m: Annotated[Positive | None, Field(description="above the ground, m; default: half the diameter")] = None
+    shape: Annotated[int | None, Field(ge=0, description="0-15: blocks, angular to rounded; 16-31: clinker")] = None
+    yaw_deg: Annotated[float | None, Field(description="turn about its vertical, deg; drawn where not given")] = None
+
+
+class RockParameters(Parameters):
+    """Rocks of a terrain: the size-frequency distribution of Golombek & Rapp (1997), and rocks at stated positions.
+
+    The fraction of the ground covered by rocks of at least diameter D is ``F_k(D) = k exp(-q D)``,
+    ``q = 1.79 + 0.152 / k`` (D in metres), fitted to the Viking landing sites.
+    The number of rocks per area and diameter follows: ``n(D) = -dF/dD / (pi D**2 / 4)``.
+    """
+
+    abundance: Annotated[float, Field(ge=0.0, le=0.4, description="k, fraction of the ground under rocks")] = 0.05
+    smallest_m: Annotated[Positive, Field(description="diameter of the smallest rocks that are made, m")] = 0.05
+    largest_m: Annotated[Positive, Field(description="diameter of the largest, m")] = 3.0
+    height_ratio: Annotated[float, Field(gt=0.0, le=1.0, description="mean height/diameter (Golombek & Rapp)")] = 0.5
+    height_spread: Annotated[float, Field(ge=0.0, lt=1.0, description="half width of its uniform spread over it")] = 0.3
+    form: Annotated[Literal["block", "clinker"], Field(description="blocks or the jagged clinker of a'a")] = "block"
+    placed: Annotated[tuple[PlacedRock, ...], Field(description="rocks at stated positions")] = ()
+
+    @model_validator(mode="after")
+    def _check_consistency(self) -> RockParameters:
+        if self.largest_m <= self.smallest_m:
+            raise ValueError(f"largest_m is {self.largest_m:g}; it must be larger than smallest_m, {self.smallest_m:g}")
+        duplicates = sorted(name for name, count in Counter(rock.name for rock in self.placed).items() if count > 1)
+        if duplicates:
+            raise ValueError(f"more than one placed rock is called {', '.join(duplicates)}; names must be unique")
+        return self
+
+
+def decay_per_m(abundance: float) -> float:
+    """q(k) of Golombek & Rapp (1997), 1/m."""
+    return 1.79 + 0.152 / abundance
+
+
+def draw_diameters(parameters: RockParameters, area_m2: float, rng: Generator) -> Float64[np.ndarray, "n"]:
+    """Draw the diameters of the rocks on an area, metres, the largest first; their number is Poisson.
+
+    Raises ValueError where there would be more than `MAX_ROCKS`.
+    """
+    p, q = parameters, decay_per_m(parameters.abundance or 1.0)
+
+    def per_log(d: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+        return np.asarray(p.abundance * q * np.exp(-q * d) / (np.pi * d / 4.0))
+
+    # the number of smaller rocks per square metre, by Simpson's rule in the logarithm of the diameter
+    diameter, step = np.geomspace(p.smallest_m, p.largest_m, 2001), np.log(p.largest_m / p.smallest_m) / 2000
+    middle = np.sqrt(diameter[1:] * diameter[:-1])
+    pieces = step / 6.0 * (per_log(diameter[:-1]) + 4.0 * per_log(middle) + per_log(diameter[1:]))
+    number = np.concatenate([[0.0], np.cumsum(pieces)])
+    expected = number[-1] * area_m2
+    if expected > MAX_ROCKS:
+        raise ValueError(
+            f"{expected:.3g} rocks of at least {p.smallest_m:g} m on {area_m2:.3g} m2; at most "
+            f"{MAX_ROCKS:g} can be made: choose a larger rocks.smallest_m"
+        )
+    quantile = rng.random(int(rng.poisson(expected)))
+    drawn = np.exp(np.interp(quantile * number[-1], number, np.log(diameter)))
+    return np.asarray(np.sort(drawn)[::-1])
 
 
 @dataclass(frozen=True)
@@ -65,30 +133,38 @@ class RockField:
     period_m: float
     shape: Int32[np.ndarray, "rocks"]
     position_m: Float64[np.ndarray, "rocks 3"]
-    diameter_m: Float64[np.ndarray, "rocks"]
-    height_m: Float64[np.ndarray, "rocks"]
-    yaw_rad: Float64[np.ndarray, "rocks"]
+    diameter_m: Sizes
+    height_m: Sizes
+    yaw_rad: Sizes
     up: Float64[np.ndarray, "rocks 3"]
     names: Mapping[str, int]
 
     @classmethod
-    def on(cls, surface: Surface, parameters: RockParameters, rng: np.random.Generator) -> RockField:
+    def on(cls, surface: Surface, parameters: RockParameters, rng: Generator) -> RockField:
         """Draw rocks on this ground that do not overlap, seen along their verticals.
 
         Raises ValueError where a rock finds no free position, or a placed rock has no such shape.
         """
         placed = parameters.placed
         drawn = draw_diameters(parameters, surface.period_m**2, substream(rng, "rock sizes"))
-        looks = substream(rng, "rock looks")
-        ratio = parameters.height_ratio * (1.0 + parameters.height_spread * looks.uniform(-1.0, 1.0, drawn.size))
-        first = FORMS.index(parameters.form) * SHAPES_OF_FORM
-        placed_shape, placed_yaw = _placed_shapes(placed, first, substream(rng, "placed rocks"))
+        appearance = substream(rng, "rock looks")
+        ratio = parameters.height_ratio * (1.0 + parameters.height_spread * appearance.uniform(-1.0, 1.0, drawn.size))
+        first = shapes.FORMS.index(parameters.form) * SHAPES_OF_FORM
+        placed_shape, placed_yaw, draws = [], [], substream(rng, "placed rocks")
+        for rock in placed:
+            if rock.shape is not None and rock.shape >= shapes.SHAPES:
+                allowed = f"0 to {shapes.SHAPES - 1}"
+                raise ValueError(f"rock '{rock.name}' has shape {rock.shape}; allowed: {allowed}")
+            kind, turn = first + int(draws.integers(0, SHAPES_OF_FORM)), float(draws.uniform(-np.pi, np.pi))
+            placed_shape.append(kind if rock.shape is None else rock.shape)
+            placed_yaw.append(turn if rock.yaw_deg is None else float(np.radians(rock.yaw_deg)))
         diameter = np.concatenate([[rock.diameter_m for rock in placed], drawn])
         height = np.concatenate([[rock.height_m or 0.5 * rock.diameter_m for rock in placed], ratio * drawn])
-        shape = np.concatenate([placed_shape, first + looks.integers(0, SHAPES_OF_FORM, drawn.size)]).astype(np.int32)
-        yaw = np.concatenate([placed_yaw, looks.uniform(-np.pi, np.pi, drawn.size)])
-        radius = rock_shapes(COARSE).reach[shape] * diameter
-        xy = _positions(parameters, radius, diameter, surface.period_m, substream(rng, "rock places"))
+        kinds = first + appearance.integers(0, SHAPES_OF_FORM, drawn.size)
+        shape = np.concatenate([placed_shape, kinds]).astype(np.int32)
+        yaw = np.concatenate([placed_yaw, appearance.uniform(-np.pi, np.pi, drawn.size)])
+        radius = rock_shapes(shapes.COARSE).reach[shape] * diameter
+        xy = _draw_positions(parameters, radius, diameter, surface.period_m, substream(rng, "rock places"))
         position = np.column_stack([xy, surface.height(xy[:, 0], xy[:, 1])])
         # the ground's slope over about the rock's own size
         level = np.clip(np.log2(np.maximum(diameter / surface.spacing_m, 1.0)).astype(int), 0, len(surface.levels) - 1)
@@ -128,11 +204,19 @@ class RockField:
         - smallest_m: smallest diameter of interest
         - above_m, pixel_rad: height of the eye above the ground there, and angle that a pixel subtends
         - detail: level of detail of all rocks, 0 (80 triangles) to 3 (5120); by default each rock's is the coarsest
-          that looks like the finest (`DEVIATION_PX`)
+          that deviates too little from the finest to be seen (`DEVIATION_PX`)
         """
-        number, offset = self._images(x, y, radius_m, smallest_m)
-        position = self.position_m[number]
-        position[:, :2] += offset
+        large = np.flatnonzero(self.diameter_m >= smallest_m)
+        reach = int(np.ceil(radius_m / self.period_m))
+        home = np.floor(np.array([x, y]) / self.period_m)
+        numbers, positions = [], []
+        for i, j in product(range(-reach, reach + 1), repeat=2):
+            offset = (home + np.array([j, i])) * self.period_m
+            dx = self.position_m[large, 0] + (offset[0] - x)
+            dy = self.position_m[large, 1] + (offset[1] - y)
+            numbers.append(large[dx * dx + dy * dy <= radius_m * radius_m])
+            positions.append(self.position_m[numbers[-1]] + np.append(offset, 0.0))
+        number, position = np.concatenate(numbers), np.concatenate(positions)
         if detail is None:
             distance = np.sqrt((position[:, 0] - x) ** 2 + (position[:, 1] - y) ** 2 + above_m**2)
             # the shortest possible distance from the eye to any of its surface
@@ -148,76 +232,32 @@ class RockField:
         numbers = np.array([number])
         return self._assemble(numbers, self.position_m[numbers], np.array([detail]))
 
-    def _images(
-        self, x: float, y: float, radius_m: float, smallest_m: float
-    ) -> tuple[Int64[np.ndarray, "found"], Float64[np.ndarray, "found 2"]]:
-        """Numbers of the rocks near a position, and the multiples of the period by which they are moved there."""
-        large = np.flatnonzero(self.diameter_m >= smallest_m)
-        period = self.period_m
-        reach = int(np.ceil(radius_m / period))
-        home = np.floor(np.array([x, y]) / period)
-        numbers, offsets = [], []
-        for i in range(-reach, reach + 1):
-            for j in range(-reach, reach + 1):
-                offset = (home + np.array([j, i])) * period
-                dx = self.position_m[large, 0] + (offset[0] - x)
-                dy = self.position_m[large, 1] + (offset[1] - y)
-                found = large[dx * dx + dy * dy <= radius_m * radius_m]
-                numbers.append(found)
-                offsets.append(np.broadcast_to(offset, (found.size, 2)))
-        return np.concatenate(numbers), np.concatenate(offsets)
-
-    def _assemble(
-        self,
-        number: Int64[np.ndarray, "found"],
-        position: Float64[np.ndarray, "found 3"],
-        detail: Int64[np.ndarray, "found"],
-    ) -> RockMesh:
+    def _assemble(self, number: Numbers, position: Positions, detail: Numbers) -> RockMesh:
         order = np.argsort(detail, kind="stable")
         number, position, detail = number[order], position[order], detail[order]
         diameter = self.diameter_m[number]
-        scale = np.column_stack([diameter, diameter, self.height_m[number] / UNIT_HEIGHT])
+        scale = np.column_stack([diameter, diameter, self.height_m[number] / shapes.UNIT_HEIGHT])
         vertices, normals = [np.empty((0, 3))], [np.empty((0, 3))]
         faces, counts, start = [np.empty((0, 3), dtype=np.int32)], [np.empty(0, dtype=np.int64)], 0
         for level in np.unique(detail):
-            one, shapes = detail == level, rock_shapes(int(level))
+            one, unit = detail == level, rock_shapes(int(level))
             rocks = number[one]
             placements = Placements(self.shape[rocks], position[one], scale[one], self.yaw_rad[rocks], self.up[rocks])
-            level_vertices, level_normals = assemble(placements, shapes.vertices, shapes.normals)
+            level_vertices, level_normals = assemble(placements, unit.vertices, unit.normals)
             stop = start + len(level_vertices)
-            first = np.arange(start, stop, shapes.vertices.shape[1], dtype=np.int32)
+            first = np.arange(start, stop, unit.vertices.shape[1], dtype=np.int32)
             vertices.append(level_vertices)
             normals.append(level_normals)
-            faces.append((shapes.faces[None] + first[:, None, None]).reshape(-1, 3))
-            counts.append(np.full(rocks.size, len(shapes.faces)))
+            faces.append((unit.faces[None] + first[:, None, None]).reshape(-1, 3))
+            counts.append(np.full(rocks.size, len(unit.faces)))
             start = stop
         body_of_face = np.repeat(np.arange(number.size, dtype=np.int32), np.concatenate(counts))
-        rock_of_face = number.astype(np.int32)[body_of_face]
-        return RockMesh(
-            np.concatenate(vertices), np.concatenate(normals), np.concatenate(faces), rock_of_face, body_of_face
-        )
+        joined = (np.concatenate(vertices), np.concatenate(normals), np.concatenate(faces))
+        return RockMesh(*joined, number.astype(np.int32)[body_of_face], body_of_face)
 
 
-def _placed_shapes(
-    placed: tuple[PlacedRock, ...], first: int, rng: np.random.Generator
-) -> tuple[list[int], list[float]]:
-    """Shapes and yaws of the placed rocks: drawn where not stated, shapes from the form's `first` on."""
-    shapes, yaws = [], []
-    for rock in placed:
-        if rock.shape is not None and rock.shape >= SHAPES:
-            raise ValueError(f"rock '{rock.name}' has shape {rock.shape}; allowed: 0 to {SHAPES - 1}")
-        shape, yaw = first + int(rng.integers(0, SHAPES_OF_FORM)), float(rng.uniform(-np.pi, np.pi))
-        shapes.append(shape if rock.shape is None else rock.shape)
-        yaws.append(yaw if rock.yaw_deg is None else float(np.radians(rock.yaw_deg)))
-    return shapes, yaws
-
-
-def _positions(
-    parameters: RockParameters,
-    radius: Float64[np.ndarray, "rocks"],
-    diameter: Float64[np.ndarray, "rocks"],
-    period_m: float,
-    rng: np.random.Generator,
+def _draw_positions(
+    parameters: RockParameters, radius: Sizes, diameter: Sizes, period_m: float, rng: Generator
 ) -> Float64[np.ndarray, "rocks 2"]:
     """Positions of the placed rocks as stated, and of the others where they do not overlap, the largest first."""
     placed = np.array([(rock.east_m, rock.north_m) for rock in parameters.placed], dtype=np.float64).reshape(-1, 2)
@@ -230,5 +270,5 @@ def _positions(
     drawn = place_discs(radius[count:], occupied, period_m, cell, MAX_TRIES, rng)
     crowded = int(np.count_nonzero(np.isnan(drawn[:, 0])))
     if crowded:
-        raise ValueError(f"{crowded} of {drawn.shape[0]} rocks find no free place; a smaller rocks.abundance is needed")
+        raise ValueError(f"{crowded} of {len(drawn)} rocks find no free position; a smaller rocks.abundance is needed")
     return np.concatenate([placed, drawn])

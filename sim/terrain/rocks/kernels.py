@@ -35,11 +35,8 @@ def place_discs(
     side = max(int(period / cell_m), 1)
     cell = period / side
     entries = 0
-    for n in range(radii.size):
-        across = min(int(2.0 * radii[n] / cell) + 2, side)
-        entries += across * across
-    for n in range(occupied.shape[0]):
-        across = min(int(2.0 * occupied[n, 2] / cell) + 2, side)
+    for radius in np.concatenate((radii, occupied[:, 2])):
+        across = min(int(2.0 * radius / cell) + 2, side)
         entries += across * across
     first = np.full(side * side, -1, dtype=np.int32)
     following = np.empty(entries, dtype=np.int32)
@@ -57,9 +54,7 @@ def place_discs(
         tries = 0
         while not free and tries < max_tries:
             tries += 1
-            x = rng.random() * period
-            y = rng.random() * period
-            free = True
+            x, y, free = rng.random() * period, rng.random() * period, True
             span = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)
             width = min(int((x + radius) / cell + side) - int((x - radius) / cell + side) + 1, side)
             for di in range(span):
@@ -69,8 +64,7 @@ def place_discs(
                     entry = first[i * side + j]
                     while entry >= 0:
                         other = member[entry]
-                        dx = abs(discs[other, 0] - x)
-                        dy = abs(discs[other, 1] - y)
+                        dx, dy = abs(discs[other, 0] - x), abs(discs[other, 1] - y)
                         dx, dy = min(dx, period - dx), min(dy, period - dy)
                         apart = discs[other, 2] + radius
                         if dx * dx + dy * dy < apart * apart:
@@ -92,8 +86,7 @@ def place_discs(
             i = (int((y - radius) / cell + side) + di) % side
             for dj in range(width):
                 j = (int((x - radius) / cell + side) + dj) % side
-                member[used] = count
-                following[used] = first[i * side + j]
+                member[used], following[used] = count, first[i * side + j]
                 first[i * side + j] = used
                 used += 1
         count += 1
@@ -109,8 +102,7 @@ def assemble(rocks: Placements, unit_vertices: Array, unit_normals: Array) -> tu
     """
     shape, position, scale, yaw, up = rocks
     each = unit_vertices.shape[1]
-    vertices = np.empty((shape.size * each, 3))
-    normals = np.empty((shape.size * each, 3))
+    vertices, normals = np.empty((shape.size * each, 3)), np.empty((shape.size * each, 3))
     for n in range(shape.size):
         kind = shape[n]
         c, s = math.cos(yaw[n]), math.sin(yaw[n])

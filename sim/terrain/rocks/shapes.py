@@ -17,18 +17,15 @@ from scipy.sparse.linalg import splu
 from marsyard.sim.cache import cache_directory, evict_files, load_array, save_array, touch
 from marsyard.sim.processor import processor_features
 
-#: Shapes of each form; the first blocks are angular, the last rounded.
-SHAPES_OF_FORM = 16
+SHAPES_OF_FORM = 16  #: Shapes of each form; the first blocks are angular, the last rounded.
 #: Forms in the order of their shapes' numbers: blocks, and the rough clinker of a'a.
 FORMS = ("block", "clinker")
 SHAPES = SHAPES_OF_FORM * len(FORMS)
 #: Subdivisions of the icosahedron at each level of detail: 80, 320, 1280 and 5120 triangles.
 SUBDIVISIONS = (1, 2, 3, 4)
 COARSE, MEDIUM, FINE, FINEST = range(4)
-#: Allowed RMS deviation of a rock's image from its finest shape, pixels.
-DEVIATION_PX = 0.25
-#: Height above the ground over diameter of the unit shapes. Each rock is stretched to its own.
-UNIT_HEIGHT = 0.5
+DEVIATION_PX = 0.25  #: Allowed RMS deviation of a rock's image from its finest shape, pixels.
+UNIT_HEIGHT = 0.5  #: Height above the ground over diameter of the unit shapes. Each rock is stretched to its own.
 #: Exponents of the cuts' union, which rounds their edges, from the most angular to the most rounded.
 _SHARPEST, _ROUNDEST = 200.0, 10.0
 #: Range of the fraction of a form's height that is under the ground.
@@ -36,11 +33,12 @@ _BURIED = {"block": (0.15, 0.4), "clinker": (0.3, 0.5)}
 #: Bumps in bands of wavenumber (radians per radius): number of waves, and each form's RMS height over the radius.
 _BUMP_WAVENUMBERS, _BUMP_WAVES = (3.0, 6.5, 13.0, 24.0), (10, 16, 24, 32)
 _BUMP_RMS = {"block": (0.03, 0.015, 0.008, 0.004), "clinker": (0.1, 0.045, 0.022, 0.0)}
+Points = Float64[np.ndarray, "n 3"]
 
 
 @dataclass(frozen=True)
 class ShapeSet:
-    """All shapes at one level of detail; each is a displaced icosphere, so they share their triangles.
+    """All shapes at one level of detail; each is a displaced icosphere, so all have the same triangles.
 
     A unit shape stands on the ground plane z = 0, part of it below; seen from above, the mean of its longest and its
     shortest diameter is 1, and it is `UNIT_HEIGHT` high.
@@ -121,14 +119,14 @@ def _vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
 
 def _built_vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
     directions, _ = _icosphere(detail)
-    vertices = []
+    vertices: Float64[np.ndarray, "shapes vertices 3"] = np.empty((SHAPES, *directions.shape))
     for number, block in enumerate(_blocks()):
         if detail == FINEST:
             points = directions * block.radius(directions)[:, None]
         else:
             points = directions / _fitted_inverse_radii(number, detail)[:, None]
-        vertices.append(block.to_unit_shape(points))
-    return np.stack(vertices)
+        vertices[number] = block.to_unit_shape(points)
+    return vertices
 
 
 @cache
@@ -182,27 +180,25 @@ class _Block:
             buried_fraction=float(rng.uniform(*_BURIED[form])),
         )
 
-    def to_unit_shape(self, own: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    def to_unit_shape(self, own: Points) -> Points:
         """Points of the unit shape from points in the block's own axes before stretching."""
         shift, stretch = self.frame
         return np.asarray((own * self.axes - shift) * stretch)
 
-    def normals(self, directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    def normals(self, directions: Points) -> Points:
         """Outward unit normals along directions, by differences of the implicit surface ``|x| - r(x / |x|)``."""
+
+        def implicit(points: Points) -> Float64[np.ndarray, "n"]:
+            length = np.linalg.norm(points, axis=1)
+            return np.asarray(length - self.radius(points / length[:, None]))
+
         own = directions * self.radius(directions)[:, None] * self.axes / self.axes
         step = 1e-4
-        gradient = np.empty_like(own)
-        for axis in range(3):
-            offset = step * np.eye(3)[axis]
-            gradient[:, axis] = (self._implicit(own + offset) - self._implicit(own - offset)) / (2.0 * step)
-        gradient /= self.axes * self.frame[1]
+        differences = [implicit(own + offset) - implicit(own - offset) for offset in step * np.eye(3)]
+        gradient = np.stack(differences, axis=1) / (2.0 * step) / (self.axes * self.frame[1])
         return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
 
-    def _implicit(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
-        length = np.linalg.norm(points, axis=1)
-        return np.asarray(length - self.radius(points / length[:, None]))
-
-    def radius(self, d: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
+    def radius(self, d: Points) -> Float64[np.ndarray, "n"]:
         """Distance of the surface along directions, in the block's own axes."""
         towards = np.maximum(_dot_products(d, self.cut_normals), 0.0) / self.cut_distances
         radius = (1.0 + np.sum(towards**self.sharpness, axis=1)) ** (-1.0 / self.sharpness)
@@ -233,7 +229,7 @@ class _Block:
         return np.array([*middle, ground]), np.array([across, across, UNIT_HEIGHT / (highest - ground)])
 
 
-def _dot_products(d: Float64[np.ndarray, "n 3"], vectors: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "n m"]:
+def _dot_products(d: Points, vectors: Float64[np.ndarray, "m 3"]) -> Float64[np.ndarray, "n m"]:
     """All scalar products, written out because the order of summation of BLAS differs between machines."""
     x, y, z = (d[:, axis, None] * vectors[:, axis] for axis in range(3))
     return np.asarray(x + y + z)

@@ -5,14 +5,7 @@ import pytest
 
 from marsyard.sim.sensor import DetectorParameters, preset
 from marsyard.sim.sensor.detector import dark_seconds
-from marsyard.sim.sensor.optics import (
-    DARK_E_S,
-    DARKEST_RADIANCE_FACTOR,
-    NG3_FIELD,
-    NG4_FLIGHT,
-    LightPath,
-    solar_photons,
-)
+from marsyard.sim.sensor.optics import DARK_E_S, DARKEST_RADIANCE_FACTOR, LightPath, solar_photons
 
 FLOWN, FIELD = preset("mer-descent-flown"), preset("mer-descent-field")
 
@@ -34,23 +27,19 @@ def test_sunlight_is_the_solar_constant() -> None:
 
 def test_neutral_density_filters() -> None:
     """Section III.B.2: optical density 0.67 and 22 %, 0.97 and 11 %."""
-    assert NG4_FLIGHT.optical_density == pytest.approx(0.67)
-    assert NG3_FIELD.optical_density == pytest.approx(0.97)
-    for camera, share in ((FLOWN, 0.22), (FIELD, 0.11)):
+    for camera, fraction in ((FLOWN, 0.22), (FIELD, 0.11)):
         bare = replace(camera.light, neutral_density=None)
         passed = camera.light.responsivity_e_s(1.5) / bare.responsivity_e_s(1.5)
-        assert passed == pytest.approx(share, abs=0.005)
-    # thicker glass is darker: Beer's law with the reflection left alone
-    assert 10 ** -(2 * 1.44 * NG4_FLIGHT.density_per_mm) == pytest.approx(0.2332**2, rel=0.01)
+        assert passed == pytest.approx(fraction, abs=0.005)
 
 
 @pytest.mark.parametrize(
     ("temperature_c", "ratio", "share"), [(-34.0, 102.0, None), (0.0, 100.0, 0.02), (23.0, 87.0, 0.15)]
 )
-def test_paper_signal_to_noise_and_shares_of_dark_current(
+def test_paper_signal_to_noise_and_dark_current_fractions(
     temperature_c: float, ratio: float, share: float | None
 ) -> None:
-    """Section III.B.3, one set of constants: the ratio within 2, shares within a factor of 1.2."""
+    """Section III.B.3, one set of constants: the ratio within 2, fractions within a factor of 1.2."""
     for camera in (FLOWN, FIELD):
         p = camera.detector.model_copy(update={"temperature_c": temperature_c})
         assert _signal_to_noise(p, DARKEST_RADIANCE_FACTOR) == pytest.approx(ratio, abs=2.0)

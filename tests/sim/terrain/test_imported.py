@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from marsyard.sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
-from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, choose_grid, embed, filled, read_rasters
+from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, choose_grid, embed, fill_holes, read_rasters
 from marsyard.sim.terrain.statistics import terrain_statistics
 
 ROWS, COLUMNS = 90, 110
@@ -52,7 +52,7 @@ def test_the_surface_passes_through_the_posts(npz: Path) -> None:
     extent = embed(source, 256, 1.0).extent
     assert (extent.holes, extent.ortho_holes) == (6, 8 * COLUMNS)
     surface = made(around(source))
-    whole, _ = filled(read_rasters(source)[0].values)
+    whole, _ = fill_holes(read_rasters(source)[0].values)
     x, y = np.meshgrid(extent.west_m + np.arange(11, COLUMNS - 11), extent.south_m + np.arange(11, ROWS - 11))
     expected = whole[11:-11, 11:-11] - whole.mean()
     np.testing.assert_allclose(surface.height(x, y), expected, atol=1e-4)

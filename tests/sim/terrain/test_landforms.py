@@ -12,9 +12,8 @@ from scipy.spatial import cKDTree
 
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.landforms import Dunes, Fans, Ground, Gullies, Lava, Playa, Ramp, Swell
-from marsyard.sim.terrain.landforms.ground import refined, smooth_pair
+from marsyard.sim.terrain.landforms.ground import draw_smooth_fields, refine, substream
 from marsyard.sim.terrain.landforms.kernels import Bedforms, add_cracks, add_dunes, stamp_craters
-from marsyard.sim.terrain.random_fields import substream
 from marsyard.sim.terrain.statistics import mean_slope_deg
 
 SMOOTH = TerrainParameters(samples=512, rms_slope_deg=0.0, craters_per_km2=0.0, albedo_contrast=0.0)
@@ -168,16 +167,17 @@ def test_gullies_have_steep_walls() -> None:
 def test_refinement_keeps_the_surface_exactly() -> None:
     rng = np.random.default_rng(0)
     coarse = rng.normal(size=(16, 16)).astype(np.float32)
-    fine = refined(coarse, 64)
+    fine = refine(coarse, 64)
     x, y = rng.uniform(0, 16, 200), rng.uniform(0, 16, 200)
     theirs = map_coordinates(coarse.astype(float), [y, x], order=3, mode="grid-wrap", prefilter=False)
     ours = map_coordinates(fine.astype(float), [4 * y, 4 * x], order=3, mode="grid-wrap", prefilter=False)
     np.testing.assert_allclose(ours, theirs, atol=2e-6)
 
 
-def test_smooth_pair_has_unit_power() -> None:
+def test_smooth_fields_have_unit_power() -> None:
     powers = [
-        np.mean(np.sum(smooth_pair(100.0, 4.0, 8.0, 0.3, np.random.default_rng(s)) ** 2.0, axis=2)) for s in range(30)
+        np.mean(np.sum(draw_smooth_fields(100.0, 4.0, 8.0, 0.3, np.random.default_rng(s)) ** 2.0, axis=2))
+        for s in range(30)
     ]
     assert np.mean(powers) == pytest.approx(1.0, abs=0.05)
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface
 from marsyard.sim.terrain.rocks import shapes
-from marsyard.sim.terrain.rocks.population import decay_per_m, draw_diameters
+from marsyard.sim.terrain.rocks.field import decay_per_m, draw_diameters
 from marsyard.sim.terrain.rocks.shapes import (
     COARSE,
     FINE,

@@ -3,9 +3,9 @@ import pytest
 from pydantic import ValidationError
 
 from marsyard.sim.terrain import TerrainParameters, synthesise
+from marsyard.sim.terrain.landforms.ground import Spectrum
 from marsyard.sim.terrain.landforms.kernels import stamp_craters
 from marsyard.sim.terrain.landforms.relief import DEGRADED_DEPTH, FRESH_DEPTH, draw_craters
-from marsyard.sim.terrain.random_fields import Spectrum
 
 
 def test_same_stream_same_bytes() -> None:
