@@ -86,15 +86,7 @@ def stats(
     measured = terrain_statistics(surface, None if real is None else real.real_samples(parameters.samples))
     extent = None if real is None else real.extent
     if not as_json:
-        _print_statistics(site, parameters, seed, measured, extent)
-        if grid_north is not None:
-            side, sign = ("east", "-") if grid_north >= 0.0 else ("west", "+")
-            away = f"{abs(grid_north):.2f} deg"
-            console().print(
-                f"Grid north (the y axis) points {away} {side} of true north in the middle of the file. All azimuths, "
-                "the sun's too, count from grid north: azimuth from grid north = azimuth from true north "
-                f"{sign} {away}."
-            )
+        _print_statistics(site, parameters, seed, measured, extent, grid_north)
         return
     paper = PAPER.get(site)
     stated: dict[str, Any] | None = None
@@ -115,7 +107,12 @@ def stats(
 
 
 def _print_statistics(
-    name: str, parameters: TerrainParameters, seed: int, measured: TerrainStatistics, extent: RealExtent | None
+    name: str,
+    parameters: TerrainParameters,
+    seed: int,
+    measured: TerrainStatistics,
+    extent: RealExtent | None,
+    grid_north: float | None,
 ) -> None:
     from rich.table import Table
 
@@ -150,6 +147,14 @@ def _print_statistics(
             f"{extent.north_m:g} m, posts {extent.posting_m:g} m apart, synthetic around it; the figures are those of "
             f"the real part, without holes. Filled: {extent.holes} posts without height ({extent.hole_fraction:.1%}), "
             f"{extent.ortho_holes} pixels without brightness."
+        )
+    if grid_north is not None:
+        towards, sign = ("east", "-") if grid_north >= 0.0 else ("west", "+")
+        away = f"{abs(grid_north):.2f} deg"
+        out.print(
+            f"Grid north (the y axis) points {away} {towards} of true north in the middle of the file. All azimuths, "
+            "the sun's too, count from grid north: azimuth from grid north = azimuth from true north "
+            f"{sign} {away}."
         )
 
 
