@@ -3,29 +3,13 @@
 The names of `marsyard.api` are available here, and imported on first use.
 """
 
+# ruff: noqa: F405  (the names are those of marsyard.api)
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from marsyard.api import (
-        CameraModel,
-        Campaign,
-        CaseResult,
-        catalogue,
-        draw,
-        draws,
-        load_campaign,
-        read_camera,
-        read_cameras,
-        render_view,
-        results,
-        run_campaign,
-        run_case,
-        score,
-        sites,
-        verdicts,
-    )
+    from marsyard.api import *  # noqa: F403
 
 __all__ = [
     "CameraModel",

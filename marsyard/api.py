@@ -28,7 +28,7 @@ from marsyard.sim.camera import read_cameras as read_cameras
 if TYPE_CHECKING:
     import pandas as pd
 
-    from marsyard.cli.render import Picture
+    from marsyard.cli.pictures import Picture
     from marsyard.reports.verdicts import Verdict
 
 
@@ -93,8 +93,7 @@ def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) ->
     from marsyard.campaigns.execution.workers import ExecutorConfig
     from marsyard.campaigns.running.engine import run_campaign as run
     from marsyard.cli.outcome import settle
-    from marsyard.cli.progress import campaign_progress
-    from marsyard.cli.run_log import RunLog
+    from marsyard.cli.progress import RunLog, campaign_progress
 
     folder = Path(directory)
     with campaign_progress(Console(stderr=True)) as progress, RunLog(folder, progress) as log:
@@ -136,7 +135,7 @@ def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True,
     - shot: options of `marsyard render`: scale, altitude_m, east_m, north_m, azimuth_deg, elevation_deg,
       sun_azimuth_deg, sun_elevation_deg, seed, max_hole_fraction
     """
-    from marsyard.cli.render import Shot, take
+    from marsyard.cli.pictures import Shot, take
 
     return take(Shot.usual(site, camera, **shot), detector=detector)
 

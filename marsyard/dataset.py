@@ -23,8 +23,9 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.identity import configuration_hash
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.running.preparation import plan_inputs
-from marsyard.scenarios.exposure import ProvidesSamples, Sample
+from marsyard.scenarios.exposure import ProvidesSamples
 from marsyard.scenarios.registry import scenario, scenario_names
+from marsyard.sim.camera import BODY_FRAME, write_cahvor
 
 MANIFEST = "dataset.json"
 
@@ -105,35 +106,27 @@ def _files(campaign: Campaign, case: int) -> Iterator[tuple[str, bytes]]:
     for number, sample in enumerate(scenario.samples(campaign.parameters(case), campaign.streams(case))):
         key = f"{case:07d}-{number}"
         metadata = {"campaign": campaign.configuration.name, "case": case, "picture": number, "drawn": drawn}
-        yield f"{key}.image.png", _png(sample.image * np.uint16(2 ** (16 - sample.bits)))
-        yield f"{key}.range.npy", _npy(sample.range_m)
-        yield f"{key}.normal.npy", _npy(sample.normal)
-        yield f"{key}.rocks.png", _png(sample.rocks)
+        yield f"{key}.image.png", _encode(sample.image * np.uint16(2 ** (16 - sample.bits)))
+        yield f"{key}.range.npy", _encode(sample.range_m)
+        yield f"{key}.normal.npy", _encode(sample.normal)
+        yield f"{key}.rocks.png", _encode(sample.rocks)
         if sample.hazard is not None:
-            yield f"{key}.hazard.png", _png(sample.hazard)
-        yield f"{key}.cahvor", _camera(sample)
+            yield f"{key}.hazard.png", _encode(sample.hazard)
+        with tempfile.NamedTemporaryFile() as camera:
+            write_cahvor(sample.camera, Path(camera.name), frame=BODY_FRAME)
+            yield f"{key}.cahvor", Path(camera.name).read_bytes()
         yield f"{key}.json", json.dumps({**metadata, "bits": sample.bits, **sample.about}, indent=1).encode()
 
 
-def _png(values: np.ndarray[Any, Any]) -> bytes:
+def _encode(values: np.ndarray[Any, Any]) -> bytes:
+    """Encode whole numbers as PNG, other numbers as NPY."""
+    if not np.issubdtype(values.dtype, np.integer):
+        buffer = io.BytesIO()
+        np.save(buffer, values, allow_pickle=False)
+        return buffer.getvalue()
     import cv2
 
     written, encoded = cv2.imencode(".png", values)
     if not written:
         raise ValueError("a picture could not be written as PNG")
     return encoded.tobytes()
-
-
-def _npy(values: np.ndarray[Any, Any]) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, values, allow_pickle=False)
-    return buffer.getvalue()
-
-
-def _camera(sample: Sample) -> bytes:
-    from marsyard.sim.camera import BODY_FRAME, write_cahvor
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "camera.cahvor"
-        write_cahvor(sample.camera, path, frame=BODY_FRAME)
-        return path.read_bytes()

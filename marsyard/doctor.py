@@ -41,10 +41,7 @@ MODULES = {"opencv-python-headless": "cv2", "pyrender2": "pyrender", "pyyaml": "
 #: Distributions that write into the same folder as one of ours, ours first.
 RIVALS = (("pyrender2", "pyrender"), ("opencv-python-headless", "opencv-python"))
 #: The GL backends, the preferred one first, and their Debian packages.
-BACKENDS = {
-    "osmesa": "libosmesa6 libgl1 libxrender1",
-    "egl": "libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libxrender1",
-}
+BACKENDS = {"osmesa": "libosmesa6 libgl1 libxrender1", "egl": "libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libxrender1"}
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 REINSTALL = "make setup, or: pip install -c constraints.txt -e ."
 MEBI = 2**20
@@ -71,21 +68,20 @@ class Check:
 
 def run(console: Console, *, as_json: bool = False) -> int:
     """Print all checks as a table or JSON; return 0 if a campaign can run here, else 1."""
-    checks = list(examine())
+    checks, version = list(examine()), importlib.metadata.version("marsyard")
     failed = [check.name for check in checks if check.verdict is Verdict.FAIL]
-    if as_json:
-        summary = {"version": importlib.metadata.version("marsyard"), "root": str(ROOT), "can_run": not failed}
-        rows = [
-            {"check": check.name, "found": check.finding, "verdict": check.verdict.name.lower(), "mend": check.remedy}
-            for check in checks
-        ]
-        console.print(json.dumps({**summary, "checks": rows}, indent=2), markup=False, highlight=False, soft_wrap=True)
-        return 1 if failed else 0
-    table = Table(title=f"Marsyard {importlib.metadata.version('marsyard')} in {ROOT}", title_justify="left")
+    table = Table(title=f"Marsyard {version} in {ROOT}", title_justify="left")
     for heading in ("check", "found", "verdict"):
         table.add_column(heading, overflow="fold")
+    rows = []
     for check in checks:
-        table.add_row(Text(check.name), Text(check.finding), Text(check.verdict.name.lower(), check.verdict.value))
+        word = check.verdict.name.lower()
+        rows.append({"check": check.name, "found": check.finding, "verdict": word, "mend": check.remedy})
+        table.add_row(Text(check.name), Text(check.finding), Text(word, check.verdict.value))
+    if as_json:
+        summary = {"version": version, "root": str(ROOT), "can_run": not failed, "checks": rows}
+        console.print(json.dumps(summary, indent=2), markup=False, highlight=False, soft_wrap=True)
+        return 1 if failed else 0
     console.print(table)
     for check in checks:
         if check.remedy:
@@ -101,7 +97,9 @@ def examine() -> Iterator[Check]:
     """Run all checks, in the order of the table; the slow ones run in parallel."""
     with ThreadPoolExecutor() as pool:
         rendering = {backend: pool.submit(probe_backend, backend) for backend in BACKENDS}
-        imports = pool.submit(import_failures, _dependency_modules())
+        names = [_module(canonicalize_name(requirement.name)) for requirement in _requirements()]
+        # pyrender loads a GL library at import, which `probe_backend` tests
+        imports = pool.submit(import_failures, [name for name in names if name != "pyrender"])
         yield check_python()
         yield check_optimisation(__debug__)
         yield from check_shadowing()
@@ -127,14 +125,17 @@ def check_python() -> Check:
 
 def check_optimisation(assertions: bool) -> Check:
     """Check that `assert` statements run: pyrender makes GL calls inside them."""
-    if assertions:
-        return Check("assertions", "on")
-    return Check("assertions", "off (python -O)", Verdict.FAIL, "run Python without -O and unset PYTHONOPTIMIZE")
+    remedy = "run Python without -O and unset PYTHONOPTIMIZE"
+    return Check("assertions", "on") if assertions else Check("assertions", "off (python -O)", Verdict.FAIL, remedy)
 
 
 def check_shadowing() -> Iterator[Check]:
     """Check that Python imports this package, and that no distribution is installed over another."""
-    origin = _origin(PACKAGE)
+    spec = importlib.util.find_spec(PACKAGE)
+    origins = [] if spec is None else list(spec.submodule_search_locations or ())
+    if spec is not None and spec.origin is not None:
+        origins = [str(Path(spec.origin).parent)]
+    origin = Path(origins[0]).resolve() if origins else None
     if origin != ROOT / PACKAGE:
         remedy = "uninstall what brought it, unset PYTHONPATH, or leave the folder that holds it; then " + REINSTALL
         yield Check("package shadowing", f"another package comes first: {PACKAGE} from {origin}", Verdict.FAIL, remedy)
@@ -143,20 +144,12 @@ def check_shadowing() -> Iterator[Check]:
     owners = importlib.metadata.packages_distributions().get(PACKAGE, [])
     others = sorted({canonicalize_name(owner) for owner in owners} - {"marsyard"})
     if others:
-        yield Check(
-            "package names",
-            f"{', '.join(others)} also installs a package named {PACKAGE}",
-            Verdict.WARN,
-            f"pip uninstall {' '.join(others)}, then {REINSTALL}",
-        )
+        finding = f"{', '.join(others)} also installs a package named {PACKAGE}"
+        yield Check("package names", finding, Verdict.WARN, f"pip uninstall {' '.join(others)}, then {REINSTALL}")
     for ours, rival in RIVALS:
         if _version(rival) is not None:
-            yield Check(
-                "package names",
-                f"{rival} is installed over {ours}, into the same folder",
-                Verdict.FAIL,
-                f"pip uninstall -y {rival} {ours}, then {REINSTALL}",
-            )
+            finding = f"{rival} is installed over {ours}, into the same folder"
+            yield Check("package names", finding, Verdict.FAIL, f"pip uninstall -y {rival} {ours}, then {REINSTALL}")
 
 
 def check_dependencies(failures: Mapping[str, str]) -> Iterator[Check]:
@@ -183,15 +176,15 @@ def check_dependencies(failures: Mapping[str, str]) -> Iterator[Check]:
 
 def import_failures(modules: Iterable[str]) -> dict[str, str]:
     """Import modules in a separate process; return the errors by module."""
-    waiting = list(modules)
+    remaining = list(modules)
     failures: dict[str, str] = {}
-    while waiting:
-        ended = _run_python("-c", _IMPORT_ALL, *waiting)
+    while remaining:
+        ended = _run_python("-c", _IMPORT_ALL, *remaining)
         reached = [json.loads(line) for line in ended.stdout.splitlines()]
         failures |= {name: fault for name, fault in reached if fault}
-        waiting = waiting[len(reached) :]
-        if waiting:  # this one crashed the process
-            failures[waiting.pop(0)] = _failure_reason(ended)
+        remaining = remaining[len(reached) :]
+        if remaining:  # the first of these crashed the process
+            failures[remaining.pop(0)] = _failure_reason(ended)
     return failures
 
 
@@ -224,27 +217,11 @@ def _module(distribution: str) -> str:
     return MODULES.get(distribution, distribution.replace("-", "_"))
 
 
-def _dependency_modules() -> list[str]:
-    """Return the modules to import, without pyrender: it loads a GL library at import, which `probe_backend` tests."""
-    names = (_module(canonicalize_name(requirement.name)) for requirement in _requirements())
-    return [name for name in names if name != "pyrender"]
-
-
 def _version(distribution: str) -> str | None:
     try:
         return importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError:
         return None
-
-
-def _origin(package: str) -> Path | None:
-    """Return the folder from which Python imports a top-level package."""
-    spec = importlib.util.find_spec(package)
-    if spec is None:
-        return None
-    if spec.origin is not None:
-        return Path(spec.origin).resolve().parent
-    return next((Path(folder).resolve() for folder in spec.submodule_search_locations or ()), None)
 
 
 @dataclass(frozen=True)
@@ -266,12 +243,9 @@ def probe_backend(backend: str) -> Probe:
 
 def check_rendering(probes: Mapping[str, Probe]) -> Iterator[Check]:
     """Check each backend, and the one that a campaign would use."""
-    sound = []
-    for backend, probe in probes.items():
-        check = _check_backend(backend, probe)
-        if check.verdict is Verdict.OK:
-            sound.append(backend)
-        yield check
+    checks = {backend: _check_backend(backend, probe) for backend, probe in probes.items()}
+    yield from checks.values()
+    sound = [backend for backend, check in checks.items() if check.verdict is Verdict.OK]
     wanted = os.environ.get("MARSYARD_GL", next(iter(BACKENDS))).lower()
     if wanted not in BACKENDS:
         fault = f"MARSYARD_GL is '{wanted}'; allowed: {', '.join(BACKENDS)}"
@@ -298,9 +272,8 @@ def _check_backend(backend: str, probe: Probe) -> Check:
         return Check(name, finding + fault, Verdict.WARN, "use the other backend, or another driver")
     finding += f"; depth right to {error_m * 1e3:.2g} mm at {gl_probe.DISTANCE_M:.0f} m"
     if max(map(abs, offset)) > gl_probe.OFFSET_TOLERANCE_PX:
-        finding += (
-            f"; pyrender alone samples it ({offset[0]:+.3f}, {offset[1]:+.3f}) px off-centre, Marsyard at the centre"
-        )
+        pixels = f"({offset[0]:+.3f}, {offset[1]:+.3f}) px"
+        finding += f"; pyrender alone samples it {pixels} off-centre, Marsyard at the centre"
     return Check(name, finding)
 
 
@@ -311,9 +284,8 @@ def check_numba_cache() -> Check:
     folder = Path(os.environ.get("NUMBA_CACHE_DIR", Path.home() / ".cache" / "numba"))
     if _is_writable(folder):
         return Check("numba cache", f"{folder} is writable")
-    return Check(
-        "numba cache", f"cannot write to {folder}", Verdict.WARN, "export NUMBA_CACHE_DIR=FOLDER, one you may write to"
-    )
+    remedy = "export NUMBA_CACHE_DIR=FOLDER, one you may write to"
+    return Check("numba cache", f"cannot write to {folder}", Verdict.WARN, remedy)
 
 
 def check_disk() -> Iterator[Check]:
@@ -332,17 +304,19 @@ def check_disk() -> Iterator[Check]:
 
 def _check_disk_space(name: str, folder: Path, remedy: str) -> Check:
     free = shutil.disk_usage(folder).free // MEBI
-    finding = f"{free} MiB free in {folder}"
     if not _is_writable(folder):
         return Check(name, f"cannot write to {folder}", Verdict.FAIL, remedy)
-    if free >= 1024:
-        return Check(name, finding)
-    return Check(name, finding, Verdict.FAIL if free < 100 else Verdict.WARN, remedy)
+    verdict = Verdict.OK if free >= 1024 else Verdict.FAIL if free < 100 else Verdict.WARN
+    return Check(name, f"{free} MiB free in {folder}", verdict, "" if verdict is Verdict.OK else remedy)
 
 
 def check_machine() -> Check:
-    """Check cores and memory; a worker needs about half a GiB."""
-    cores, memory = _cores(), _memory_mib()
+    """Check cores and memory, of the machine or of a smaller control group; a worker needs about half a GiB."""
+    cores, limits = _cores(), [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    group = Path("/sys/fs/cgroup/memory.max")
+    if group.is_file() and (text := group.read_text().strip()).isdigit():
+        limits.append(int(text))
+    memory = min(limits) // MEBI
     finding = f"{cores} cores, {memory} MiB of memory"
     if memory < 512 * cores:
         return Check("cores and memory", finding, Verdict.WARN, f"run with --jobs {max(1, memory // 512)}")
@@ -375,15 +349,6 @@ def check_systems() -> Iterator[Check]:
 
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _memory_mib() -> int:
-    """Return the memory of the machine, or of the control group if that is smaller."""
-    limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
-    group = Path("/sys/fs/cgroup/memory.max")
-    if group.is_file() and (text := group.read_text().strip()).isdigit():
-        limits.append(int(text))
-    return min(limits) // MEBI
 
 
 def _is_writable(folder: Path) -> bool:

@@ -17,50 +17,44 @@ from typer.core import TyperCommand, TyperGroup
 
 from marsyard.cli.campaign import append, replay, resume, run
 from marsyard.cli.conformance import conformance
-from marsyard.cli.dashboard import dashboard
-from marsyard.cli.gallery import gallery
 from marsyard.cli.housekeeping import clean, compile_kernels
-from marsyard.cli.ingest import ingest
-from marsyard.cli.new import new
+from marsyard.cli.new import ingest, new
 from marsyard.cli.nightly import nightly
 from marsyard.cli.offline import dataset, export, score
 from marsyard.cli.options import CampaignArgument, Exit, JsonOption, SetOption, console, handle_user_errors
-from marsyard.cli.render import render
-from marsyard.cli.report import compare, report
+from marsyard.cli.render import gallery, render
+from marsyard.cli.report import compare, dashboard, report
 from marsyard.cli.terrain import app as terrain
 
 
-class _Command(TyperCommand):
-    """A command whose help shows no value type for flags."""
+class _PlainFlags:
+    """Hides the value type of flags in the help of a command or group."""
 
     def get_params(self, ctx: Any) -> list[Any]:
         """The parameters, flags without a type."""
-        return _hide_flag_types(super().get_params(ctx))
+        parameters: list[Any] = super().get_params(ctx)  # type: ignore[misc]
+        for one in parameters:
+            if getattr(one, "is_flag", False):
+                one.metavar = ""
+        return parameters
 
 
-class _Group(TyperGroup):
-    """A group whose help shows no value type for flags."""
-
-    def get_params(self, ctx: Any) -> list[Any]:
-        """The parameters, flags without a type."""
-        return _hide_flag_types(super().get_params(ctx))
+class _Command(_PlainFlags, TyperCommand):
+    pass
 
 
-def _hide_flag_types(parameters: list[Any]) -> list[Any]:
-    for one in parameters:
-        if getattr(one, "is_flag", False):
-            one.metavar = ""
-    return parameters
+class _Group(_PlainFlags, TyperGroup):
+    pass
 
 
 app = typer.Typer(
     cls=_Group,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    help="A virtual Mars Yard: runs vision software through rendered, truth-known cases and says whether its "
+    help="A virtual Mars Yard: runs vision software through rendered, truth-known cases and reports whether its "
     "requirements are met, with a stated confidence.",
     epilog="Exit status: 0 every requirement met, or none asked; 1 a requirement failed, or a case crashed; "
-    "2 the command or a file is wrong; 3 not enough cases to say, or no independent random draws.",
+    "2 the command or a file is wrong; 3 not enough cases for a verdict, or no independent random draws.",
 )
 
 
@@ -76,28 +70,20 @@ def list_campaigns(as_json: JsonOption = False) -> None:
     for problem in problems():
         typer.echo(f"warning: {problem}", err=True)
     keys = ("scenario", "cases", "description")
-    campaigns = {name: (path, _read_stated(path)) for name, path in catalogue().items()}
-    if as_json:
-        rows = [
-            {"name": name, "file": str(path), **{key: stated.get(key) for key in keys}}
-            for name, (path, stated) in campaigns.items()
-        ]
-        typer.echo(json.dumps(rows, indent=2))
-        return
-    table = Table()
+    rows, table = [], Table()
     for heading in ("campaign", *keys):
         table.add_column(heading, overflow="fold")
-    for name, (_, stated) in campaigns.items():
+    for name, path in catalogue().items():
+        try:
+            stated = tomllib.loads(path.read_text(encoding="utf-8"))  # not validated: `run` reports errors
+        except (OSError, ValueError) as error:
+            stated = {"description": f"cannot be read: {error}"}
+        rows.append({"name": name, "file": str(path), **{key: stated.get(key) for key in keys}})
         table.add_row(Text(name), *(Text(str(stated.get(key, ""))) for key in keys))
-    console().print(table)
-
-
-def _read_stated(path: Path) -> dict[str, Any]:
-    """A campaign's file without validation; `run` reports its errors."""
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        return {"description": f"cannot be read: {error}"}
+    if as_json:
+        typer.echo(json.dumps(rows, indent=2))
+    else:
+        console().print(table)
 
 
 @handle_user_errors
@@ -106,8 +92,7 @@ def show(
     override: SetOption = None,
     draw: Annotated[int | None, Option("--draw", metavar="N", help="Show the draws of the first N cases.")] = None,
     figure: Annotated[
-        Path | None,
-        Option("--figure", metavar="FILE", help="With --draw: write marginals and pairs as .svg or .png."),
+        Path | None, Option("--figure", metavar="FILE", help="With --draw: write marginals and pairs as .svg or .png.")
     ] = None,
     as_json: Annotated[bool, Option("--json", help="Print JSON, with all draws.")] = False,
 ) -> None:
@@ -117,7 +102,7 @@ def show(
     from marsyard.cli.showing import described, show_campaign, show_draws, write_draws_figure
 
     if figure is not None and draw is None:
-        raise CampaignError("--figure shows draws: say of how many cases with --draw N")
+        raise CampaignError("--figure shows draws: give the number of cases with --draw N")
     loaded = load_campaign(campaign, override or [])
     if figure is not None and draw is not None:
         write_draws_figure(loaded, draw, figure)
@@ -139,7 +124,6 @@ def doctor(as_json: JsonOption = False) -> None:
 
 
 def _print_version(asked: bool) -> None:
-    """Print the version and exit."""
     if asked:
         from importlib.metadata import version
 

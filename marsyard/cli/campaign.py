@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,15 +29,12 @@ from marsyard.cli.options import (
     SetOption,
     console,
     handle_user_errors,
-    size_text,
     with_options,
 )
 
 if TYPE_CHECKING:
-    from marsyard.campaigns.definition.campaign import Campaign
     from marsyard.campaigns.execution.workers import ExecutorConfig
     from marsyard.campaigns.running.engine import Watch
-    from marsyard.campaigns.running.replay import Replay
 
 
 @dataclass(frozen=True)
@@ -56,10 +53,7 @@ class RunOptions:
     )
     until_decided: Annotated[
         bool,
-        Option(
-            "--until-decided",
-            help="Stop early once the verdicts are decided; the number of cases is the maximum.",
-        ),
+        Option("--until-decided", help="Stop early once the verdicts are decided; the number of cases is the maximum."),
     ] = False
     override: SetOption = None
     algorithm: AlgorithmOption = None
@@ -77,15 +71,15 @@ def run(given: RunOptions) -> None:
     loaded = load_campaign(given.campaign, changes, given.cases, given.seed, given.algorithm or [])
     # imported after loading, so that an error in the file is reported at once
     from marsyard.campaigns.running.engine import run_campaign
-    from marsyard.cli.evidence import run_until_decided
+    from marsyard.cli import evidence
 
     executor = make_executor(given.jobs, given.cluster)
     if given.dry_run:
-        _print_estimate(loaded, executor)
-        _print_limits(loaded)
+        evidence.print_estimate(loaded, executor)
+        evidence.print_limits(loaded)
         return
     directory = given.out if given.out is not None else default_directory(loaded.configuration.name)
-    start = run_until_decided if given.until_decided else run_campaign
+    start = evidence.run_until_decided if given.until_decided else run_campaign
     run_and_judge(directory, lambda watch: start(loaded, directory, executor, watch))
 
 
@@ -107,10 +101,16 @@ def resume(
     allow_changed: ChangedOption = False,
 ) -> None:
     """Run the remaining cases of an interrupted or killed campaign, and judge it."""
+    from marsyard.campaigns.errors import CampaignError, not_allowed
+    from marsyard.campaigns.outcomes import RETRYABLE
     from marsyard.campaigns.running.engine import resume_campaign
     from marsyard.cli.evidence import continue_until_decided
 
-    executor, outcomes = make_executor(jobs, cluster), _retried_outcomes(retry or [])
+    executor, allowed = make_executor(jobs, cluster), [*RETRYABLE, "all"]
+    for word in retry or []:
+        if word not in allowed:
+            raise CampaignError(f"--retry: {not_allowed('outcome', word, allowed)}")
+    outcomes = list(RETRYABLE) if "all" in (retry or []) else retry or []
 
     def continue_campaign(watch: Watch) -> None:
         resume_campaign(directory, executor, watch, retry=outcomes, case_time_s=case_time, allow_changed=allow_changed)
@@ -131,10 +131,11 @@ def append(
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.running.engine import append_cases, campaign_with_block
     from marsyard.campaigns.store.record import stored_configuration
+    from marsyard.cli import evidence
 
     if stored_configuration(directory).most_cases is not None:
         raise CampaignError(f"{directory} stopped itself (--until-decided): more cases would buy a second chance")
-    _print_limits(campaign_with_block(directory, cases))
+    evidence.print_limits(campaign_with_block(directory, cases))
     executor = make_executor(jobs, cluster)
     run_and_judge(directory, lambda watch: append_cases(directory, cases, executor, watch, allow_changed=allow_changed))
 
@@ -150,40 +151,33 @@ def replay(
 ) -> None:
     """Rerun one case, write and plot its intermediate results, and compare its row with the stored one."""
     from marsyard.campaigns.running.replay import replay as run_again
-    from marsyard.campaigns.store.products import case_directory
+    from marsyard.campaigns.store.products import (
+        case_directory,
+        replaced_files,
+        unpack_products,
+        write_packed,
+    )
+    from marsyard.cli.steps import write_steps
+    from marsyard.reports.cases import write_case_figures
 
     replayed = run_again(directory, case)
     target = out if out is not None else case_directory(directory, case)
     if (replayed.failed or replayed.products is None) and (target / "products.json").exists():
         written = [f"{target} keeps the products that it had: this time the case delivered none to replace them"]
-    else:
-        written = _write_products(target, replayed, step=step)
+    else:  # the products, stages and figures, all or none
+        packed = replayed.products or pack_products({})
+        products = unpack_products(packed)
+        with replaced_files(target) as folder:
+            write_packed(folder, packed, replayed.row)
+            stages = write_steps(folder / "steps", products) if step else 0
+            figures = [target / path.relative_to(folder) for path in write_case_figures(folder, products)]
+        lines = [f"stages: {stages} files in {target / 'steps'}"] if step else []
+        written = [f"products: {target}", *lines, *(f"figure: {figure}" for figure in figures)]
     typer.echo(f"case {case}: {replayed.row['outcome']}")
     for line in (replayed.row["error"] and (replayed.row["traceback"] or replayed.row["error"]), replayed.note):
         if line:
             typer.echo(line)
     typer.echo("\n".join(written))
-    _compare(replayed)
-
-
-def _write_products(target: Path, replayed: Replay, *, step: bool) -> list[str]:
-    """Write the products, stages and figures of a replayed case, all or none; return lines that name them."""
-    from marsyard.campaigns.store.products import pack_products, replaced_files, unpack_products, write_packed
-    from marsyard.cli.steps import write_steps
-    from marsyard.reports.cases import write_case_figures
-
-    packed = replayed.products or pack_products({})
-    products = unpack_products(packed)
-    with replaced_files(target) as folder:
-        write_packed(folder, packed, replayed.row)
-        stages = write_steps(folder / "steps", products) if step else 0
-        figures = [target / path.relative_to(folder) for path in write_case_figures(folder, products)]
-    lines = [f"stages: {stages} files in {target / 'steps'}"] if step else []
-    return [f"products: {target}", *lines, *(f"figure: {figure}" for figure in figures)]
-
-
-def _compare(replayed: Replay) -> None:
-    """Report the differences of a replayed row from the stored one; end with status 1 if there are any."""
     if replayed.changed:
         typer.echo(f"since the campaign ran this has changed: {'; '.join(replayed.changed)}")
     if replayed.stored is None:
@@ -209,21 +203,10 @@ def make_executor(jobs: int | None, cluster: str | None) -> ExecutorConfig:
     return ExecutorConfig(jobs or available_cores(), cluster)
 
 
-def _retried_outcomes(words: Sequence[str]) -> list[str]:
-    """The outcomes of `--retry`."""
-    from marsyard.campaigns.errors import CampaignError, not_allowed
-    from marsyard.campaigns.outcomes import RETRYABLE
-
-    for word in words:
-        if word not in (*RETRYABLE, "all"):
-            raise CampaignError(f"--retry: {not_allowed('outcome', word, [*RETRYABLE, 'all'])}")
-    return list(RETRYABLE) if "all" in words else list(words)
-
-
 def run_and_judge(directory: Path, work: Callable[[Watch], None]) -> None:
     """Do a campaign's work and judge it."""
     from marsyard.cli.outcome import conclude
-    from marsyard.cli.run_log import RunLog
+    from marsyard.cli.progress import RunLog
 
     with shown_progress(directory, f"marsyard resume {directory}") as progress, RunLog(directory, progress) as log:
         work(log)
@@ -244,7 +227,7 @@ def shown_progress(directory: Path, next_command: str) -> Iterator[Watch]:
         try:
             stored = read(directory)
             rows = f"the rows so far are in {directory} ({stored['cases_finished']} of {stored['cases']})"
-            typer.echo(f"interrupted; {rows}. To go on: {next_command}", err=True)
+            typer.echo(f"interrupted; {rows}. To continue: {next_command}", err=True)
         except CampaignError:
             pass
         raise typer.Exit(Exit.INTERRUPTED) from None
@@ -270,46 +253,6 @@ def stopped_by_signals() -> Iterator[None]:
     finally:
         for kind, handler in before.items():
             signal.signal(kind, handler)
-
-
-def _print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:
-    """Print the estimated time and disk space of a campaign."""
-    from marsyard.campaigns.running.preparation import estimate
-    from marsyard.reports.wording import count
-
-    workers = executor.jobs if executor.cluster is None else os.cpu_count() or 1
-    estimated = estimate(campaign, workers)
-    total = campaign.configuration.total_cases
-    low, high = estimated.case_range_s
-    typer.echo(f"{count(total, 'case')} on {count(workers, 'worker')}: about {_duration(estimated.time_s)}")
-    if estimated.inputs:
-        typer.echo(f"  {count(estimated.inputs, 'terrain')} (shared inputs) to build, {estimated.input_s:.3g} s each")
-    typer.echo(
-        f"  {estimated.case_s:.3g} s a case ({low:.3g} to {high:.3g} s in {count(estimated.trials, 'trial case')})"
-    )
-    if estimated.unfinished:
-        typer.echo(f"  {estimated.unfinished} of the trial cases did not come to their end")
-    typer.echo(
-        f"disk: {size_text(estimated.rows_bytes)} of rows, up to {size_text(estimated.products_bytes)} of products"
-    )
-    if estimated.inputs_bytes:
-        limit = size_text(estimated.cache_limit_bytes)
-        typer.echo(f"  {size_text(estimated.inputs_bytes)} of terrains in the cache, which keeps at most {limit}")
-
-
-def _print_limits(campaign: Campaign) -> None:
-    """Print why the campaign's requirements cannot be PASS, and the remedy."""
-    from marsyard.cli.evidence import evidence_limits
-
-    for limit in evidence_limits(campaign):
-        typer.echo(f"note: {limit}")
-
-
-def _duration(seconds: float) -> str:
-    """A time in s, min or h."""
-    if seconds < 120.0:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
 def default_directory(name: str) -> Path:

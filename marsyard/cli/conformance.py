@@ -1,19 +1,15 @@
-"""`marsyard conformance`: an algorithm, or a motion, instrument or score of one's own, put to its protocol's suite."""
+"""`marsyard conformance`: check an algorithm, or a custom motion, instrument or score, against its protocol."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from typer import Argument, Option
 
 from marsyard.cli.options import Exit, JsonOption, console, handle_user_errors
-
-if TYPE_CHECKING:
-    from marsyard.scenarios.conformance import Finding, Subject
 
 
 @handle_user_errors
@@ -34,40 +30,32 @@ def conformance(
     ] = 60.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Put an algorithm, or your own motion, instrument or score, to its suite: right types, no change of inputs, ..."""
+    """Check an algorithm, or a custom motion, instrument or score, against its protocol: types, inputs, time, ..."""
     from marsyard.campaigns.running.conformance import examine, subject_of
     from marsyard.scenarios.parts.named import KINDS
 
     subject = subject_of(algorithm, task, time_limit)
     findings = []
     if not as_json:
-        typer.echo(
-            f"{algorithm} as {'a part of the kind' if subject.task in KINDS else 'an algorithm for'} {subject.task}"
-        )
+        kind = "a part of the kind" if subject.task in KINDS else "an algorithm for"
+        typer.echo(f"{algorithm} as {kind} {subject.task}")
     for finding in examine(subject):
         findings.append(finding)
-        if not as_json:
-            _print(finding)
+        if as_json:
+            continue
+        word = "[green]ok  [/]" if finding.passed else "[bold red]FAIL[/]"
+        console().print(f"{word} {finding.check:<14}", end="", highlight=False)
+        lines = [f"{finding.asked} ({finding.note})" if finding.note else finding.asked]
+        if not finding.passed:
+            lines += [f"{'':20}{line}" for line in (finding.problem, f"next: {finding.next_step}")]
+        for line in lines:
+            console().print(line, markup=False, highlight=False, soft_wrap=True)
+    failed = sum(not finding.passed for finding in findings)
     if as_json:
-        typer.echo(json.dumps(_plain(subject, findings), indent=2))
+        checks = [{**asdict(one), "passed": one.passed} for one in findings]
+        data = {"algorithm": subject.spec, "task": subject.task, "passed": not failed, "checks": checks}
+        typer.echo(json.dumps(data, indent=2))
     else:
-        failed = sum(not finding.passed for finding in findings)
         typer.echo(f"{len(findings) - failed} of {len(findings)} checks passed")
-    if not all(finding.passed for finding in findings):
+    if failed:
         raise typer.Exit(Exit.FAILED)
-
-
-def _print(finding: Finding) -> None:
-    word = "[green]ok  [/]" if finding.passed else "[bold red]FAIL[/]"
-    console().print(f"{word} {finding.check:<14}", end="", highlight=False)
-    note = f" ({finding.note})" if finding.note else ""
-    console().print(f"{finding.asked}{note}", markup=False, highlight=False, soft_wrap=True)
-    if not finding.passed:
-        for line in (finding.problem, f"next: {finding.next_step}"):
-            console().print(f"{'':20}{line}", markup=False, highlight=False, soft_wrap=True)
-
-
-def _plain(subject: Subject, findings: Sequence[Finding]) -> dict[str, object]:
-    checks = [{**asdict(one), "passed": one.passed} for one in findings]
-    passed = all(one.passed for one in findings)
-    return {"algorithm": subject.spec, "task": subject.task, "passed": passed, "checks": checks}

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+
+import typer
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import Watch, append_cases, run_campaign
+from marsyard.campaigns.running.preparation import estimate
 from marsyard.campaigns.store import record
-from marsyard.cli.outcome import read_frame
+from marsyard.cli.options import size_text
 from marsyard.reports.evaluation import next_look
 from marsyard.reports.sampling_design import sampled
 from marsyard.reports.statistics.proportions import minimum_sample_size
@@ -41,21 +45,46 @@ def evidence_limits(campaign: Campaign) -> list[str]:
     if cases < fewest:
         limits.append(f"{what} takes at least {count(fewest, 'case')} without a failure, and {cases} are asked for.")
     supply = how.terrains
-    terrains = min(cases, supply.terrains) if supply is not None and supply.in_turn else _drawn_terrains(campaign)
+    if supply is None:
+        return limits
+    # the distinct terrains of the cases: in turn, or as drawn
+    terrains = min(cases, supply.terrains) if supply.in_turn else cases
+    path = next((path for path in ("place.terrain", "world.terrain") if path in configuration.dispersions), None)
+    if not supply.in_turn and path is not None and cases <= _MAX_DRAWS:
+        terrains = len({campaign.draws(case)[path] for case in range(int(configuration.design.nominal), cases)})
     # cases with a terrain each are limited by their number alone; others are counted by terrains
-    if supply is not None and terrains is not None and terrains < min(cases, fewest):
+    if terrains < min(cases, fewest):
         limits.append(supply.advice(fewest, hardest.probability, hardest.confidence))
     return limits
 
 
-def _drawn_terrains(campaign: Campaign) -> int | None:
-    """Number of distinct terrains that the cases draw; None without a terrain's dispersion, or for very many cases."""
-    configuration = campaign.configuration
-    path = next((path for path in ("place.terrain", "world.terrain") if path in configuration.dispersions), None)
-    if path is None or configuration.total_cases > _MAX_DRAWS:
-        return None
-    first = int(configuration.design.nominal)
-    return len({campaign.draws(case)[path] for case in range(first, configuration.total_cases)})
+def print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:
+    """Print the estimated time and disk space of a campaign."""
+    workers = executor.jobs if executor.cluster is None else os.cpu_count() or 1
+    estimated = estimate(campaign, workers)
+    total = campaign.configuration.total_cases
+    low, high = estimated.case_range_s
+    time_s = estimated.time_s
+    duration = f"{time_s / 60.0:.0f} min" if time_s < 7200.0 else f"{time_s / 3600.0:.1f} h"
+    duration = f"{time_s:.0f} s" if time_s < 120.0 else duration
+    typer.echo(f"{count(total, 'case')} on {count(workers, 'worker')}: about {duration}")
+    if estimated.inputs:
+        typer.echo(f"  {count(estimated.inputs, 'terrain')} (shared inputs) to build, {estimated.input_s:.3g} s each")
+    trials = count(estimated.trials, "trial case")
+    typer.echo(f"  {estimated.case_s:.3g} s a case ({low:.3g} to {high:.3g} s in {trials})")
+    if estimated.unfinished:
+        typer.echo(f"  {estimated.unfinished} of the trial cases did not come to their end")
+    rows, products = size_text(estimated.rows_bytes), size_text(estimated.products_bytes)
+    typer.echo(f"disk: {rows} of rows, up to {products} of products")
+    if estimated.inputs_bytes:
+        limit = size_text(estimated.cache_limit_bytes)
+        typer.echo(f"  {size_text(estimated.inputs_bytes)} of terrains in the cache, which keeps at most {limit}")
+
+
+def print_limits(campaign: Campaign) -> None:
+    """Print why the campaign's requirements cannot be PASS, and the remedy."""
+    for limit in evidence_limits(campaign):
+        typer.echo(f"note: {limit}")
 
 
 def run_until_decided(campaign: Campaign, directory: Path, executor: ExecutorConfig, watch: Watch) -> None:
@@ -80,6 +109,8 @@ def run_until_decided(campaign: Campaign, directory: Path, executor: ExecutorCon
 
 def continue_until_decided(directory: Path, executor: ExecutorConfig, watch: Watch) -> None:
     """Add cases to a finished campaign with looks until it is decided."""
+    from marsyard.cli.outcome import read_frame  # the reports, which `new` does not need
+
     while True:
         configuration = record.stored_configuration(directory)
         if configuration.most_cases is None:

@@ -2,34 +2,35 @@
 
 from __future__ import annotations
 
+import base64
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Any, TypeAlias
 
+import cv2
+import numpy as np
 import typer
-from typer import Option
+from jaxtyping import Bool, Float64, UInt8
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from marsyard.cli.options import OverwriteOption
-from marsyard.cli.render import Shot, report_picture_errors, take
+from marsyard.cli.pictures import Shot, take
+from marsyard.sim.terrain import sites
 
-if TYPE_CHECKING:
-    import numpy as np
-    from jaxtyping import Bool, Float64, UInt8
-
-    Grey = UInt8[np.ndarray, "rows columns"]
+Grey: TypeAlias = UInt8[np.ndarray, "rows columns"]
 
 PAGE, SHEET = "index.html", "contact-sheet.png"
-#: Widest the pictures on the page are, and the quality of their JPEG files.
+#: Maximum width of the pictures on the page, and the quality of their JPEG files and of those next to it.
 PAGE_WIDTH_PX, PAGE_QUALITY, FULL_QUALITY = 760, 82, 92
 #: The contact sheet: cells, gap, height of the labels, the bytes it may take, and the greys tried to stay below them.
 COLUMNS, CELL_PX, GAP_PX, LABEL_PX, SHEET_BYTES = 4, (240, 180), 8, 22, 300_000
 SHEET_GREYS = (64, 48, 40, 32, 26, 21, 16, 12, 8)
 #: Display: percentiles of the brightness that become almost black and white, how much of the first, and the gamma.
-BLACK_PERCENTILE, WHITE_PERCENTILE, BLACK_SHARE, GAMMA = 0.5, 99.7, 0.6, 0.65
+BLACK_PERCENTILE, WHITE_PERCENTILE, BLACK_FRACTION, GAMMA = 0.5, 99.7, 0.6, 0.65
 
-#: Site, camera, and what differs from the camera's usual stance.
+#: Site, camera, and differences from the camera's usual pose.
 PLATES: Sequence[tuple[str, str, dict[str, Any]]] = (
     ("gusev", "mer-descent-flown", {"altitude_m": 1400.0, "sun_azimuth_deg": 270.0, "sun_elevation_deg": 30.0}),
     ("gusev", "mer-navcam", {"east_m": 30.0, "north_m": 40.0, "azimuth_deg": 340.0, "sun_azimuth_deg": 265.0}),
@@ -69,24 +70,25 @@ class SvgFigure:
         )
 
 
-def gallery(
-    out: Annotated[Path, Option("--out", metavar="DIR", help="Folder of the page and pictures.")] = Path("gallery"),
-    overwrite: OverwriteOption = False,
-) -> None:
-    """Render every site through the cameras that fit it: one page, and a contact sheet. Takes about a minute."""
-    with report_picture_errors(out):
-        _check_folder(out, overwrite)
-        plates = []
-        for number, (site, camera, settings) in enumerate(PLATES, start=1):
-            typer.echo(f"{number} of {len(PLATES)}: {site}, {camera}", err=True)
-            plates.append(plate(number, Shot.usual(site, camera, **settings)))
-        typer.echo(write_gallery(plates, out))
+def render_gallery(folder: Path, overwrite: bool) -> Path:
+    """Render all plates and write the gallery; return the page's path. Raises ValueError."""
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"--out {folder} is a file; a folder is needed")
+    existing = [folder / name for name in (PAGE, SHEET) if (folder / name).exists()]
+    if existing and not overwrite:
+        raise ValueError(f"{existing[0]}: there already; --overwrite replaces what is there")
+    above = next(one for one in (folder, *folder.absolute().parents) if one.exists())
+    if not os.access(above, os.W_OK):
+        raise ValueError(f"--out {folder}: the folder {above} cannot be written to")
+    plates = []
+    for number, (site, camera, settings) in enumerate(PLATES, start=1):
+        typer.echo(f"{number} of {len(PLATES)}: {site}, {camera}", err=True)
+        plates.append(plate(number, Shot.usual(site, camera, **settings)))
+    return write_gallery(plates, folder)
 
 
 def plate(number: int, shot: Shot) -> SvgFigure:
-    """One picture as its camera's detector delivers it; of a pair the left one."""
-    import numpy as np
-
+    """Render one picture as its camera's detector delivers it; of a pair the left one."""
     picture = take(shot, both=False)[0]
     if picture.exposed is None or picture.counts is None:
         raise ValueError("only what a detector delivered can be displayed")
@@ -96,35 +98,40 @@ def plate(number: int, shot: Shot) -> SvgFigure:
 
 
 def displayed(signal: Float64[np.ndarray, "rows columns"], ground: Bool[np.ndarray, "rows columns"]) -> Grey:
-    """Counts above the offset as greys for the eye, given which pixels see the ground.
+    """Map counts above the offset to greys for the eye; `ground` marks the pixels that see the ground.
 
-    White is the brightest ground; a brighter sky is pressed into the upper greys (Reinhard et al. 2002, eq. 4).
+    White is the brightest ground; a brighter sky is compressed into the upper greys (Reinhard et al. 2002, eq. 4).
     """
-    import numpy as np
-
     white = float(np.percentile(signal[ground] if ground.any() else signal, WHITE_PERCENTILE))
-    black = BLACK_SHARE * float(np.percentile(signal, BLACK_PERCENTILE))
-    share = np.clip((signal - black) / max(white - black, 1.0), 0.0, None)
-    brightest = max(float(np.percentile(share, WHITE_PERCENTILE)), 1.0)
-    pressed = np.clip(share * (1.0 + share / brightest**2) / (1.0 + share), 0.0, 1.0)
-    grey: Grey = np.rint(255.0 * pressed**GAMMA).astype(np.uint8)
+    black = BLACK_FRACTION * float(np.percentile(signal, BLACK_PERCENTILE))
+    ratio = np.clip((signal - black) / max(white - black, 1.0), 0.0, None)
+    brightest = max(float(np.percentile(ratio, WHITE_PERCENTILE)), 1.0)
+    compressed = np.clip(ratio * (1.0 + ratio / brightest**2) / (1.0 + ratio), 0.0, 1.0)
+    grey: Grey = np.rint(255.0 * compressed**GAMMA).astype(np.uint8)
     return grey
 
 
 def write_gallery(plates: Sequence[SvgFigure], folder: Path) -> Path:
     """Write the page, the pictures next to it and the contact sheet; return the page's path."""
-    from importlib.metadata import version
-
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    from marsyard.sim.terrain import sites
-
     folder.mkdir(parents=True, exist_ok=True)
+    groups: dict[str, list[dict[str, Any]]] = {}
     for one in plates:
-        (folder / one.file).write_bytes(_jpeg(one.grey, FULL_QUALITY))
+        s, (rows, columns) = one.shot, one.grey.shape
+        full = encode_picture(".jpg", one.grey, [cv2.IMWRITE_JPEG_QUALITY, FULL_QUALITY])
+        (folder / one.file).write_bytes(full)
+        width = min(PAGE_WIDTH_PX, columns)
+        small = cv2.resize(one.grey, (width, round(rows * width / columns)), interpolation=cv2.INTER_AREA)
+        inline = encode_picture(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, PAGE_QUALITY])
+        command = (
+            f"marsyard render {s.site} --camera {s.camera} --scale {s.scale} --altitude {s.altitude_m:g} "
+            f"--east {s.east_m:g} --north {s.north_m:g} "
+            f"--azimuth {s.azimuth_deg:g} --elevation {s.elevation_deg:g} --sun-azimuth {s.sun_azimuth_deg:g} "
+            f"--sun-elevation {s.sun_elevation_deg:g} --out {s.site}"
+        )
+        values = {"file": one.file, "columns": columns, "rows": rows, "caption": one.caption, "command": command}
+        source = f"data:image/jpeg;base64,{base64.b64encode(inline).decode()}"
+        groups.setdefault(s.site, []).append({"source": source, **values})
     (folder / SHEET).write_bytes(contact_sheet(plates))
-    order = dict.fromkeys(one.shot.site for one in plates)
-    groups = [(sites()[name], [_template_values(one) for one in plates if one.shot.site == name]) for name in order]
     environment = Environment(
         loader=PackageLoader("marsyard.reports"),
         autoescape=True,
@@ -132,16 +139,15 @@ def write_gallery(plates: Sequence[SvgFigure], folder: Path) -> Path:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    page = environment.get_template("gallery.html.j2").render(groups=groups, version=version("marsyard"))
+    page = environment.get_template("gallery.html.j2").render(
+        groups=[(sites()[name], shown) for name, shown in groups.items()], version=version("marsyard")
+    )
     (folder / PAGE).write_text(page, encoding="utf-8")
     return folder / PAGE
 
 
 def contact_sheet(plates: Sequence[SvgFigure]) -> bytes:
     """All pictures small, as a PNG file of at most `SHEET_BYTES`, with as many greys as fit."""
-    import cv2
-    import numpy as np
-
     wide, high = CELL_PX
     rows = -(-len(plates) // COLUMNS)
     size = (rows * (high + LABEL_PX + GAP_PX) + GAP_PX, COLUMNS * (wide + GAP_PX) + GAP_PX)
@@ -149,85 +155,27 @@ def contact_sheet(plates: Sequence[SvgFigure]) -> bytes:
     for number, one in enumerate(plates):
         top = GAP_PX + number // COLUMNS * (high + LABEL_PX + GAP_PX)
         left = GAP_PX + number % COLUMNS * (wide + GAP_PX)
-        sheet[top : top + high, left : left + wide] = _cell(one.grey)
+        height, width = one.grey.shape
+        shown = min(height, round(width * high / wide))
+        first = (height - shown) // 3  # rather the upper part, where the horizon is
+        cell = cv2.resize(one.grey[first : first + shown], CELL_PX, interpolation=cv2.INTER_AREA)
+        sheet[top : top + high, left : left + wide] = cell
         label = f"{one.shot.site}  {one.shot.camera}  {one.shot.altitude_m:g} m"
-        place = (left + 1, top + high + LABEL_PX - 8)
-        cv2.putText(sheet, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 235, 1, cv2.LINE_AA)
+        position = (left + 1, top + high + LABEL_PX - 8)
+        cv2.putText(sheet, label, position, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 235, 1, cv2.LINE_AA)
     encoded = b""
     for greys in SHEET_GREYS:
         step = 255.0 / (greys - 1)
         coarse = np.rint(np.rint(sheet / step) * step).astype(np.uint8)
-        encoded = _encoded(".png", coarse, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+        encoded = encode_picture(".png", coarse, [cv2.IMWRITE_PNG_COMPRESSION, 9])
         if len(encoded) <= SHEET_BYTES:
             break
     return encoded
 
 
-def _cell(grey: Grey) -> Grey:
-    """The middle of a picture in the shape of a cell."""
-    import cv2
-    import numpy as np
-
-    rows, columns = grey.shape
-    wide, high = CELL_PX
-    kept = min(rows, round(columns * high / wide))
-    first = (rows - kept) // 3  # rather its upper part, where the horizon is
-    shrunk: Grey = np.asarray(
-        cv2.resize(grey[first : first + kept], CELL_PX, interpolation=cv2.INTER_AREA), dtype=np.uint8
-    )
-    return shrunk
-
-
-def _template_values(one: SvgFigure) -> dict[str, Any]:
-    """A picture's values in the page's template."""
-    import base64
-
-    import cv2
-    import numpy as np
-
-    rows, columns = one.grey.shape
-    width = min(PAGE_WIDTH_PX, columns)
-    small = cv2.resize(one.grey, (width, round(rows * width / columns)), interpolation=cv2.INTER_AREA)
-    inline = base64.b64encode(_jpeg(np.asarray(small, dtype=np.uint8), PAGE_QUALITY)).decode()
-    s = one.shot
-    command = (
-        f"marsyard render {s.site} --camera {s.camera} --scale {s.scale} --altitude {s.altitude_m:g} "
-        f"--east {s.east_m:g} --north {s.north_m:g} "
-        f"--azimuth {s.azimuth_deg:g} --elevation {s.elevation_deg:g} --sun-azimuth {s.sun_azimuth_deg:g} "
-        f"--sun-elevation {s.sun_elevation_deg:g} --out {s.site}"
-    )
-    return {
-        "source": f"data:image/jpeg;base64,{inline}",
-        "file": one.file,
-        "columns": columns,
-        "rows": rows,
-        "caption": one.caption,
-        "command": command,
-    }
-
-
-def _jpeg(grey: Grey, quality: int) -> bytes:
-    import cv2
-
-    return _encoded(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])
-
-
-def _encoded(ending: str, grey: Grey, options: Sequence[int]) -> bytes:
-    import cv2
-
+def encode_picture(ending: str, grey: Grey, options: Sequence[int]) -> bytes:
+    """Encode a picture in the format of an ending. Raises ValueError."""
     done, encoded = cv2.imencode(ending, grey, options)
     if not done:
         raise ValueError(f"a picture could not be encoded as {ending}")
     return encoded.tobytes()
-
-
-def _check_folder(folder: Path, overwrite: bool) -> None:
-    """Raise ValueError where the gallery cannot be written, or exists and may not be replaced."""
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"--out {folder} is a file; a folder is needed")
-    there = [name for name in (PAGE, SHEET) if (folder / name).exists()]
-    if there and not overwrite:
-        raise ValueError(f"{folder / there[0]}: there already; --overwrite replaces what is there")
-    above = next(one for one in (folder, *folder.absolute().parents) if one.exists())
-    if not os.access(above, os.W_OK):
-        raise ValueError(f"--out {folder}: the folder {above} cannot be written to")

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
@@ -22,17 +20,6 @@ KINDS = {
 LIMITED = "terrain"
 
 
-@dataclass(frozen=True)
-class CacheUsage:
-    """Folder, number of files and bytes on disk of one kind."""
-
-    kind: str
-    folder: Path
-    files: int
-    bytes: int
-    limit_bytes: int | None = None
-
-
 @handle_user_errors
 def clean(
     kinds: Annotated[
@@ -45,25 +32,48 @@ def clean(
 
     Campaigns' folders are not touched. Running campaigns continue: missing files are built again.
     """
+    from rich import box
+    from rich.table import Table
+
     from marsyard.campaigns.errors import CampaignError, not_allowed
+    from marsyard.sim.cache import UNFINISHED
 
     for kind in kinds or []:
         if kind not in KINDS:
             raise CampaignError(not_allowed("kind", kind, KINDS))
     found = [cache_usage(kind) for kind in kinds or KINDS]
-    freed = sum(_remove_files(one.folder) for one in found) if yes else 0
+    freed = 0
+    paths = [path for one in found for path in sorted(one["folder"].rglob("*"), reverse=True)] if yes else []
+    for path in paths:
+        try:
+            if path.is_dir() and not path.is_symlink():
+                path.rmdir()
+            elif path.suffix != UNFINISHED:  # of another process
+                size = path.stat().st_size
+                path.unlink()
+                freed += size
+        except OSError:  # not empty, in use, or gone already
+            continue
     if as_json:
-        typer.echo(json.dumps({"kept": [asdict(one) for one in found], "removed_bytes": freed}, indent=2, default=str))
+        typer.echo(json.dumps({"kept": found, "removed_bytes": freed}, indent=2, default=str))
         return
-    _print_usage(found)
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("kind", "files", "size", "limit", "folder", "what it is"):
+        right = heading in ("files", "size", "limit")
+        table.add_column(heading, justify="right" if right else "left", overflow="fold")
+    for one in found:
+        limit = "none" if one["limit_bytes"] is None else size_text(one["limit_bytes"])
+        kind, size = one["kind"], size_text(one["bytes"])
+        table.add_row(kind, str(one["files"]), size, limit, str(one["folder"]), KINDS[kind])
+    console().print(table)
     if yes:
         typer.echo(f"removed {size_text(freed)}")
     else:
         typer.echo("nothing was removed; to remove it: marsyard clean --yes")
 
 
-def cache_usage(kind: str) -> CacheUsage:
-    """The cache of a kind. Raises CampaignError where MARSYARD_CACHE_GB is not a number of gigabytes."""
+def cache_usage(kind: str) -> dict[str, Any]:
+    """Folder, number of files and bytes of a kind. Raises CampaignError for a wrong number in MARSYARD_CACHE_GB."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.sim.cache import cache_directory, limit_bytes
 
@@ -80,39 +90,7 @@ def cache_usage(kind: str) -> CacheUsage:
         limit = limit_bytes(folder, size) if kind == LIMITED else None
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    return CacheUsage(kind, folder, len(sizes), size, limit)
-
-
-def _remove_files(folder: Path) -> int:
-    """Remove all files in a folder except unfinished ones of other processes; return their bytes."""
-    from marsyard.sim.cache import UNFINISHED
-
-    freed = 0
-    for path in sorted(folder.rglob("*"), reverse=True):
-        try:
-            if path.is_dir() and not path.is_symlink():
-                path.rmdir()
-            elif path.suffix != UNFINISHED:
-                size = path.stat().st_size
-                path.unlink()
-                freed += size
-        except OSError:  # not empty, in use, or gone already
-            continue
-    return freed
-
-
-def _print_usage(found: list[CacheUsage]) -> None:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("kind", "files", "size", "limit", "folder", "what it is"):
-        right = heading in ("files", "size", "limit")
-        table.add_column(heading, justify="right" if right else "left", overflow="fold")
-    for one in found:
-        limit = "none" if one.limit_bytes is None else size_text(one.limit_bytes)
-        table.add_row(one.kind, str(one.files), size_text(one.bytes), limit, str(one.folder), KINDS[one.kind])
-    console().print(table)
+    return {"kind": kind, "folder": folder, "files": len(sizes), "bytes": size, "limit_bytes": limit}
 
 
 @handle_user_errors

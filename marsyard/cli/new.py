@@ -1,11 +1,14 @@
-"""`marsyard new`: a commented campaign from flags or a short dialogue, which runs as it is written."""
+"""`marsyard new` and `ingest`: a campaign from flags or a short dialogue, and one from recorded pictures."""
 
 from __future__ import annotations
 
 import math
+import os
+import shutil
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,7 +19,10 @@ from marsyard.cli.options import OverwriteOption, handle_user_errors, with_optio
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
+    from marsyard.scenarios.system import Ingested
     from marsyard.scenarios.template import CampaignTemplate, Choices
+
+CAMPAIGN_FILE = "campaign.toml"
 
 
 @dataclass(frozen=True)
@@ -25,8 +31,7 @@ class NewOptions:
 
     name: Annotated[str, Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")]
     system: Annotated[
-        str | None,
-        Option("--system", help="System under test, such as velocity; a wrong name lists all."),
+        str | None, Option("--system", help="System under test, such as velocity; a wrong name lists all.")
     ] = None
     site: Annotated[str | None, Option("--site", help="One of `marsyard terrain list`.")] = None
     camera: Annotated[
@@ -57,6 +62,7 @@ def new(given: NewOptions) -> None:
     from marsyard.scenarios.import_path import import_object
     from marsyard.scenarios.systems import template_paths
     from marsyard.scenarios.template import Choices
+    from marsyard.sim.terrain import sites
 
     name = given.name
     path = Path(f"{name}.toml") if given.out is None else given.out
@@ -65,23 +71,22 @@ def new(given: NewOptions) -> None:
     if not name or any(letter in name for letter in '/\\"\n'):
         raise CampaignError(f"'{name}' is no name for a campaign: without slashes and quotes")
     asked, known = given.system is None and _is_terminal(), template_paths()
-    chosen = given.system or _answer("System", next(iter(known)), asked, _one_of(list(known)))
+    chosen = given.system or _answer("System", next(iter(known)), asked, partial(_find_word_problem, list(known)))
     if chosen not in known:
         raise CampaignError(f"--system: {not_allowed('system', chosen, known)}")
     template: CampaignTemplate = import_object(known[chosen])
-    stated = Choices(
-        name=name,
-        site=given.site or "",
-        camera=given.camera or "",
-        detector=given.detector or "",
-        flight=given.flight or "",
-        axes=given.axes,
-        bound=math.nan if given.bound is None else given.bound,
-        cases=given.cases,
-    )
-    choices = _completed(template, stated, asked)
-    loaded = _written(path, template, choices)
-    where = f"{path}: {chosen} over {choices.site}, {count(given.cases, 'case')}"
+    asks_camera, asks_flight = (asked and option not in template.refused for option in ("camera", "flight"))
+    with_terrain = [name for name, one in sites().items() if getattr(one, template.scale) is not None]
+    site = given.site or _answer("Site", template.site, asked, partial(_find_word_problem, with_terrain))
+    camera = given.camera or _answer("Camera's file (empty: the paper's camera)", "", asks_camera, _find_camera_problem)
+    flight = given.flight or _answer("Trajectory's file (empty: simulated)", "", asks_flight, _find_file_problem)
+    question, default = f"Requirement: {template.bound_text}", f"{template.bound:g}"
+    bound = math.nan if given.bound is None else given.bound
+    if math.isnan(bound):
+        bound = float(_answer(question, default, asked, partial(_find_number_problem, template.max_bound)))
+    choices = Choices(name, site, camera, given.detector or "", flight, given.axes, bound, given.cases)
+    loaded = _write_and_load(path, template, choices)
+    where = f"{path}: {chosen} over {site}, {count(given.cases, 'case')}"
     typer.echo(f"{where}. See it with `marsyard show {path}`, run it with\n  marsyard run {path}")
     for limit in evidence_limits(loaded):
         typer.echo(f"note: {limit}")
@@ -91,20 +96,7 @@ def _is_terminal() -> bool:
     return sys.stdin.isatty()
 
 
-def _completed(template: CampaignTemplate, given: Choices, asked: bool) -> Choices:
-    """The choices with answers at the terminal, or the template's defaults, for what is not given."""
-    asks_camera, asks_flight = (asked and option not in template.refused for option in ("camera", "flight"))
-    site = given.site or _answer("Site", template.site, asked, _one_of(_sites(template.scale)))
-    camera = given.camera or _answer("Camera's file (empty: the paper's camera)", "", asks_camera, _camera_file)
-    flight = given.flight or _answer("Trajectory's file (empty: simulated)", "", asks_flight, _readable_file)
-    question, usual = f"Requirement: {template.bound_text}", f"{template.bound:g}"
-    bound = given.bound
-    if math.isnan(bound):
-        bound = float(_answer(question, usual, asked, _above_zero(template.max_bound)))
-    return replace(given, site=site, camera=camera, flight=flight, bound=bound)
-
-
-def _written(path: Path, template: CampaignTemplate, choices: Choices) -> Campaign:
+def _write_and_load(path: Path, template: CampaignTemplate, choices: Choices) -> Campaign:
     """Write the campaign and load it; where it cannot be loaded, restore what the path held before."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.errors import CampaignError
@@ -123,62 +115,91 @@ def _written(path: Path, template: CampaignTemplate, choices: Choices) -> Campai
         raise
 
 
-def _answer(question: str, usual: str, asked: bool, check: Callable[[str], str]) -> str:
-    """The answer at the terminal, asked for again until `check` accepts it; or the usual."""
-    if not asked:
-        return usual
-    return str(typer.prompt(question, default=usual, show_default=bool(usual), value_proc=check))
+def _answer(question: str, default: str, asked: bool, find_problem: Callable[[str], str]) -> str:
+    """The answer at the terminal, asked for again while it has a problem; or the default."""
+
+    def check(answer: str) -> str:
+        if problem := find_problem(answer):
+            raise typer.BadParameter(problem)
+        return answer
+
+    return str(
+        typer.prompt(question, default=default, show_default=bool(default), value_proc=check) if asked else default
+    )
 
 
-def _one_of(allowed: Sequence[str]) -> Callable[[str], str]:
-    """Accepts one of some words."""
+def _find_word_problem(allowed: Sequence[str], answer: str) -> str:
     from marsyard.campaigns.errors import not_allowed
 
-    def check(answer: str) -> str:
-        if answer not in allowed:
-            raise typer.BadParameter(not_allowed("answer", answer, allowed))
-        return answer
-
-    return check
+    return "" if answer in allowed else not_allowed("answer", answer, allowed)
 
 
-def _sites(scale: str) -> list[str]:
-    """Sites with a terrain at a scale."""
-    from marsyard.sim.terrain import sites
-
-    return [name for name, one in sites().items() if getattr(one, scale) is not None]
+def _find_file_problem(answer: str) -> str:
+    missing = answer and not Path(answer).is_file()
+    return f"{answer}: no such file; allowed: the path of a file, or nothing" if missing else ""
 
 
-def _readable_file(answer: str) -> str:
-    """Accepts nothing, or a file that is there."""
-    if answer and not Path(answer).is_file():
-        raise typer.BadParameter(f"{answer}: no such file; allowed: the path of a file, or nothing")
-    return answer
-
-
-def _camera_file(answer: str) -> str:
-    """Accepts nothing, or a file that a camera is read from."""
+def _find_camera_problem(answer: str) -> str:
     from marsyard.sim.camera import CameraFileError, read_camera
 
-    if answer:
-        try:
+    try:
+        if answer:
             read_camera(answer)
-        except CameraFileError as error:
-            raise typer.BadParameter(f"{error}; allowed: the path of a camera's file, or nothing") from error
-    return answer
+    except CameraFileError as error:
+        return f"{error}; allowed: the path of a camera's file, or nothing"
+    return ""
 
 
-def _above_zero(highest: float) -> Callable[[str], str]:
-    """Accepts a number above 0 and below `highest`."""
+def _find_number_problem(limit: float, answer: str) -> str:
+    try:
+        number = float(answer)
+    except ValueError:
+        number = 0.0
+    below = "" if limit == math.inf else f" and below {limit:g}"
+    return "" if 0.0 < number < limit else f"'{answer}' is not allowed; allowed: a number above 0{below}"
 
-    def check(answer: str) -> str:
-        try:
-            number = float(answer)
-        except ValueError:
-            number = 0.0
-        if not 0.0 < number < highest:
-            below = "" if highest == float("inf") else f" and below {highest:g}"
-            raise typer.BadParameter(f"'{answer}' is not allowed; allowed: a number above 0{below}")
-        return answer
 
-    return check
+@handle_user_errors
+def ingest(
+    folder: Annotated[
+        Path, Argument(metavar="FOLDER", help="ingest.toml, pictures.csv and pictures (docs/real-pictures.md).")
+    ],
+    out: Annotated[Path, Option("--out", metavar="DIR", help="New folder of the cases and their campaign.")],
+    system: Annotated[str | None, Option("--system", help="System of the cases; by default real pictures.")] = None,
+) -> None:
+    """Make a campaign of real cases from pictures with measured attitude and altitude."""
+    from marsyard.campaigns.definition.loading import load_campaign
+    from marsyard.campaigns.errors import CampaignError, StoreError, not_allowed
+    from marsyard.reports.wording import count
+    from marsyard.scenarios.import_path import import_object
+    from marsyard.scenarios.systems import systems
+
+    known = {one.name: one.ingest for one in systems() if one.ingest}
+    chosen = system or next(iter(known))
+    if chosen not in known:
+        raise CampaignError(f"--system: {not_allowed('system', chosen, known)}")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise StoreError(f"{out} is there already, and is not empty; name a new folder with --out")
+    unfinished = out.with_name(f"{out.name}.part{os.getpid()}")
+    try:
+        unfinished.mkdir(parents=True)
+        made: Ingested = import_object(known[chosen])(folder, unfinished, out.resolve())
+        (unfinished / CAMPAIGN_FILE).write_text(made.campaign, encoding="utf-8")
+        if out.exists():
+            out.rmdir()
+        unfinished.rename(out)
+    except ValueError as error:
+        raise CampaignError(str(error)) from error
+    except OSError as error:
+        raise StoreError(f"{out}: cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+    try:
+        load_campaign(str(out / CAMPAIGN_FILE))
+    except CampaignError:  # a campaign that cannot be run is not kept
+        shutil.rmtree(out)
+        raise
+    typer.echo(f"{count(made.cases, 'case')} of {count(made.pictures, 'picture')}: {out}")
+    if made.note:
+        typer.echo(made.note)
+    typer.echo(f"run them with: marsyard run {out / CAMPAIGN_FILE}")

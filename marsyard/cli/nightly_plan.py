@@ -1,18 +1,36 @@
-"""A nightly's plan: which campaigns run every night."""
+"""A nightly's plan, and the run of its campaigns in one night."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import typer
 from pydantic import Field, model_validator
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import MAX_CASES, read_table
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.running.engine import Watch, run_campaign
+from marsyard.cli.options import Exit
+from marsyard.cli.outcome import settle
+from marsyard.reports.campaign import write_whole
+from marsyard.reports.comparison import figures_of, sample_of
+from marsyard.reports.dashboard.site import write_site
+from marsyard.reports.history import Change, History, NightCampaign, NightFigure, compare_night, night_text
 from marsyard.sim.parameters import Parameters
+
+#: Files and folders of a nightly's folder.
+HISTORY_FILE, PAGE_FILE, RUNS, SITE = "history.sqlite", "nightly.md", "runs", "site"
+#: Verdict of a campaign that could not be run at all.
+NOT_RUN = "NOT RUN"
 
 #: The plan that ships with Marsyard.
 PLAN_FILE = Path(__file__).resolve().parents[1] / "scenarios" / "nightly.toml"
@@ -21,7 +39,7 @@ Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
 
 class PlannedCampaign(Parameters):
-    """A campaign of the plan, with what is said of it instead of its file."""
+    """A campaign of the plan, with values that replace those of its file."""
 
     campaign: Annotated[str, Field(min_length=1)]
     cases: Annotated[int, Field(strict=True, ge=1, le=MAX_CASES)] | None = None
@@ -36,7 +54,7 @@ class PlannedCampaign(Parameters):
 
 
 class Plan(Parameters):
-    """What runs every night."""
+    """Campaigns of every night."""
 
     seed: Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)] = Field(
         default=0, description="of which each night's root seed is made, so that nights draw cases of their own"
@@ -52,10 +70,7 @@ class Plan(Parameters):
 
 
 def read_plan(path: Path) -> Plan:
-    """The plan in a file.
-
-    Raises ConfigurationError where it cannot be read, or states something else.
-    """
+    """Read the plan in a file. Raises ConfigurationError where it cannot be read or is not valid."""
     return read_table(path, Plan)
 
 
@@ -66,7 +81,56 @@ def night_seed(seed: int, night: int) -> int:
 
 
 def definition_of(campaign: Campaign) -> str:
-    """A hash of what a campaign is, its seed and words aside: nights are compared where it is the same."""
-    aside = {"seed", "description", "retain", "limits", "cases"}
-    stated = campaign.configuration.model_dump(mode="json", exclude=aside)
+    """Hash a campaign's definition without seed and texts: nights are compared where it is the same."""
+    excluded = {"seed", "description", "retain", "limits", "cases"}
+    stated = campaign.configuration.model_dump(mode="json", exclude=excluded)
     return hashlib.sha256(json.dumps(stated, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class Night:
+    """A night in progress."""
+
+    history: History
+    number: int
+    out: Path
+    executor: ExecutorConfig
+    plan: Plan
+
+
+def run_planned(now: Night, planned: PlannedCampaign, folder: Path, watch: Watch) -> None:
+    """Run a campaign, judge it, and store its figures; its errors do not affect the others."""
+    figures = []
+    try:
+        campaign = planned.load(now.plan.seed, now.number, folder)
+        name = campaign.configuration.name
+        directory = now.out / RUNS / f"night-{now.number:05d}-{name}"
+        run_campaign(campaign, directory, now.executor, watch)
+        found, _ = settle(directory)
+        frame, compared = figures_of(found.run)
+        figures = [NightFigure(one.name, one.larger_is_better, one.level, sample_of(frame, one)) for one in compared]
+        verdict, definition = found.whole, definition_of(campaign)
+        result = NightCampaign(name, definition, directory.name, verdict.word, found.exit_code, verdict.sentence)
+    except Exception as error:  # a defect in one campaign must not stop the others
+        figures = []
+        if not isinstance(error, CampaignError):
+            traceback.print_exc()
+        result = NightCampaign(planned.campaign, "", "", NOT_RUN, Exit.FAILED, f"{type(error).__name__}: {error}")
+    now.history.add(now.number, result, figures)
+
+
+def publish(history: History, night: int, out: Path, found: Sequence[Change]) -> None:
+    """Write the page and the dashboard, and print the page."""
+    text = write_page(history, night, out, found)
+    write_site(out / SITE, [out / RUNS])
+    typer.echo(text)
+
+
+def write_page(history: History, night: int, out: Path, found: Sequence[Change]) -> str:
+    """Write the page of the night so far, and return it."""
+    nights = {one.night: one for one in history.nights()}
+    earlier = [one for number, one in nights.items() if number < night]
+    compared = sum(bool(one.before) for one in compare_night(history, night))
+    text = night_text(nights[night], earlier, history.campaigns(night), found, compared)
+    write_whole(out / PAGE_FILE, text)
+    return text

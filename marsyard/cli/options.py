@@ -66,12 +66,10 @@ ClusterOption = Annotated[
     ),
 ]
 CaseTimeOption = Annotated[
-    float | None,
-    Option("--case-time", metavar="S", help="Time limit of a case in seconds (limits.case_time_s)."),
+    float | None, Option("--case-time", metavar="S", help="Time limit of a case in seconds (limits.case_time_s).")
 ]
 ChangedOption = Annotated[
-    bool,
-    Option("--allow-changed", help="Continue with changed code or versions; the record notes it."),
+    bool, Option("--allow-changed", help="Continue with changed code or versions; the record notes it.")
 ]
 
 OutOption = Annotated[

@@ -1,12 +1,21 @@
-"""Progress of a running campaign: a bar with rate and time left on a terminal, plain lines elsewhere."""
+"""Progress of a running campaign: bars with rate and time left on a terminal, lines elsewhere, and `run.log`.
+
+The classes are `Watch` objects (`marsyard.campaigns.running.engine`).
+"""
 
 from __future__ import annotations
 
+import platform
+import shlex
+import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from datetime import timedelta
-from typing import TYPE_CHECKING
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime, timedelta
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
@@ -15,8 +24,9 @@ from rich.text import Text
 if TYPE_CHECKING:
     from marsyard.campaigns.running.engine import Watch
 
-#: Seconds between two plain lines.
-LINE_INTERVAL_S = 10.0
+LOG_FILE = "run.log"
+#: Seconds between two lines of a stage, on the console and in the log.
+LINE_INTERVAL_S, LOG_INTERVAL_S = 10.0, 60.0
 
 
 def left_s(done: int, total: int, elapsed_s: float) -> float:
@@ -112,6 +122,55 @@ class LineProgress:
 
     def _line(self, text: str) -> None:
         self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+class RunLog:
+    """A `Watch` that appends to the log and forwards to another; a log that cannot be written stops no campaign."""
+
+    def __init__(self, directory: Path, watch: Watch) -> None:
+        self._path, self._watch = directory / LOG_FILE, watch
+        self._stage, self._total, self._done = "", 0, 0
+        self._started, self._written, self._begun = time.monotonic(), 0.0, False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _at: TracebackType | None
+    ) -> None:
+        if not self._begun:
+            return  # the campaign did not begin: the folder is not its own
+        duration = f"{time.monotonic() - self._started:.1f} s"
+        stopped = "" if kind is None else f", {self._stage}: {self._done}/{self._total}: {kind.__name__}: {error}"
+        self._line(f"{'stopped' if stopped else 'ended'} after {duration}{stopped}")
+
+    def begin(self, stage: str, total: int) -> None:
+        """Log the begin of a stage."""
+        self._stage, self._total, self._done = stage, total, 0
+        self._line(f"{stage}: {total}")
+        self._watch.begin(stage, total)
+
+    def step(self) -> None:
+        """Count a step; log the progress at intervals."""
+        self._done += 1
+        if self._done == self._total or time.monotonic() - self._written > LOG_INTERVAL_S:
+            self._line(f"{self._stage}: {self._done}/{self._total}")
+        self._watch.step()
+
+    def note(self, text: str) -> None:
+        """Log a note."""
+        self._line(f"note: {text}")
+        self._watch.note(text)
+
+    def _line(self, text: str) -> None:
+        self._written, lines = time.monotonic(), [text]
+        if not self._begun:
+            self._begun = True
+            versions = f"marsyard {version('marsyard')}, Python {platform.python_version()}, {platform.platform()}"
+            lines = [f"session: {shlex.join(['marsyard', *sys.argv[1:]])}", versions, text]
+        now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        with suppress(OSError), self._path.open("a", encoding="utf-8") as file:
+            file.writelines(f"{now} {' '.join(line.split())}\n" for line in lines)
 
 
 @contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,17 +16,16 @@ from marsyard.campaigns.definition.campaign import Campaign, leaves, value_at
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, description_at
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.sampling.design import describe_design
-from marsyard.campaigns.sampling.dispersion import Dispersion
 from marsyard.reports.columns import split_unit
 from marsyard.reports.wording import asked_text, count
 
 if TYPE_CHECKING:
     from marsyard.reports.section import Grid
 
-#: Width of a column of drawn values with what sets it apart.
+#: Width of a column of drawn values with its margin.
 _VALUE_WIDTH = 12
 _EXTENT = ("least", "mean", "greatest")
-#: Probabilities at which a distribution is taken as a whole, for the figure.
+#: Number of quantiles of a distribution in the figure.
 _QUANTILES = 2000
 _FIGURES = (".svg", ".png")
 
@@ -36,18 +34,65 @@ def show_campaign(campaign: Campaign, console: Console) -> None:
     """Print a campaign: description, parameters, dispersions and requirements."""
     configuration = campaign.configuration
     _print_head(configuration, console)
-    console.print(_parameters(configuration))
-    console.print(_dispersions(campaign))
+    table = _table("Parameters", "parameter", "value")
+    for path, value in leaves(configuration.parameters):
+        nominal = f"; nominal {value}" if configuration.design.nominal else ""
+        table.add_row(Text(path), Text(f"dispersed{nominal}" if path in configuration.dispersions else str(value)))
+    console.print(table)
+    table = _table("Dispersions", "parameter", "distribution", "bounds", "unit", "source")
+    for path, dispersion in campaign.marginals.items():
+        data, bounds = _dispersion_data(campaign, path), dispersion.bounds()
+        name = Text(path)
+        if data["description"]:
+            name.append(f"\n{data['description']}", style="dim")
+        source = Text(dispersion.source) if dispersion.source else Text("not stated", style="yellow")
+        if bounds is None:
+            bounds_text = "by formula" if dispersion.formulas else "kinds"
+        else:
+            low, high = bounds
+            lower, upper = "" if math.isinf(low) else f"≥ {low:g}", "" if math.isinf(high) else f"≤ {high:g}"
+            bounds_text = f"{low:g} to {high:g}" if lower and upper else lower or upper or "none"
+        table.add_row(name, Text(dispersion.describe()), Text(bounds_text), Text(data["unit"]), source)
+    console.print(table)
     if configuration.correlations:
-        console.print(_correlations(configuration))
-    console.print(_requirements(configuration))
+        table = _table("Correlated", "parameters", "by", "matrix", "source")
+        for group in configuration.correlations:
+            rows = "\n".join(" ".join(f"{value:8.3g}" for value in row) for row in getattr(group, group.kind))
+            table.add_row(Text("\n".join(group.parameters)), Text(group.kind), Text(rows), Text(group.source))
+        console.print(table)
+    table = _table("Requirements", "id", "statement", "asked")
+    for asked in configuration.requirements:
+        table.add_row(Text(asked.id), Text(asked.statement), Text(asked_text(asked, asked.metric)))
+    console.print(table)
 
 
 def show_draws(campaign: Campaign, cases: int, console: Console) -> None:
-    """Print the draws of the first cases."""
-    drawn = drawn_values(campaign, cases)
+    """Print the draws of the first cases: a row for each parameter, with as many cases as fit the terminal.
+
+    A row begins with minimum, mean and maximum over all cases; of values other than numbers, the number of kinds.
+    """
+    drawn, nominal = drawn_values(campaign, cases), int(campaign.configuration.design.nominal)
     _print_head(campaign.configuration, console)
-    console.print(_draws(campaign, drawn, console.width))
+    cases = cases if drawn else 0
+    units = {path: campaign.marginals[path].unit for path in drawn}
+    names = {path: f"{path} ({unit})" if unit else path for path, unit in units.items()}
+    longest = max((len(name) for name in names.values()), default=0)
+    shown = min(cases, max(1, (console.width - longest) // _VALUE_WIDTH - len(_EXTENT)))
+    title = f"Draws of {count(cases - nominal, 'case')}" + ("" if shown == cases else "; all of them with --json")
+    table = _table(title, "parameter")
+    table.box = box.SIMPLE_HEAD
+    headings = ["nominal" if nominal and case == 0 else f"case {case}" for case in range(shown)]
+    for heading in (*_EXTENT, *headings):
+        table.add_column(heading, justify="right", overflow="fold")
+    for path, values in drawn.items():
+        random = values[nominal:]
+        extent = ["", "", ""]
+        if any(isinstance(value, bool) or not isinstance(value, int | float) for value in random):
+            extent[1] = count(len({_value(value) for value in random}), "kind")
+        elif random:
+            extent = [_value(value) for value in (min(random), sum(random) / len(random), max(random))]
+        table.add_row(Text(names[path]), *map(Text, extent), *(Text(_value(value)) for value in values[:shown]))
+    console.print(table)
 
 
 def described(campaign: Campaign, cases: int | None) -> dict[str, Any]:
@@ -77,17 +122,16 @@ def write_draws_figure(campaign: Campaign, cases: int, path: Path) -> None:
     drawn = {name: values[nominal:] for name, values in drawn_values(campaign, cases).items()}
     if not any(drawn.values()):
         raise CampaignError(f"--figure {path}: nothing is drawn in {count(cases, 'case')}")
-    of_each = [Drawn(name, values, _quantiles(campaign.marginals[name])) for name, values in drawn.items()]
+    of_each = []
+    for name, values in drawn.items():
+        dispersion, quantiles = campaign.marginals[name], None
+        if not dispersion.formulas:
+            quantiles = [dispersion.quantile((index + 0.5) / _QUANTILES) for index in range(_QUANTILES)]
+        of_each.append(Drawn(name, values, quantiles))
     try:
         save_figure(draws_figure(campaign.configuration.name, of_each), path)
     except OSError as error:
         raise CampaignError(f"--figure {path}: cannot be written: {error.strerror or error}") from error
-
-
-def _quantiles(dispersion: Dispersion) -> list[Any] | None:
-    if dispersion.formulas:
-        return None
-    return [dispersion.quantile((place + 0.5) / _QUANTILES) for place in range(_QUANTILES)]
 
 
 def drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
@@ -95,9 +139,9 @@ def drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
 
     Raises CampaignError where the campaign has fewer cases, or a case cannot be drawn.
     """
-    there = campaign.configuration.total_cases
-    if not 1 <= cases <= there:
-        raise CampaignError(f"--draw {cases}: the campaign has {count(there, 'case')}; allowed: 1 to {there}")
+    total = campaign.configuration.total_cases
+    if not 1 <= cases <= total:
+        raise CampaignError(f"--draw {cases}: the campaign has {count(total, 'case')}; allowed: 1 to {total}")
     drawn: dict[str, list[Any]] = {path: [] for path in campaign.configuration.dispersions}
     for case in range(cases):
         try:
@@ -123,27 +167,6 @@ def _sampling_text(configuration: CampaignConfiguration) -> str:
     return describe_design(design.kind, list(configuration.grids), nominal=design.nominal)
 
 
-def _parameters(configuration: CampaignConfiguration) -> Table:
-    table = _table("Parameters", "parameter", "value")
-    nominal = configuration.design.nominal
-    for path, value in leaves(configuration.parameters):
-        shown = "dispersed" if path in configuration.dispersions else str(value)
-        table.add_row(Text(path), Text(f"dispersed; nominal {value}" if nominal and shown == "dispersed" else shown))
-    return table
-
-
-def _dispersions(campaign: Campaign) -> Table:
-    table = _table("Dispersions", "parameter", "distribution", "bounds", "unit", "source")
-    for path, dispersion in campaign.marginals.items():
-        data = _dispersion_data(campaign, path)
-        name = Text(path)
-        if data["description"]:
-            name.append(f"\n{data['description']}", style="dim")
-        source = Text(dispersion.source) if dispersion.source else Text("not stated", style="yellow")
-        table.add_row(name, Text(dispersion.describe()), Text(_bounds_text(dispersion)), Text(data["unit"]), source)
-    return table
-
-
 def _dispersion_data(campaign: Campaign, path: str) -> dict[str, Any]:
     """One dispersion as plain data, with unit and description of the parameter where it states none itself."""
     dispersion = campaign.marginals[path]
@@ -163,71 +186,11 @@ def _dispersion_data(campaign: Campaign, path: str) -> dict[str, Any]:
     }
 
 
-def _bounds_text(dispersion: Dispersion) -> str:
-    bounds = dispersion.bounds()
-    if bounds is None:
-        return "by formula" if dispersion.formulas else "kinds"
-    low, high = bounds
-    if math.isinf(low) and math.isinf(high):
-        return "none"
-    if math.isinf(high):
-        return f"≥ {low:g}"
-    return f"≤ {high:g}" if math.isinf(low) else f"{low:g} to {high:g}"
-
-
-def _correlations(configuration: CampaignConfiguration) -> Table:
-    table = _table("Correlated", "parameters", "by", "matrix", "source")
-    for group in configuration.correlations:
-        rows = "\n".join(" ".join(f"{value:8.3g}" for value in row) for row in getattr(group, group.kind))
-        table.add_row(Text("\n".join(group.parameters)), Text(group.kind), Text(rows), Text(group.source))
-    return table
-
-
-def _draws(campaign: Campaign, drawn: Mapping[str, Sequence[Any]], width: int) -> Table:
-    """Draws, a row for each parameter: its range over all cases, then as many cases as fit the terminal."""
-    cases, nominal = len(next(iter(drawn.values()), [])), int(campaign.configuration.design.nominal)
-    names = {path: _with_unit(path, campaign.marginals[path]) for path in drawn}
-    longest = max((len(name) for name in names.values()), default=0)
-    shown = min(cases, max(1, (width - longest) // _VALUE_WIDTH - len(_EXTENT)))
-    title = f"Draws of {count(cases - nominal, 'case')}" + ("" if shown == cases else "; all of them with --json")
-    table = _table(title, "parameter")
-    table.box = box.SIMPLE_HEAD
-    headings = ["nominal" if nominal and case == 0 else f"case {case}" for case in range(shown)]
-    for heading in (*_EXTENT, *headings):
-        table.add_column(heading, justify="right", overflow="fold")
-    for path, values in drawn.items():
-        table.add_row(
-            Text(names[path]), *map(Text, _extent(values[nominal:])), *(Text(_value(v)) for v in values[:shown])
-        )
-    return table
-
-
-def _with_unit(path: str, dispersion: Dispersion) -> str:
-    """A parameter's path, with the unit if the file states one."""
-    return f"{path} ({dispersion.unit})" if dispersion.unit else path
-
-
-def _extent(values: Sequence[Any]) -> tuple[str, str, str]:
-    """Minimum, mean and maximum of numbers; the number of kinds of other values."""
-    if not values:
-        return "", "", ""
-    if any(isinstance(value, bool) or not isinstance(value, int | float) for value in values):
-        return "", count(len({_value(value) for value in values}), "kind"), ""
-    return _value(min(values)), _value(sum(values) / len(values)), _value(max(values))
-
-
 def _value(value: Any) -> str:
     """A drawn value, numbers with five digits."""
     if isinstance(value, float):
         return f"{value:.5g}"
     return value if isinstance(value, str) else json.dumps(value, default=str)
-
-
-def _requirements(configuration: CampaignConfiguration) -> Table:
-    table = _table("Requirements", "id", "statement", "asked")
-    for asked in configuration.requirements:
-        table.add_row(Text(asked.id), Text(asked.statement), Text(asked_text(asked, asked.metric)))
-    return table
 
 
 def _table(title: str, *headings: str) -> Table:
@@ -240,8 +203,8 @@ def _table(title: str, *headings: str) -> Table:
 def grid_table(title: str, grid: Grid) -> Table:
     """A report's table on the terminal: names to the left, numbers to the right."""
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
-    for place, heading in enumerate(grid.head):
-        table.add_column(heading, justify="right" if place else "left", overflow="fold")
+    for index, heading in enumerate(grid.head):
+        table.add_column(heading, justify="right" if index else "left", overflow="fold")
     for row in grid.rows:
         table.add_row(*map(Text, row))
     return table

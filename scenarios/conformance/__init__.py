@@ -1,17 +1,103 @@
 """Conformance suites: checks of an algorithm or a user-defined part against its protocol.
 
 `inputs` synthesizes measurements without terrain or renderer; `checks` has the checks common to all suites;
-`estimators`, `trackers` and `parts` add those of their protocols; `suite` selects them.
+`estimators`, `trackers` and `parts` add those of their protocols. This module selects the suite, and runs its checks
+one by one.
 """
 
-from marsyard.scenarios.conformance.checks import Finding
-from marsyard.scenarios.conformance.suite import (
-    SUBJECT_KINDS,
-    Subject,
-    check_names,
-    check_subject,
-    determine_task,
-    run_check,
-)
+from __future__ import annotations
 
-__all__ = ["SUBJECT_KINDS", "Finding", "Subject", "check_names", "check_subject", "determine_task", "run_check"]
+import inspect
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from marsyard.algorithms.exchange import PREFIXES, ExecutableLimits
+from marsyard.scenarios.conformance import estimators, parts, trackers
+from marsyard.scenarios.conformance.checks import Finding as Finding
+from marsyard.scenarios.conformance.checks import Suite
+from marsyard.scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, installed
+from marsyard.scenarios.import_path import import_object
+from marsyard.scenarios.parts.named import KINDS
+
+#: Tasks and kinds with a suite, words of the command line.
+SUBJECT_KINDS = (*TASKS, *KINDS)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """An algorithm or a user-defined part under examination.
+
+    - spec: its name; see `marsyard.scenarios.estimators`, `marsyard.scenarios.parts`
+    - task: name of its task or kind
+    - limit_s: maximum time of an answer
+    """
+
+    spec: str
+    task: str
+    limit_s: float
+
+    def suite(self) -> Suite:
+        """Its conformance suite."""
+        if self.task in KINDS:
+            kind = KINDS[self.task]
+            return parts.PartSuite(partial(parts.load_part, kind, self.spec), self.spec, False, self.limit_s, kind)
+        task: Task[Any, Any] = TASKS[self.task]
+        make = partial(task.make, self.spec, task.options(), ExecutableLimits(time_s=self.limit_s))
+        program = self.spec.startswith(tuple(PREFIXES))
+        if task is TRACKING:
+            return trackers.TrackerSuite(make, self.spec, program, self.limit_s)
+        protocol = estimators.VELOCITY if task is VELOCITY else estimators.LANDING
+        if task.takes_stream(self.spec):
+            protocol = estimators.STREAM
+        return estimators.EstimatorSuite(make, self.spec, program, self.limit_s, protocol)
+
+    def prepare(self) -> None:
+        """Load and compile the suite's own code, and the algorithm's code."""
+        check_subject(self.spec, self.task)
+        self.suite().cases()
+
+
+def check_subject(spec: str, task: str) -> None:
+    """Raises ValueError with the allowed names if there is nothing of this name for a task or kind."""
+    if task in KINDS:
+        parts.load_part(KINDS[task], spec)
+    else:
+        TASKS[task].check(spec)
+
+
+def check_names(subject: Subject) -> list[tuple[str, str]]:
+    """Names and requirements of a subject's checks."""
+    return [(check.name, check.asked) for check in subject.suite().checks()]
+
+
+def run_check(subject: Subject, number: int) -> Finding:
+    """Run one check."""
+    return list(subject.suite().checks())[number].finding()
+
+
+def determine_task(spec: str) -> str:
+    """Task or kind of a name by its entry point, methods or annotations; velocity if they do not determine it.
+
+    Raises ValueError if the algorithm does not exist.
+    """
+    shipped = next((task.name for task in TASKS.values() if spec in task.shipped), None)
+    if shipped is not None:
+        return shipped
+    if spec.startswith(tuple(PREFIXES)):
+        return VELOCITY.name
+    kind = None if spec in installed() else parts.kind_of(spec)
+    if kind is not None:
+        return kind
+    path = installed()[spec].value if spec in installed() else spec
+    if ":" not in path:
+        VELOCITY.check(spec)
+    try:
+        algorithm = import_object(path)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"no algorithm at '{spec}': {error}") from error
+    if hasattr(algorithm, "designate"):
+        return TRACKING.name
+    annotations = inspect.get_annotations(getattr(algorithm, "estimate", None) or algorithm)
+    landing = any("Landing" in str(one) or "Site" in str(one) for one in annotations.values())
+    return LANDING.name if landing else VELOCITY.name

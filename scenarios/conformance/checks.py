@@ -112,7 +112,7 @@ class Suite(ABC):
         """Inputs of ordinary cases."""
 
     def _other_cases(self) -> Sequence[Any]:
-        """Inputs of cases before the one whose answer must not depend on them."""
+        """Inputs of other cases, on which the answers of `cases` must not depend."""
         return self.cases()
 
     @abstractmethod
@@ -152,15 +152,17 @@ class Suite(ABC):
     def _repeats_answers(self) -> str:
         used = self.make()
         for case in self.cases():
-            _seed_global_generators(1)
-            first = answer_print(self._answer(case))
-            _seed_global_generators(2)
-            if answer_print(self._answer(case)) != first:
+            prints = []
+            for seed in (1, 2):  # the process's global generators, for code that uses them by mistake
+                random.seed(seed)
+                np.random.seed(seed)  # noqa: NPY002
+                prints.append(fingerprint(self._answer(case)))
+            if prints[0] != prints[1]:
                 raise BreachError("asked twice, it answers differently to the same case")
             for other in self._other_cases():
                 self._call(used, copy_inputs(other, writable=self.writable), 2)
             again = self._call(used, copy_inputs(case, writable=self.writable), 1)
-            if answer_print(self._check_answer(again, case)) != first:
+            if fingerprint(self._check_answer(again, case)) != prints[0]:
                 raise BreachError(self.dependence)
         return ""
 
@@ -174,31 +176,24 @@ class Suite(ABC):
         """Time of an answer after a first one, which compiles kernels."""
         case = self.cases()[0]
         self._answer(case)
-        return timed(lambda: self._answer(case))
+        return measure_time_s(lambda: self._answer(case))
 
     def _imports_no_truth(self) -> str:
-        closed = closed_imports(self.spec)
-        if closed:
+        if closed := closed_imports(self.spec):
             raise BreachError(f"it imports modules with access to the truth: {'; '.join(closed[:5])}")
         return ""
 
 
-def timed(call: Callable[[], object]) -> float:
-    """Wall-clock time of a call, s."""
+def measure_time_s(call: Callable[[], object]) -> float:
+    """Wall-clock time of a call."""
     began = time.perf_counter()
     call()
     return time.perf_counter() - began
 
 
-def answer_print(answer: Any) -> str:
+def fingerprint(answer: Any) -> str:
     """Fingerprint of an answer without its details, which may contain times."""
     return hash_inputs(answer, ("details",))
-
-
-def _seed_global_generators(seed: int) -> None:
-    """Seed the process's global generators, for code that uses them by mistake."""
-    random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002
 
 
 def closed_imports(spec: str) -> list[str]:
@@ -213,8 +208,8 @@ def closed_imports(spec: str) -> list[str]:
         for node in nodes:
             if isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:
                 imports += [(node.lineno, f"{node.module}.{alias.name}") for alias in node.names]
+        allowed = tuple(f"{one}." for one in OPEN_MODULES)
         for line, module in imports:
-            is_open = any(f"{module}.".startswith(f"{one}.") for one in OPEN_MODULES)
-            if module.partition(".")[0] == "marsyard" and not is_open:
+            if module.partition(".")[0] == "marsyard" and not f"{module}.".startswith(allowed):
                 closed.append(f"{name}, line {line}: {module}")
     return closed

@@ -12,7 +12,7 @@ import numpy as np
 from marsyard.algorithms.answers import check_site, check_velocity
 from marsyard.algorithms.interface import SiteOutcome, VelocityEstimate, VelocityOutcome
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, answer_print
+from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, fingerprint
 from marsyard.scenarios.handover import copy_inputs
 from marsyard.sim.measurements import DescentMeasurements
 
@@ -22,12 +22,9 @@ _PICTURES, _TOO_FEW, _ENOUGH, _MANY = 5, (0, 1), (2, 3), 10
 
 @dataclass(frozen=True)
 class Protocol:
-    """A task's measurements and answers.
+    """A task's measurements, and the check, validity and text of its answers; `failures` are outcomes without a result.
 
-    - check: checks an answer against the interface; raises AlgorithmError
-    - is_valid: whether an answer has a result
-    - describe: text of an answer
-    - failures: outcomes without a result
+    `check` checks an answer against the interface and raises AlgorithmError.
     """
 
     measurements: Callable[[], Any]
@@ -37,7 +34,8 @@ class Protocol:
     failures: str
 
 
-def _describe_velocity(estimate: VelocityEstimate) -> str:
+def describe_velocity(estimate: VelocityEstimate) -> str:
+    """Outcome of an estimate, and its distance from the truth of the suite's descents."""
     if estimate.velocity_m_s is None:
         return estimate.outcome.name
     error = float(np.hypot(*(estimate.velocity_m_s - inputs.DESCENT_VELOCITY_M_S[:2])))
@@ -48,7 +46,7 @@ VELOCITY = Protocol(
     measurements=inputs.descent,
     check=check_velocity,
     is_valid=lambda estimate: estimate.outcome is VelocityOutcome.VALID,
-    describe=_describe_velocity,
+    describe=describe_velocity,
     failures=", ".join(one.name for one in VelocityOutcome if one is not VelocityOutcome.VALID),
 )
 STREAM = replace(VELOCITY, measurements=partial(inputs.descent, _PICTURES))
@@ -81,7 +79,8 @@ class EstimatorSuite(Suite):
         yield Check("noise", asked, advice, lambda: self._outcome(inputs.noisy(p.measurements())))
         if p is LANDING:
             asked = "gives a well-formed answer without a range"
-            yield Check("no-range", asked, advice, self._answers_without_range)
+            no_range = replace(inputs.landing(), slant_range_m=float("nan"))
+            yield Check("no-range", asked, advice, lambda: self._outcome(no_range))
         yield from self.common_checks()
         if p is STREAM:
             advice = f"return one of the failures from finish: {VELOCITY.failures}"
@@ -108,9 +107,6 @@ class EstimatorSuite(Suite):
     def _outcome(self, measurements: Any) -> str:
         return str(self._answer(measurements).outcome.name)
 
-    def _answers_without_range(self) -> str:
-        return self._outcome(replace(inputs.landing(), slant_range_m=float("nan")))
-
     def _fails_on(self, name: str, blank: inputs.Blank) -> str:
         answer = self._answer(inputs.blanked(self.protocol.measurements(), blank))
         if self.protocol.is_valid(answer):
@@ -127,17 +123,17 @@ class EstimatorSuite(Suite):
         return ", ".join(outcomes)
 
     def _answers_any_number(self) -> str:
-        answers = [self._answer(one) for one in (*map(_first_pictures, _ENOUGH), inputs.descent(_MANY))]
-        return "; ".join(VELOCITY.describe(answer) for answer in answers)
+        streams = (*map(_first_pictures, _ENOUGH), inputs.descent(_MANY))
+        return "; ".join(describe_velocity(self._answer(one)) for one in streams)
 
     def _starts_again(self) -> str:
         measurements = self.protocol.measurements()
-        expected = answer_print(self._answer(measurements))
+        expected = fingerprint(self._answer(measurements))
         used = self.make()
         used.stream.start()
         for frame in copy_inputs(inputs.noisy(measurements)).frames()[:2]:
             used.stream.picture(frame)
-        if answer_print(used.estimate(copy_inputs(measurements))) != expected:
+        if fingerprint(used.estimate(copy_inputs(measurements))) != expected:
             raise BreachError("started again after two pictures, it answers differently")
         return ""
 

@@ -56,11 +56,9 @@ BLANKS: dict[str, Blank] = {
 
 @dataclass(frozen=True)
 class TexturedPlane:
-    """A plane with a periodic texture.
+    """A plane through `origin` in the world, with a periodic texture of samples `step_m` apart.
 
-    - origin: a point of the plane, world
-    - along: orthogonal unit vectors in the plane along columns and rows of the texture
-    - step_m: distance between samples of the texture
+    The orthogonal unit vectors `along` follow the texture's columns and rows.
     """
 
     origin: Float64[np.ndarray, "3"]
@@ -118,10 +116,7 @@ def landing() -> LandingMeasurements:
     attitudes = [Rotation.from_euler("ZYX", angles, degrees=True) for angles in ((10, 3, -2), (10.2, 2.8, -1.9))]
     times = [0.0, 2.0]
     first, second = _take_pictures(preset("xc-55"), _HOVER_M, attitudes, times, 0.03)
-    poses = [
-        PoseMeasurement(rigid(one, position), time)
-        for one, position, time in zip(attitudes, _HOVER_M, times, strict=True)
-    ]
+    poses = [PoseMeasurement(rigid(attitudes[k], _HOVER_M[k]), times[k]) for k in (0, 1)]
     axis = attitudes[0].apply(first.camera.a.copy())
     slant = -_HOVER_M[0, 2] / axis[2]
     return LandingMeasurements(
@@ -156,10 +151,11 @@ def blanked(measurements: Measurements, blank: Blank) -> Measurements:
 def noisy(measurements: Measurements) -> Measurements:
     """The measurements with pictures of pure noise."""
     rng = np.random.default_rng(2)
-    return _replace_counts(
-        measurements,
-        lambda one: rng.integers(0, one.calibration.full_scale_dn, one.counts.shape, np.uint16, endpoint=True),
-    )
+
+    def draw(image: DetectorImage) -> np.ndarray:
+        return rng.integers(0, image.calibration.full_scale_dn, image.counts.shape, np.uint16, endpoint=True)
+
+    return _replace_counts(measurements, draw)
 
 
 def _replace_counts(measurements: Measurements, counts: Callable[[DetectorImage], np.ndarray]) -> Measurements:

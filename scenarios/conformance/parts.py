@@ -20,7 +20,7 @@ from marsyard.algorithms.interface import (
     VelocityOutcome,
 )
 from marsyard.scenarios.conformance import inputs, trackers
-from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, answer_print
+from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, fingerprint
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
 from marsyard.scenarios.landing.truth import GroundTruth
 from marsyard.scenarios.parts.instruments import InstrumentTruth, check_readings
@@ -88,10 +88,8 @@ class PartSuite(Suite):
 
     def cases(self) -> Sequence[Any]:
         """See `Suite`."""
-        if self.kind is DYNAMICS:
-            return places()
-        if self.kind is INSTRUMENT:
-            return truths()
+        if self.kind is not SCORE:
+            return places() if self.kind is DYNAMICS else truths()
         return [case for case in scored_cases() if isinstance(case, accepted_cases(load_score(self.spec)))]
 
     def _call(self, algorithm: Any, case: Any, seed: int) -> Any:
@@ -127,7 +125,7 @@ class PartSuite(Suite):
     def _depends_on_stream(self) -> str:
         stated = bool(self.make().random)
         case = self.cases()[0]
-        differs = answer_print(self._answer(case, 1)) != answer_print(self._answer(case, 2))
+        differs = fingerprint(self._answer(case, 1)) != fingerprint(self._answer(case, 2))
         if stated and not differs:
             raise BreachError("its random is true, but two streams give the same")
         if differs and not stated:
@@ -239,6 +237,6 @@ def _scored_run(state: TrackingState) -> ScoredRun:
         target_world=trackers.TARGET_M.copy(),
         world_from_rover=poses,
         point_px=np.array([[512.0, 400.0], [515.0, 398.0]]),
-        measurements=tuple(trackers.taken(trackers._box_ahead(), pose) for pose in poses),
+        measurements=tuple(trackers.take_pictures(trackers.aim_ahead(), pose) for pose in poses),
         answers=(first, last),
     )

@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.answers import check_aim, check_update
 from marsyard.algorithms.interface import MastAim, PixelBox, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt.pointing import mast_angles
-from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, timed
+from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, measure_time_s
 from marsyard.scenarios.conformance.inputs import MEAN, TexturedPlane, texture
 from marsyard.scenarios.handover import copy_inputs, hash_inputs
 from marsyard.sim.camera import CameraModel
@@ -51,17 +51,13 @@ def designation() -> PixelTarget:
     return PixelTarget(np.asarray(left.project(TARGET_M)[0]), *angles)
 
 
-def taken(aim: MastAim, world_from_rover: RigidTransform, blank: int | None = None) -> RoverMeasurements:
+def take_pictures(aim: MastAim, world_from_rover: RigidTransform, blank: int | None = None) -> RoverMeasurements:
     """Measurements of a stop at the aim: pictures of the wall, or blank pictures of one count."""
-    head = world_from_rover * mast().geometry.rover_from_head(aim.azimuth_rad, aim.elevation_rad)
-    return RoverMeasurements(
-        left=_take_picture(mast().left.moved(head), aim.left, blank),
-        right=_take_picture(mast().right.moved(head), aim.right, blank),
-        mast=mast(),
-        azimuth_rad=aim.azimuth_rad,
-        elevation_rad=aim.elevation_rad,
-        world_from_rover=world_from_rover,
-    )
+    angles = aim.azimuth_rad, aim.elevation_rad
+    head = world_from_rover * mast().geometry.rover_from_head(*angles)
+    left = _take_picture(mast().left.moved(head), aim.left, blank)
+    right = _take_picture(mast().right.moved(head), aim.right, blank)
+    return RoverMeasurements(left, right, mast(), *angles, world_from_rover)
 
 
 def _take_picture(camera: CameraModel, box: PixelBox, blank: int | None) -> MastImage:
@@ -83,7 +79,8 @@ class TrackerSuite(Suite):
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
         form = "see algorithms/interface.py for aim, update and state"
-        yield Check("answer", "gives a well-formed aim and answer at every stop of a drive", form, self._answers)
+        asked = "gives a well-formed aim and answer at every stop of a drive"
+        yield Check("answer", asked, form, lambda: ", ".join(one.state.name for one in drive(self.make())))
         yield Check("states", "has no target before one is designated and after it is cleared", form, self._has_states)
         advice = "return a TargetUpdate with the state LOST and the reasons in losses"
         for name, blank in BLANKS.items():
@@ -106,9 +103,6 @@ class TrackerSuite(Suite):
     def _check_answer(self, answer: Any, case: PixelTarget) -> Any:
         return answer  # checked by `drive`
 
-    def _answers(self) -> str:
-        return ", ".join(update.state.name for update in drive(self.make()))
-
     def _has_states(self) -> str:
         tracker = self.make()
         _expect_state(tracker, "before a target is designated", TrackingState.NO_TARGET)
@@ -116,7 +110,7 @@ class TrackerSuite(Suite):
         _expect_state(tracker, "once a target is designated", TrackingState.NORMAL)
         tracker.clear()
         _expect_state(tracker, "once it is cleared", TrackingState.NO_TARGET)
-        update = check_update(tracker.update(copy_inputs(taken(_box_ahead(), pose(0.0)))))
+        update = check_update(tracker.update(copy_inputs(take_pictures(aim_ahead(), pose(0.0)))))
         if update.state is not TrackingState.NO_TARGET:
             raise BreachError(f"asked without a target, it answers {update.state.name}; allowed: NO_TARGET")
         return ""
@@ -136,14 +130,14 @@ class TrackerSuite(Suite):
     def _answers_after_jump(self) -> str:
         tracker = self.make()
         drive(tracker)
-        measurements = replace(taken(_box_ahead(), pose(0.0)), world_from_rover=pose(3.0))
+        measurements = replace(take_pictures(aim_ahead(), pose(0.0)), world_from_rover=pose(3.0))
         return check_update(tracker.update(copy_inputs(measurements))).state.name
 
     def _leaves_inputs(self) -> str:
         tracker, target = self.make(), copy_inputs(designation(), writable=True)
         target_before = hash_inputs(target)
         tracker.designate(target, pose(0.0))
-        measurements = copy_inputs(taken(_aim_at_target(tracker, pose(0.0)), pose(0.0)), writable=True)
+        measurements = copy_inputs(take_pictures(_aim_at_target(tracker, pose(0.0)), pose(0.0)), writable=True)
         before = hash_inputs(measurements)
         tracker.update(measurements)
         if hash_inputs(target) != target_before or hash_inputs(measurements) != before:
@@ -158,8 +152,8 @@ class TrackerSuite(Suite):
         times = []
         for number in range(_STOPS):
             here = pose(number * _STEP_M)
-            measurements = copy_inputs(taken(_aim_at_target(tracker, here), here))
-            times.append(timed(partial(tracker.update, measurements)))
+            measurements = copy_inputs(take_pictures(_aim_at_target(tracker, here), here))
+            times.append(measure_time_s(partial(tracker.update, measurements)))
         return max(times)
 
 
@@ -182,7 +176,7 @@ def stop(tracker: Any, here: RigidTransform, blank: int | None = None) -> Target
     aim = check_aim(tracker.aim(here, copy_inputs(mast())), mast())
     if aim is None:
         return None
-    update = check_update(tracker.update(copy_inputs(taken(aim, here, blank))))
+    update = check_update(tracker.update(copy_inputs(take_pictures(aim, here, blank))))
     if tracker.state is not update.state:
         raise BreachError(f"its state is {tracker.state}, but its update says {update.state}")
     return update
@@ -195,7 +189,7 @@ def _aim_at_target(tracker: Any, here: RigidTransform) -> MastAim:
     return aim
 
 
-def _box_ahead() -> MastAim:
+def aim_ahead() -> MastAim:
     """Aim straight ahead with the middle of both frames."""
     columns, rows = mast().left.size
     box = PixelBox((columns // 4, rows // 4), (columns // 2, rows // 2))

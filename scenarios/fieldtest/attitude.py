@@ -141,8 +141,13 @@ def solve_attitude(
     for _ in range(_ITERATIONS):
         propagated = _propagate(increments, bias)
         predicted = (start * propagated.attitude(times)).apply(camera)
-        cross = _cross_matrices(predicted)
-        by_bias = np.einsum("nij,jk,nkl->nil", cross, start.as_matrix(), -_bias_integral(propagated, times))
+        # matrices M with M w = v x w
+        (x, y, z), zero = predicted.T, np.zeros(len(predicted))
+        cross = np.moveaxis(np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]), 2, 0)
+        # integral of the attitude's matrix up to each time: rotation of the start's axes per unit of bias in body axes
+        integral = np.cumsum(propagated.attitudes[:-1].as_matrix() * increments.period_s, axis=0)
+        before = np.clip(np.searchsorted(increments.times_s, times) - 1, 0, len(integral) - 1)
+        by_bias = np.einsum("nij,jk,nkl->nil", cross, start.as_matrix(), -integral[before])
         rows = np.concatenate([-cross, -by_bias], axis=2).reshape(-1, 6) / sighting_sd_rad
         prior = np.concatenate([np.zeros((3, 3)), np.eye(3)], axis=1) / bias_sd_rad_s
         residuals = np.concatenate([(world - predicted).ravel() / sighting_sd_rad, -bias / bias_sd_rad_s])
@@ -159,18 +164,3 @@ def _propagate(increments: ImuIncrements, bias_rad_s: Float64[np.ndarray, "3"]) 
     """Propagate the attitude relative to the first by the gyros without a bias."""
     corrected = replace(increments, delta_angles_rad=increments.delta_angles_rad - bias_rad_s * increments.period_s)
     return InertialSolution.propagate(corrected, Rotation.identity(), np.zeros(3), 0.0)
-
-
-def _bias_integral(propagated: InertialSolution, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3 3"]:
-    """Integrate the attitude's matrix up to each time: rotation of the start's axes per unit of bias in body axes."""
-    increments = propagated.increments
-    integral = np.cumsum(propagated.attitudes[:-1].as_matrix() * increments.period_s, axis=0)
-    before = np.clip(np.searchsorted(increments.times_s, times_s) - 1, 0, len(integral) - 1)
-    return np.asarray(integral[before])
-
-
-def _cross_matrices(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3 3"]:
-    """Return matrices M with M w = v x w."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.moveaxis(np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]), 2, 0)

@@ -1,12 +1,17 @@
-"""Simulate and process a run of the field test: flight, attitudes, altitudes and triples (paper, III.D)."""
+"""Simulate and process a run of the field test: flight, sun, attitudes, altitudes and triples (paper, III.D and IV).
+
+The sun is that of Meeus, "Astronomical Algorithms" (1998), chapter 25, low accuracy: accurate to 0.01 deg in this
+century, without refraction (0.02 deg at 45 deg of elevation) and parallax (0.002 deg).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
+from enum import StrEnum
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
@@ -18,17 +23,17 @@ from marsyard.scenarios.fieldtest.attitude import (
     sight_targets,
     solve_attitude,
 )
-from marsyard.scenarios.fieldtest.ephemeris import sun_direction
 from marsyard.scenarios.fieldtest.parameters import (
     CAMERA,
     ElevationParameters,
     FieldTestParameters,
     RunParameters,
+    TripleParameters,
 )
-from marsyard.scenarios.fieldtest.triples import Pictures, Triple, make_triples
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import Motion
 from marsyard.sim.dynamics.helicopter import HelicopterFlight, helicopter_flight
+from marsyard.sim.frames import direction
 from marsyard.sim.render import CloudLayer
 from marsyard.sim.sensor import preset
 from marsyard.sim.sensor.imu import DEG_H, Imu
@@ -41,6 +46,124 @@ from marsyard.sim.terrain import Surface, TerrainBank, site
 _GROUND_POINTS = 256
 #: Posts of the elevation model around the requested points.
 _MARGIN = 2
+#: Noon of 1 January 2000, and terrestrial less universal time in 2002, s.
+_J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)
+_TT_LESS_UT_S = 64.3
+
+
+class Category(StrEnum):
+    """The paper's categories of triples."""
+
+    SHORT_TIME = "short time"
+    SAME_DIRECTION = "same direction"
+    OPPOSITE_DIRECTION = "opposite direction"
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Measurements at a run's pictures, one row per picture in the order taken.
+
+    - flown: number of the pass
+    - direction: direction of flight along the line, +1 or -1
+    - position_m: by GPS, world axes
+    - altitude_m: above the ground, as measured
+    - centre_m: intersection of the camera's axis with level ground, by the measured attitude: east, north
+    """
+
+    flown: Int64[np.ndarray, "n"]
+    direction: Int64[np.ndarray, "n"]
+    position_m: Float64[np.ndarray, "n 3"]
+    altitude_m: Float64[np.ndarray, "n"]
+    centre_m: Float64[np.ndarray, "n 2"]
+
+
+@dataclass(frozen=True)
+class Triple:
+    """Three pictures in the order in which DIMES is given them, by their numbers in the run."""
+
+    category: Category
+    pictures: tuple[int, int, int]
+
+
+def make_triples(
+    run: RunParameters, pictures: Pictures, parameters: TripleParameters, rng: np.random.Generator
+) -> tuple[Triple, ...]:
+    """Draw the triples of a run: for each category the stated number out of all candidates.
+
+    Pictures of a short-time triple are consecutive ones of one pass. Those of the other categories have decreasing
+    altitudes, as in a landing. Raises ValueError where there are too few candidates.
+    """
+    # pairs that overlap and whose distance DIMES can measure over the virtual interval
+    lower = np.minimum(pictures.altitude_m[:, None], pictures.altitude_m)
+    paired = _distances(pictures.centre_m) <= parameters.overlap_share * lower
+    paired &= _distances(pictures.position_m[:, :2]) <= parameters.most_speed_m_s * parameters.virtual_interval_s
+    first = np.arange(len(pictures.flown) - 2)
+    in_one_pass = pictures.flown[first] == pictures.flown[first + 2]
+    consecutive = first[in_one_pass & paired[first, first + 1] & paired[first + 1, first + 2]]
+    # all three pictures with a step down from each to the next, by GPS
+    step = pictures.position_m[:, 2][:, None] - pictures.position_m[:, 2]
+    follows = paired & (step >= parameters.least_step_m) & (step <= parameters.most_step_m)
+    descending = np.array(
+        [
+            (before, middle, after)
+            for middle in range(len(step))
+            for before in np.flatnonzero(follows[:, middle])
+            for after in np.flatnonzero(follows[middle])
+        ],
+        dtype=np.int64,
+    ).reshape(-1, 3)
+    one_direction = (np.diff(pictures.direction[descending], axis=1) == 0).all(axis=1)
+    candidates = {
+        Category.SHORT_TIME: (consecutive[:, None] + np.arange(3), run.short_time),
+        Category.SAME_DIRECTION: (descending[one_direction], run.same_direction),
+        Category.OPPOSITE_DIRECTION: (descending[~one_direction], run.opposite_direction),
+    }
+    made = []
+    for category, (possible, wanted) in candidates.items():
+        if len(possible) < wanted:
+            raise ValueError(
+                f"{run.name}: {wanted} triples '{category}' are asked for, but its pictures make {len(possible)}"
+            )
+        for first, second, third in possible[rng.choice(len(possible), wanted, replace=False)].tolist():
+            made.append(Triple(category, (first, second, third)))
+    return tuple(made)
+
+
+def _distances(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n n"]:
+    return np.asarray(np.linalg.norm(points[:, None] - points, axis=-1))
+
+
+def sun_direction(time: datetime, latitude_deg: float, longitude_deg: float) -> Float64[np.ndarray, "3"]:
+    """Compute the unit vector to the sun's centre in the local level frame (east, north, up).
+
+    Latitude is geodetic, longitude positive to the east. Raises ValueError for a time without a time zone.
+    """
+    if time.tzinfo is None:
+        raise ValueError(f"the time {time} has no time zone; one is needed, as in 2002-10-15T12:00-07:00")
+    days = (time - _J2000).total_seconds() / 86400.0
+    t = (days + _TT_LESS_UT_S / 86400.0) / 36525.0  # Julian centuries since J2000
+    mean_longitude = 280.46646 + 36000.76983 * t + 0.0003032 * t**2
+    anomaly = np.radians(357.52911 + 35999.05029 * t - 0.0001537 * t**2)
+    centre = (
+        (1.914602 - 0.004817 * t) * np.sin(anomaly)
+        + (0.019993 - 0.000101 * t) * np.sin(2.0 * anomaly)
+        + 0.000289 * np.sin(3.0 * anomaly)
+    )
+    node = np.radians(125.04 - 1934.136 * t)
+    longitude = np.radians(mean_longitude + centre - 0.00569 - 0.00478 * np.sin(node))
+    obliquity = np.radians(23.4392911 - 0.0130042 * t + 0.00256 * np.cos(node))
+    right_ascension = np.arctan2(np.cos(obliquity) * np.sin(longitude), np.cos(longitude))
+    declination = np.arcsin(np.sin(obliquity) * np.sin(longitude))
+    # mean sidereal time at Greenwich (Meeus 12.4); nutation, at most 0.005 deg, is neglected
+    sidereal = np.radians((280.46061837 + 360.98564736629 * days + longitude_deg) % 360.0)
+    hour = sidereal - right_ascension
+    latitude = np.radians(latitude_deg)
+    elevation = np.arcsin(
+        np.sin(latitude) * np.sin(declination) + np.cos(latitude) * np.cos(declination) * np.cos(hour)
+    )
+    east = -np.cos(declination) * np.sin(hour)
+    north = np.sin(declination) * np.cos(latitude) - np.cos(declination) * np.sin(latitude) * np.cos(hour)
+    return direction(float(np.arctan2(east, north)), float(elevation))
 
 
 @dataclass(frozen=True)
@@ -116,7 +239,13 @@ def simulate_run(key: RunKey) -> Run:
     p, run = key.field_test, key.field_test.runs[key.number]
     streams = _RunStreams(Streams(key.seed, key.campaign, 0), run.name)
     surface = TerrainBank(p.terrain(run.site), p.bank_seed).terrain(0)
-    flight = _draw_flight(p, run, surface, streams.generator("flight"))
+    # a line of random position and azimuth; heights count from the mean ground under it
+    rng = streams.generator("flight")
+    middle, azimuth = rng.uniform(0.0, surface.period_m, 2), float(rng.uniform(0.0, 2.0 * np.pi))
+    steps = np.linspace(-0.5, 0.5, _GROUND_POINTS) * p.helicopter.length_m
+    line = surface.height(middle[0] + steps * np.sin(azimuth), middle[1] + steps * np.cos(azimuth))
+    origin = np.array([*middle, float(line.mean())])
+    flight = helicopter_flight(p.helicopter, origin, azimuth, site(run.site).environment.gravity_m_s2, rng)
     step = p.pictures.interval_s
     times_of_pass = [np.arange(one.start_s + 0.5 * step, one.end_s, step) for one in flight.passes]
     times = np.concatenate(times_of_pass)
@@ -164,33 +293,18 @@ class _RunStreams:
         return self.streams.generator(f"run {self.run}: {name}")
 
 
-def _draw_flight(
-    p: FieldTestParameters, run: RunParameters, surface: Surface, rng: np.random.Generator
-) -> HelicopterFlight:
-    """Draw the flight with a random position and azimuth of its line."""
-    middle = rng.uniform(0.0, surface.period_m, 2)
-    azimuth = float(rng.uniform(0.0, 2.0 * np.pi))
-    steps = np.linspace(-0.5, 0.5, _GROUND_POINTS) * p.helicopter.length_m
-    ground = surface.height(middle[0] + steps * np.sin(azimuth), middle[1] + steps * np.cos(azimuth))
-    origin = np.array([*middle, float(ground.mean())])
-    return helicopter_flight(p.helicopter, origin, azimuth, site(run.site).environment.gravity_m_s2, rng)
-
-
 def _estimate_attitudes(
     p: FieldTestParameters, surface: Surface, flight: HelicopterFlight, clock: Clock, gps: Gps, streams: _RunStreams
 ) -> AttitudeSolution:
     """Simulate both passes over the targets and the gyros, and estimate the attitude over the flight."""
-    camera = field_camera()
+    camera, noise, sightings = field_camera(), streams.generator("sightings"), []
     targets = Targets.drawn(p.targets, surface, flight.origin_m[:2], streams.generator("targets"))
-    noise = streams.generator("sightings")
-    sightings = []
     for start, end in flight.fly_overs_s:
         times = np.linspace(start, end, p.targets.pictures + 2)[1:-1]
         tags = clock.tags(times, noise)
         fixes = gps.measure(flight, times, noise).values
-        sightings.append(
-            sight_targets(targets, camera, flight.motion(times), tags, fixes, p.targets.centroid_px, noise)
-        )
+        motion = flight.motion(times)
+        sightings.append(sight_targets(targets, camera, motion, tags, fixes, p.targets.centroid_px, noise))
     unit = Imu.drawn(p.imu, flight.span_s, streams.generator("imu errors"))
     increments = unit.increments(flight, *flight.span_s, streams.generator("imu noise"))
     middle = np.array(camera.size) / 2.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, UInt16
@@ -17,8 +18,7 @@ from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, pi
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import render_state, sunlight_ratio
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
-from marsyard.scenarios.fieldtest.run import Run, RunKey, field_camera, simulate_run
-from marsyard.scenarios.fieldtest.triples import Category, Triple
+from marsyard.scenarios.fieldtest.run import Category, Run, RunKey, Triple, field_camera, simulate_run
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.optics import camera_optics, draw_calibrated
 from marsyard.scenarios.parts.named import SCORE, Kind
@@ -96,9 +96,13 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         pictures = [one.counts for one in taken]
         truth = truth_velocities(p, case)[1, :2]
         measurements = measure(p, case, pictures, detector, calibrated_camera(p, streams))
+        # the clouds' transmittance over the middle picture's ground at each picture, and its changes
+        light = cloud_transmittances(run, taken[1].ground_m, [state.time_s for state in case.states])
+        changes = np.abs(np.diff(light, axis=0))
         conditions = {
             **_conditions(p, case, measurements, ground.surface),
-            **_cloud_conditions(case, taken[1].ground_m),
+            **{f"cloud_transmittance_{number}": float(np.nanmean(one)) for number, one in enumerate(light, start=1)},
+            **{f"cloud_change_{pair}": float(np.nanmean(one)) for pair, one in enumerate(changes, start=1)},
             **picture_columns(p.backend, pictures),
         }
 
@@ -112,14 +116,9 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
             velocity = None if estimate is None else estimate.velocity_m_s
             row = {**velocity_row("velocity", velocity, truth), **consistency_row(estimate, truth), **attempt.row}
             if estimate is not None:
-                scored_flight = ScoredFlight(
-                    measurements=measurements,
-                    answer=estimate,
-                    true_velocity_m_s=truth,
-                    states=case.states,
-                    motion=run.flight,
-                )
-                row |= scored(p.scores, scored_flight, {*row, *conditions})
+                known: dict[str, Any] = {"true_velocity_m_s": truth, "states": case.states, "motion": run.flight}
+                flight = ScoredFlight(measurements=measurements, answer=estimate, **known)
+                row |= scored(p.scores, flight, {*row, *conditions})
             return algorithm_result(attempt, velocity is not None, row, velocity_products(pictures, estimate, truth))
 
         return case_result(p.algorithms, judge, conditions)
@@ -145,9 +144,9 @@ def case_order(p: FieldTestParameters) -> list[tuple[int, int]]:
     for number, run in enumerate(p.runs):
         start = 0
         for count in (run.short_time, run.same_direction, run.opposite_direction):
-            cells += [((place + 0.5) / count, number, start + place) for place in range(count)]
+            cells += [((index + 0.5) / count, number, start + index) for index in range(count)]
             start += count
-    return [(number, place) for _, number, place in sorted(cells)]
+    return [(number, index) for _, number, index in sorted(cells)]
 
 
 def truth_velocities(p: FieldTestParameters, case: Case) -> Float64[np.ndarray, "2 3"]:
@@ -198,9 +197,9 @@ def _conditions(
         "horizontal_speed_m_s": float(np.hypot(*case.states[1].velocity_m_s[:2])),
     }
     errors = []
-    each = zip(case.states, measurements.altitudes, true_altitudes, strict=True)
-    for number, (state, altitude, true) in enumerate(each, start=1):
-        errors.append((measurements.attitudes[number - 1].world_from_body * state.attitude.inv()).as_rotvec())
+    each = zip(case.states, measurements.attitudes, measurements.altitudes, true_altitudes, strict=True)
+    for number, (state, attitude, altitude, true) in enumerate(each, start=1):
+        errors.append((attitude.world_from_body * state.attitude.inv()).as_rotvec())
         row[f"flown_{number}_s"] = state.time_s
         row[f"pass_{number}"] = int(run.pictures.flown[numbers[number - 1]])
         row[f"altitude_{number}_m"] = float(true)
@@ -214,16 +213,6 @@ def _conditions(
     row["off_nadir_max_deg"] = max(off_nadir_deg(state) for state in case.states)
     row["attitude_rate_max_deg_s"] = max(attitude_rate_deg_s(state) for state in case.states)
     return row
-
-
-def _cloud_conditions(case: Case, ground_m: Float64[np.ndarray, "m n 3"]) -> dict[str, Scalar]:
-    """Average the clouds' transmittance over the middle picture's ground at each picture, and its changes."""
-    light = cloud_transmittances(case.run, ground_m, [state.time_s for state in case.states])
-    changes = np.abs(np.diff(light, axis=0))
-    return {
-        **{f"cloud_transmittance_{number}": float(np.nanmean(one)) for number, one in enumerate(light, start=1)},
-        **{f"cloud_change_{pair}": float(np.nanmean(one)) for pair, one in enumerate(changes, start=1)},
-    }
 
 
 @dataclass(frozen=True)
@@ -249,10 +238,9 @@ def cloud_transmittances(
     run: Run, ground_m: Float64[np.ndarray, "m n 3"], times_s: Sequence[float]
 ) -> Float64[np.ndarray, "times m n"]:
     """Compute the fraction of the direct sunlight that clouds transmit to points of the ground."""
-    layer = run.clouds
-    if layer is None:
+    if run.clouds is None:
         return np.ones((len(times_s), *ground_m.shape[:2]))
-    return np.stack([layer.transmittance(ground_m, sun_at(run, time), time) for time in times_s])
+    return np.stack([run.clouds.transmittance(ground_m, sun_at(run, time), time) for time in times_s])
 
 
 def sun_at(run: Run, time_s: float) -> Sun:

@@ -13,10 +13,11 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float64
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.scenarios.interface import Scalar
@@ -34,14 +35,12 @@ _FAR_M = 1e7
 #: Quantiles of the counts that become black and white.
 _STRETCH = (0.005, 0.995)
 
+_Features: TypeAlias = tuple[Float64[np.ndarray, "n 2"], np.ndarray]
+
 
 @dataclass(frozen=True, eq=False)
 class PairMatches:
-    """Features matched between two pictures.
-
-    - pixels: (u, v) as delivered, in the earlier and in the later picture
-    - inliers: matches that a rigid motion explains
-    """
+    """Pixels (u, v) of features matched between an earlier and a later picture; a rigid motion explains the inliers."""
 
     pixels: Float64[np.ndarray, "2 n 2"]
     inliers: Bool[np.ndarray, "n"]
@@ -49,9 +48,9 @@ class PairMatches:
 
 @dataclass(frozen=True, eq=False)
 class PairAgreement:
-    """The matches of two pictures and their offsets from the positions that poses predict.
+    """The matches of two pictures, and their offsets from the positions that poses predict.
 
-    - offsets: in the later picture, pixels; NaN where the later camera cannot see the predicted point
+    The offsets are in pixels of the later picture; NaN where its camera cannot see the predicted point.
     """
 
     matches: PairMatches
@@ -69,10 +68,7 @@ class PairAgreement:
 def match_images(images: Sequence[DetectorImage]) -> list[PairMatches]:
     """Match the features of each picture with those of the next."""
     features = [_detect_features(image) for image in images]
-    return [
-        _select_inliers(first, second, *_match_features(*pair))
-        for (first, second), pair in zip(itertools.pairwise(images), itertools.pairwise(features), strict=True)
-    ]
+    return list(map(_match_pair, itertools.pairwise(images), itertools.pairwise(features)))
 
 
 def compare_with_poses(
@@ -115,14 +111,16 @@ def agreement_products(images: Sequence[DetectorImage], pairs: Sequence[PairAgre
     return products
 
 
-def _detect_features(image: DetectorImage) -> tuple[Float64[np.ndarray, "n 2"], np.ndarray]:
+def _detect_features(image: DetectorImage) -> _Features:
     """Detect SIFT features on about square pixels, without the flat field; return pixels as delivered, descriptors."""
     fu, fv = image.camera.focal_lengths
     rows, columns = image.counts.shape
     across, down = _binning(fu / fv, columns), _binning(fv / fu, rows)
     signal = (image.counts - image.calibration.offset_dn) / image.calibration.flat_field
     square = signal.reshape(rows // down, down, columns // across, across).mean(axis=(1, 3))
-    points, descriptors = cv2.SIFT.create(nfeatures=_MAX_FEATURES).detectAndCompute(_eight_bits(square), None)
+    black, white = np.quantile(square, _STRETCH)
+    grey = np.clip((square - black) / max(white - black, 1e-9) * 255.0, 0.0, 255.0).astype(np.uint8)
+    points, descriptors = cv2.SIFT.create(nfeatures=_MAX_FEATURES).detectAndCompute(grey, None)
     if descriptors is None:
         return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32)
     binned = np.array([point.pt for point in points], dtype=np.float64)
@@ -135,55 +133,39 @@ def _binning(ratio: float, extent: int) -> int:
     return factor if extent % factor == 0 else 1
 
 
-def _eight_bits(signal: Float64[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:
-    low, high = np.quantile(signal, _STRETCH)
-    return np.asarray(np.clip((signal - low) / max(high - low, 1e-9) * 255.0, 0.0, 255.0).astype(np.uint8))
+def _match_pair(images: tuple[DetectorImage, DetectorImage], features: tuple[_Features, _Features]) -> PairMatches:
+    """Match features that are mutual nearest neighbours and pass the ratio test.
 
-
-def _match_features(
-    first: tuple[Float64[np.ndarray, "n 2"], np.ndarray], second: tuple[Float64[np.ndarray, "m 2"], np.ndarray]
-) -> tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, "k 2"]]:
-    """Return the pixels of features that are mutual nearest neighbours and pass the ratio test."""
-    (pixels, descriptors), (later_pixels, later_descriptors) = first, second
-    if len(pixels) < 2 or len(later_pixels) < 2:
-        return np.empty((0, 2)), np.empty((0, 2))
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    back = {one.queryIdx: one.trainIdx for (one,) in matcher.knnMatch(later_descriptors, descriptors, k=1)}
-    # one feature of several orientations is one match
-    matches = {
-        tuple(pixels[best.queryIdx].tolist()): (best.queryIdx, best.trainIdx)
-        for best, next_best in matcher.knnMatch(descriptors, later_descriptors, k=2)
-        if best.distance < _RATIO * next_best.distance and back.get(best.trainIdx) == best.queryIdx
-    }
+    Inliers are the matches that one rigid motion between the cameras explains, independent of the poses.
+    """
+    (earlier, descriptors), (later, later_descriptors) = features
+    matches: dict[tuple[float, ...], tuple[int, int]] = {}
+    if len(earlier) >= 2 and len(later) >= 2:
+        matcher = cv2.BFMatcher(cv2.NORM_L2)
+        back = {one.queryIdx: one.trainIdx for (one,) in matcher.knnMatch(later_descriptors, descriptors, k=1)}
+        # one feature of several orientations is one match
+        matches = {
+            tuple(earlier[best.queryIdx].tolist()): (best.queryIdx, best.trainIdx)
+            for best, next_best in matcher.knnMatch(descriptors, later_descriptors, k=2)
+            if best.distance < _RATIO * next_best.distance and back.get(best.trainIdx) == best.queryIdx
+        }
     indices = np.array(list(matches.values()), dtype=np.intp).reshape(-1, 2)
-    return pixels[indices[:, 0]], later_pixels[indices[:, 1]]
-
-
-def _select_inliers(
-    first: DetectorImage,
-    second: DetectorImage,
-    pixels: Float64[np.ndarray, "n 2"],
-    later_pixels: Float64[np.ndarray, "n 2"],
-) -> PairMatches:
-    """Select the matches that one rigid motion between the two cameras explains, independent of the poses."""
-    inliers = np.zeros(len(pixels), dtype=np.bool_)
-    if len(pixels) >= MIN_MATCHES:
-        cameras = first.camera, second.camera
-        points = [_normalise(camera, some) for camera, some in zip(cameras, (pixels, later_pixels), strict=True)]
-        focal = 0.5 * sum(float(np.sqrt(np.prod(camera.focal_lengths))) for camera in cameras)
+    pixels = np.stack([earlier[indices[:, 0]], later[indices[:, 1]]])
+    inliers = np.zeros(len(indices), dtype=np.bool_)
+    if len(indices) >= MIN_MATCHES:
+        points = []
+        for image, some in zip(images, pixels, strict=True):
+            # normalised image coordinates: the rays' intersections with the plane at unit distance
+            axes = np.stack([image.camera.right, image.camera.down, image.camera.a])
+            x, y, z = (image.camera.rays(some)[1] @ axes.T).T
+            points.append(np.stack([x, y], axis=1) / np.maximum(z, 1e-3)[:, None])
+        focal = 0.5 * sum(float(np.sqrt(np.prod(image.camera.focal_lengths))) for image in images)
+        limit = _MAX_DISTANCE_PX / focal
         _, mask = cv2.findEssentialMat(
-            points[0], points[1], np.eye(3), method=cv2.RANSAC, prob=_CONFIDENCE, threshold=_MAX_DISTANCE_PX / focal
+            points[0], points[1], np.eye(3), method=cv2.RANSAC, prob=_CONFIDENCE, threshold=limit
         )
         inliers = inliers if mask is None else np.asarray(mask).ravel() > 0
-    return PairMatches(np.stack([pixels, later_pixels]), inliers)
-
-
-def _normalise(camera: CameraModel, pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 2"]:
-    """Return normalised image coordinates: the rays' intersections with the plane at unit distance."""
-    directions = camera.rays(pixels)[1]
-    axes = np.stack([camera.right, camera.down, camera.a])
-    x, y, z = (directions @ axes.T).T
-    return np.asarray(np.stack([x, y], axis=1) / np.maximum(z, 1e-3)[:, None])
+    return PairMatches(pixels, inliers)
 
 
 def offsets_px(
@@ -194,26 +176,14 @@ def offsets_px(
 ) -> Float64[np.ndarray, "n 2"]:
     """Return the offsets of matches from the nearest points of their epipolar curves in the second picture, pixels.
 
-    The cameras are in one frame. NaN where the second camera cannot see the point.
+    The cameras are in one frame. NaN where the second camera cannot see the point. From the second camera, a ray of the
+    first spans the arc from the direction of the first camera, `baseline`, to the ray's own direction. The nearest
+    point, in angle, is where the second camera's ray, projected onto the plane of the arc, meets the first's: p with
+    ``p x (baseline + s direction) = 0``.
     """
     origins, directions = first.rays(pixels)
     later_origins, later_directions = second.rays(later_pixels)
-    distances = _nearest_m(origins - later_origins, directions, later_directions)
-    predicted, _ = second.project(origins + distances[:, None] * directions)
-    return np.asarray(later_pixels - predicted)
-
-
-def _nearest_m(
-    baselines: Float64[np.ndarray, "n 3"],
-    directions: Float64[np.ndarray, "n 3"],
-    later_directions: Float64[np.ndarray, "n 3"],
-) -> Float64[np.ndarray, "n"]:
-    """Return the distances along the first camera's rays of the points nearest, in angle, to the second camera's rays.
-
-    From the second camera, a ray of the first spans the arc from the direction of the first camera, `baseline`, to the
-    ray's own direction. The point is where the second camera's ray, projected onto the plane of the arc, meets the
-    first's: p with ``p x (baseline + s direction) = 0``.
-    """
+    baselines = origins - later_origins
     normals = np.cross(baselines, directions)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
@@ -225,4 +195,6 @@ def _nearest_m(
     ahead = np.sum((baselines + distances[:, None] * directions) * projected, axis=1) > 0.0
     reached = np.isfinite(distances) & (distances > 0.0) & ahead & (lengths[:, 0] > 0.0)
     # outside the arc the end at infinity is taken: no ground lies in front of the first camera's lens
-    return np.asarray(np.where(reached, np.minimum(distances, _FAR_M), _FAR_M))
+    distances = np.where(reached, np.minimum(distances, _FAR_M), _FAR_M)
+    predicted, _ = second.project(origins + distances[:, None] * directions)
+    return np.asarray(later_pixels - predicted)

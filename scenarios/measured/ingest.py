@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, UInt16
@@ -23,14 +24,16 @@ from marsyard.scenarios.measured.layout import (
     IngestFile,
     PictureRow,
     SunTable,
+    file_head,
+    read_counts,
+    read_flat_field,
     read_ingest_file,
     read_table,
 )
-from marsyard.scenarios.measured.picture_files import file_head, read_counts, read_flat_field
 from marsyard.scenarios.system import Ingested
 from marsyard.scenarios.template import toml_environment
 from marsyard.scenarios.user_files import listed
-from marsyard.sim.camera import CameraModel, Pds3Product, mount_looking_down, read_cameras, read_pds3_product
+from marsyard.sim.camera import CameraModel, mount_looking_down, read_cameras, read_pds3_product
 from marsyard.sim.camera.pds import is_pds3
 from marsyard.sim.frames import SITE_FROM_WORLD
 
@@ -51,30 +54,23 @@ def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
     - source: A folder with `ingest.toml`, `pictures.csv` and pictures (docs/real-pictures.md)
     - target, final: the folder that the cases are written to, and the folder that they are moved to afterwards
 
-    Raises
-    ------
-    ValueError
-        Where the folder cannot be used; the message names the file, and the line or key.
-    OSError
-        Where the cases cannot be written.
+    Raises ValueError where the folder cannot be used: the message names the file, and the line or key. Raises OSError
+    where the cases cannot be written.
     """
     path, stored = ingest(source, target)
-    rows_summed, note = stored.detector.rows_summed, ""
+    rows_summed, note, binned_size = stored.detector.rows_summed, "", None
     if rows_summed > 1 and read_ingest_file(source).detector.rows_summed is None:
         note = (
             f"rows_summed = {rows_summed}: taken from the camera, whose pixels are longer than wide by "
             f"that factor; rows_summed under [detector] of {INGEST_FILE} says otherwise"
         )
-    binned_size = None
     if stored.task == VELOCITY:  # DIMES bins the delivered pictures, whose rows are summed already
         columns, rows = stored.cases[0].pictures[0].size
         binned_size = binned_size_for(columns, rows * rows_summed)
         binned_size = binned_size if rows % binned_size[1] == 0 else (columns, rows)
     template = toml_environment(Path(__file__).parent).get_template("campaign.toml.j2")
     text = template.render(
-        folder=stored.folder,
-        name=stored.name,
-        task=stored.task,
+        **stored.model_dump(include={"folder", "name", "task"}),
         description=stored.description or _DESCRIPTIONS[stored.task],
         cases=len(stored.cases),
         file=str(final / path.name),
@@ -88,12 +84,8 @@ def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
 def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
     """Write the cases of a folder into an existing folder; return the path of `cases.json` and its contents.
 
-    Raises
-    ------
-    IngestError
-        Where anything in the folder cannot be used; the message names the file, and the line or key.
-    OSError
-        Where the cases cannot be written.
+    Raises IngestError where the folder cannot be used: the message names the file, and the line or key. Raises OSError
+    where the cases cannot be written.
     """
     file, table = read_ingest_file(source), source / TABLE_FILE
     reader = _FolderReader(source, file, target)
@@ -114,10 +106,8 @@ def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
         task=file.task,
         folder=str(source.resolve()),
         detector=store.StoredDetector(
-            offset_dn=detector.offset_dn,
+            **detector.model_dump(include={"offset_dn", "transfer_row_s", "clear_row_s"}),
             full_scale_dn=(1 << detector.bits) - 1,
-            transfer_row_s=detector.transfer_row_s,
-            clear_row_s=detector.clear_row_s,
             rows_summed=infer_summed_rows(first_camera) if detector.rows_summed is None else detector.rows_summed,
         ),
         cases=tuple(cases),
@@ -164,37 +154,55 @@ class _FolderReader:
         for before, after in itertools.pairwise(pictures):
             if after.time_s <= before.time_s:
                 raise after.row.error(f"time goes from {before.time_s:g} to {after.time_s:g} s; allowed: onwards")
-        stored = tuple(self._store_picture(f"{number:06d}-{place}", one) for place, one in enumerate(pictures, start=1))
-        truth = self._truth(pictures)
+        stored = [self._store_picture(f"{number:06d}-{index}", one) for index, one in enumerate(pictures, start=1)]
+        measured: dict[str, Any] = {}
+        truth = self._read_truth(pictures)
         if self.file.task == VELOCITY:
-            return store.StoredCase(
-                name=name,
-                pictures=stored,
-                interval_velocities_m_s=tuple(self._interval_velocities(pictures)),
-                sun_direction=self._sun_direction(rows[0]),
-                truth=truth,
-            )
-        if self.file.task == LANDING:
-            slant_range_m = rows[0].numbers.get("slant_range_m")
-            site_m = self._apriori_site(pictures[0], slant_range_m)
-            return store.StoredCase(name=name, pictures=stored, slant_range_m=slant_range_m, site_m=site_m, truth=truth)
-        if len({one.position_m is None for one in pictures}) > 1:
+            measured["interval_velocities_m_s"] = tuple(map(self._mean_velocity, pictures, pictures[1:]))
+            angles, sun = rows[0].vector("sun_azimuth_deg", "sun_elevation_deg"), self.file.sun
+            if angles is not None:
+                azimuth, elevation = angles.tolist()
+                if not 0.0 < elevation <= 90.0:
+                    raise rows[0].error(f"sun_elevation_deg is {elevation:g}; allowed: above 0, at most 90")
+                sun = SunTable.model_construct(azimuth_deg=azimuth, elevation_deg=elevation)
+            if sun is None:
+                raise rows[0].error(f"no sun: neither sun_azimuth_deg and sun_elevation_deg nor {INGEST_FILE}'s [sun]")
+            measured["sun_direction"] = _vector(sun.direction)
+        elif self.file.task == LANDING:
+            measured["slant_range_m"] = rows[0].numbers.get("slant_range_m")
+            measured["site_m"] = self._apriori_site(pictures[0], measured["slant_range_m"])
+        elif len({one.position_m is None for one in pictures}) > 1:
             raise rows[0].error(f"case '{name}': some pictures have a position and some have none")
-        return store.StoredCase(name=name, pictures=stored, truth=truth)
+        return store.StoredCase(name=name, pictures=tuple(stored), truth=truth, **measured)
 
     def _read_picture(self, row: PictureRow) -> _Picture:
-        """Read a row's picture; a PDS3 label supplies the values that the row leaves out."""
-        path = self.source / row.texts["file"]
+        """Read a row's picture and its camera in the body frame; a PDS3 label supplies what the row leaves out."""
+        path, table = self.source / row.texts["file"], self.file.camera
         is_product = is_pds3(file_head(path))
-        camera = self._read_camera(row, path if is_product else None)
+        named = row.texts.get("camera", table.file)
+        if named is None and not is_product:
+            raise row.error(f"no camera: neither the column camera nor {INGEST_FILE}'s camera.file names one")
+        camera_file = path if named is None else self.source / named
+        cameras = read_cameras(str(camera_file), subframe_folded_in=table.subframe_folded_in)
+        if table.number >= len(cameras):
+            raise row.error(f"{camera_file}: holds {len(cameras)} cameras; camera.number is {table.number}")
+        camera, rotation = cameras[table.number], row.rotation()
+        if not table.placed and rotation is not None:  # the row's attitude is that of a camera that looks down
+            camera = mount_looking_down(camera)
         product = read_pds3_product(path) if is_product else None
         counts = read_counts(path, camera.size) if product is None else product.counts
-        bits = self.file.detector.bits
-        if counts.max() >= 1 << bits:
+        allowed = (1 << self.file.detector.bits) - 1
+        if counts.max() > allowed:
             raise row.error(
-                f"{path}: holds counts up to {counts.max()}; detector.bits = {bits} allows {(1 << bits) - 1}"
+                f"{path}: holds counts up to {counts.max()}; detector.bits = {self.file.detector.bits} allows {allowed}"
             )
-        attitude, position = self._measured_pose(row, product)
+        if rotation is not None:
+            attitude, position = self._body_pose(row, rotation, row.vector(*_POSITION))
+        elif product is None or product.site_from_rover is None:
+            raise row.error("qx to qw are empty, and no label states them")
+        else:  # the label's body is the rover
+            world, pose = SITE_FROM_WORLD.inv(), product.site_from_rover
+            attitude, position = world * pose.rotation, np.asarray(world.apply(pose.translation))
         up = float(attitude.apply(camera.boresight())[2])
         if self.file.task in (VELOCITY, LANDING) and up >= 0.0:
             elevation = np.degrees(np.arcsin(np.clip(up, -1.0, 1.0)))
@@ -206,33 +214,6 @@ class _FolderReader:
         if time_s is None:
             raise row.error("time_s is empty, and no label states it")
         return _Picture(row, counts, camera, time_s, attitude, position)
-
-    def _read_camera(self, row: PictureRow, product: Path | None) -> CameraModel:
-        """Read the picture's camera in the body frame."""
-        table = self.file.camera
-        named = row.texts.get("camera", table.file)
-        path = product if named is None else self.source / named
-        if path is None:
-            raise row.error(f"no camera: neither the column camera nor {INGEST_FILE}'s camera.file names one")
-        cameras = read_cameras(str(path), subframe_folded_in=table.subframe_folded_in)
-        if table.number >= len(cameras):
-            raise row.error(f"{path}: holds {len(cameras)} cameras; camera.number is {table.number}")
-        camera = cameras[table.number]
-        # an attitude in the row is that of a camera that looks down, or of the body in which the file places it
-        return camera if table.placed or row.rotation() is None else mount_looking_down(camera)
-
-    def _measured_pose(
-        self, row: PictureRow, product: Pds3Product | None
-    ) -> tuple[Rotation, Float64[np.ndarray, "3"] | None]:
-        """Return the body's attitude and position, from the row or else from the label, whose body is the rover."""
-        rotation = row.rotation()
-        if rotation is not None:
-            return self._body_pose(row, rotation, row.vector(*_POSITION))
-        pose = None if product is None else product.site_from_rover
-        if pose is None:
-            raise row.error("qx to qw are empty, and no label states them")
-        world = SITE_FROM_WORLD.inv()
-        return world * pose.rotation, np.asarray(world.apply(pose.translation))
 
     def _body_pose(
         self, row: PictureRow, rotation: Rotation, position: Float64[np.ndarray, "n"] | None
@@ -253,19 +234,29 @@ class _FolderReader:
         return np.asarray(self.file.poses.world.apply(vector))
 
     def _store_picture(self, name: str, picture: _Picture) -> store.StoredPicture:
-        row, camera = picture.row, picture.camera
+        row, camera, counts = picture.row, picture.camera, picture.counts
         if camera not in self.cameras:
             self.cameras[camera] = store.write_camera(self.target, len(self.cameras), camera)
         if self.file.task == LANDING and picture.position_m is None:
             raise row.error("x_m, y_m, z_m are empty; landing needs them")
+        flat_field, named = None, row.texts.get("flat_field", self.file.detector.flat_field)
+        if named is not None:
+            path = self.source / named
+            if path not in self.flat_fields:
+                response, file = read_flat_field(path), f"{len(self.flat_fields):06d}.npy"
+                flat_field = store.write_file(
+                    self.target, "flat_fields", file, lambda path: np.save(path, response, allow_pickle=False)
+                )
+                self.flat_fields[path] = flat_field, response.shape
+            flat_field, shape = self.flat_fields[path]
+            if shape != counts.shape:
+                raise row.error(f"{path}: has {shape[1]} x {shape[0]} pixels; {row.texts['file']} has others")
         return store.StoredPicture(
             source=row.texts["file"],
             size=camera.size,
-            counts=store.write_file(
-                self.target, "pictures", f"{name}.png", lambda path: write_picture(path, picture.counts)
-            ),
+            counts=store.write_file(self.target, "pictures", f"{name}.png", lambda path: write_picture(path, counts)),
             camera=self.cameras[camera],
-            flat_field=self._store_flat_field(row, picture.counts),
+            flat_field=flat_field,
             time_s=picture.time_s,
             exposure_s=row.numbers.get("exposure_s", self.file.detector.exposure_s),
             world_from_body_xyzw=_quaternion(picture.attitude),
@@ -274,46 +265,14 @@ class _FolderReader:
             altitude_time_s=row.numbers.get("altitude_time_s"),
         )
 
-    def _store_flat_field(self, row: PictureRow, counts: UInt16[np.ndarray, "rows columns"]) -> store.StoredFile | None:
-        named = row.texts.get("flat_field", self.file.detector.flat_field)
-        if named is None:
-            return None
-        path = self.source / named
-        if path not in self.flat_fields:
-            response = read_flat_field(path)
-            name = f"{len(self.flat_fields):06d}.npy"
-            stored = store.write_file(
-                self.target, "flat_fields", name, lambda path: np.save(path, response, allow_pickle=False)
-            )
-            self.flat_fields[path] = stored, response.shape
-        stored, shape = self.flat_fields[path]
-        if shape != counts.shape:
-            raise row.error(f"{path}: has {shape[1]} x {shape[0]} pixels; {row.texts['file']} has others")
-        return stored
-
-    def _interval_velocities(self, pictures: Sequence[_Picture]) -> list[store.Vector]:
-        """Return the mean velocities between the pictures: the inertial unit's, or by the measured positions."""
-        velocities = []
-        for before, after in itertools.pairwise(pictures):
-            stated = after.row.vector("vx_m_s", "vy_m_s", "vz_m_s")
-            if stated is not None:
-                velocities.append(_vector(self._to_world(after.row, stated)))
-            elif before.position_m is not None and after.position_m is not None:
-                velocities.append(_vector((after.position_m - before.position_m) / (after.time_s - before.time_s)))
-            else:
-                raise after.row.error("neither vx_m_s to vz_m_s nor positions are given; velocity needs them")
-        return velocities
-
-    def _sun_direction(self, row: PictureRow) -> store.Vector:
-        angles, sun = row.vector("sun_azimuth_deg", "sun_elevation_deg"), self.file.sun
-        if angles is not None:
-            azimuth, elevation = (float(angle) for angle in angles)
-            if not 0.0 < elevation <= 90.0:
-                raise row.error(f"sun_elevation_deg is {elevation:g}; allowed: above 0, at most 90")
-            sun = SunTable.model_construct(azimuth_deg=azimuth, elevation_deg=elevation)
-        if sun is None:
-            raise row.error(f"no sun: neither sun_azimuth_deg and sun_elevation_deg nor {INGEST_FILE}'s [sun]")
-        return _vector(sun.direction)
+    def _mean_velocity(self, before: _Picture, after: _Picture) -> store.Vector:
+        """Return the mean velocity between two pictures: the inertial unit's, or by the measured positions."""
+        stated = after.row.vector("vx_m_s", "vy_m_s", "vz_m_s")
+        if stated is not None:
+            return _vector(self._to_world(after.row, stated))
+        if before.position_m is None or after.position_m is None:
+            raise after.row.error("neither vx_m_s to vz_m_s nor positions are given; velocity needs them")
+        return _vector((after.position_m - before.position_m) / (after.time_s - before.time_s))
 
     def _apriori_site(self, picture: _Picture, slant_range_m: float | None) -> store.Vector:
         """Return the a-priori site: as stated, or the ground on the first picture's optical axis."""
@@ -325,17 +284,27 @@ class _FolderReader:
         ground = picture.camera.c + slant_range_m * picture.camera.a
         return _vector(picture.position_m + picture.attitude.apply(ground))
 
-    def _truth(self, pictures: Sequence[_Picture]) -> store.StoredTruth:
+    def _read_truth(self, pictures: Sequence[_Picture]) -> store.StoredTruth:
+        """Read true poses and, of a descent, the true mean velocity from the second to the third picture."""
         rows = [one.row for one in pictures]
         poses = [self._true_pose(row) for row in rows]
-        velocity = self._true_velocity(pictures, poses) if self.file.task == VELOCITY else None
+        last, velocity = pictures[-1], None
+        if self.file.task == VELOCITY:
+            stated = last.row.vector("true_vx_m_s", "true_vy_m_s")
+            before, after = poses[-2:]
+            mean = None
+            if stated is not None:
+                mean = self._to_world(last.row, np.array([*stated, 0.0]))
+            elif before is not None and after is not None:
+                mean = (after[1] - before[1]) / (last.time_s - pictures[-2].time_s)
+            velocity = None if mean is None else (float(mean[0]), float(mean[1]))
         has_pose = [
             row.rotation("true_") is not None and pose is not None for row, pose in zip(rows, poses, strict=True)
         ]
-        if any(has_pose) and not all(has_pose):
-            raise rows[0].error("some pictures have a true pose and some have none")
-        if not all(has_pose):
+        if not any(has_pose):
             return store.StoredTruth(velocity_m_s=velocity)
+        if not all(has_pose):
+            raise rows[0].error("some pictures have a true pose and some have none")
         known = tuple((_vector(position), _quaternion(attitude)) for attitude, position in filter(None, poses))
         return store.StoredTruth(velocity_m_s=velocity, poses=known)
 
@@ -350,27 +319,12 @@ class _FolderReader:
         attitude, position = self._body_pose(row, rotation, recorded)
         return None if position is None else (attitude, position)
 
-    def _true_velocity(
-        self, pictures: Sequence[_Picture], poses: Sequence[tuple[Rotation, Float64[np.ndarray, "3"]] | None]
-    ) -> tuple[float, float] | None:
-        """Return the mean velocity from the second to the third picture, as stated or by true positions."""
-        last = pictures[-1]
-        stated = last.row.vector("true_vx_m_s", "true_vy_m_s")
-        if stated is not None:
-            east, north, _ = self._to_world(last.row, np.array([stated[0], stated[1], 0.0]))
-            return float(east), float(north)
-        before, after = poses[-2:]
-        if before is None or after is None:
-            return None
-        velocity = (after[1] - before[1]) / (last.time_s - pictures[-2].time_s)
-        return float(velocity[0]), float(velocity[1])
-
 
 def _vector(values: Float64[np.ndarray, "3"]) -> store.Vector:
-    x, y, z = (float(value) for value in values)
+    x, y, z = values.tolist()
     return x, y, z
 
 
 def _quaternion(rotation: Rotation) -> store.Quaternion:
-    x, y, z, w = (float(value) for value in rotation.as_quat())
+    x, y, z, w = rotation.as_quat().tolist()
     return x, y, z, w

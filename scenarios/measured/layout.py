@@ -1,16 +1,22 @@
-"""Read `ingest.toml` and `pictures.csv`, the inputs of `marsyard ingest` (docs/real-pictures.md)."""
+"""Read the inputs of `marsyard ingest` (docs/real-pictures.md): `ingest.toml`, `pictures.csv`, pictures, flat fields.
+
+Pictures are PNG, PGM and TIFF of one band with 8 or 16 bits.
+"""
 
 from __future__ import annotations
 
 import itertools
+import re
+import struct
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
+import cv2
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt16
 from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
@@ -23,7 +29,7 @@ from marsyard.scenarios.user_files import (
     listed,
     read_lines,
 )
-from marsyard.sim.files import check_regular
+from marsyard.sim.files import check_regular, npy_header, open_regular
 from marsyard.sim.frames import direction
 from marsyard.sim.parameters import Parameters
 
@@ -124,20 +130,17 @@ def read_ingest_file(folder: Path) -> IngestFile:
     try:
         file = IngestFile.model_validate(stated)
     except ValidationError as error:
-        problems = (_key_problem(dict(one)) for one in error.errors(include_url=False))
-        raise IngestError("\n".join(f"{path}: {problem}" for problem in problems)) from error
+        kinds = {"missing": "required, but missing", "extra_forbidden": "unknown key; see docs/real-pictures.md"}
+        problems = []
+        for one in error.errors(include_url=False):
+            message = f"{one['msg'].removeprefix('Value error, ')}, got {one['input']!r}"
+            problems.append(f"{path}: {'.'.join(map(str, one['loc']))}: {kinds.get(one['type'], message)}")
+        raise IngestError("\n".join(problems)) from error
     if file.camera.placed and file.poses is not None and file.poses.attitude_of != "body":
         raise IngestError(
             f'{path}: camera.placed: the file places the camera in the body, so poses.attitude_of must be "body"'
         )
     return file
-
-
-def _key_problem(detail: Mapping[str, Any]) -> str:
-    key = ".".join(str(part) for part in detail["loc"])
-    kinds = {"missing": "required, but missing", "extra_forbidden": "unknown key; see docs/real-pictures.md"}
-    message = str(detail["msg"]).removeprefix("Value error, ")
-    return f"{key}: " + kinds.get(detail["type"], f"{message}, got {detail['input']!r}")
 
 
 class Column(NamedTuple):
@@ -172,6 +175,14 @@ _COLUMN_GROUPS = (
 _QUATERNION_TOLERANCE = 5e-3
 #: More rows would take days to match.
 _MAX_ROWS = 200_000
+#: Bytes that hold the header of a PGM file with comments.
+_HEADER_BYTES = 4096
+#: Maximum number of pixels along a side of a flat field.
+_MAX_SIDE = 16384
+#: Maximum relative response: noise makes that of the brightest pixel a little more than 1.
+_MAX_RESPONSE = 1.5
+_PGM = re.compile(rb"\AP[25]\s+(?:#[^\n]*\n\s*)*(\d+)\s+(?:#[^\n]*\n\s*)*(\d+)\s")
+_ALLOWED = "allowed: PNG, PGM or TIFF of one band with 8 or 16 bits, or a PDS3 product"
 
 
 @dataclass(frozen=True)
@@ -219,7 +230,25 @@ def read_table(path: Path, task: str) -> dict[str, list[PictureRow]]:
         else:
             cases.setdefault(row.texts["case"], []).append(row)
     if not problems:
-        problems = [problem for name, rows in cases.items() for problem in _case_problems(name, rows, task, required)]
+        low, high = PICTURES[task]
+        number = str(low) if low == high else f"{low} to {high}"
+        for name, rows in cases.items():
+            if not low <= len(rows) <= high:
+                problems.append(
+                    f"line {rows[0].line}: case '{name}' has {len(rows)} pictures; allowed for {task}: {number}"
+                )
+            for before, row in itertools.pairwise(rows):
+                first, second = before.numbers.get("time_s"), row.numbers.get("time_s")
+                if first is not None and second is not None and second <= first:
+                    problems.append(
+                        f"line {row.line}: time goes from {first:g} to {second:g} s; allowed: times that increase"
+                    )
+            problems += [
+                f"line {row.line}: {column} is empty"
+                for row in rows
+                for column in required
+                if column not in row.texts and column not in row.numbers
+            ]
         if not cases:
             problems = ["it has no rows; at least one case is needed"]
     if problems:
@@ -249,16 +278,80 @@ def _parse_row(line: int, header: Sequence[str], cells: Sequence[str]) -> Pictur
     return row
 
 
-def _case_problems(name: str, rows: Sequence[PictureRow], task: str, required: Sequence[str]) -> Iterator[str]:
-    low, high = PICTURES[task]
-    if not low <= len(rows) <= high:
-        allowed = str(low) if low == high else f"{low} to {high}"
-        yield f"line {rows[0].line}: case '{name}' has {len(rows)} pictures; allowed for {task}: {allowed}"
-    for before, row in itertools.pairwise(rows):
-        first, second = before.numbers.get("time_s"), row.numbers.get("time_s")
-        if first is not None and second is not None and second <= first:
-            yield f"line {row.line}: time goes from {first:g} to {second:g} s; allowed: times that increase"
-    for row in rows:
-        for column in required:
-            if column not in row.texts and column not in row.numbers:
-                yield f"line {row.line}: {column} is empty"
+def file_head(path: Path) -> bytes:
+    """Read the file's first bytes. Raises IngestError where the file is missing, empty or unreadable."""
+    try:
+        with open_regular(path) as file:
+            head = file.read(_HEADER_BYTES)
+    except OSError as error:
+        raise IngestError(f"{path}: {error.strerror or error}") from error
+    if not head:
+        raise IngestError(f"{path}: is empty (0 bytes)")
+    return head
+
+
+def read_counts(path: Path, size: tuple[int, int]) -> UInt16[np.ndarray, "rows columns"]:
+    """Decode a picture after its header has confirmed the size (columns, rows).
+
+    Raises IngestError where the file is unreadable, or of another format or size.
+    """
+    columns, rows = picture_size(path)
+    if (columns, rows) != size:
+        raise IngestError(
+            f"{path}: has {columns} x {rows} pixels; its camera has {size[0]} x {size[1]} (columns x rows)"
+        )
+    counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if counts is None:
+        raise IngestError(f"{path}: cannot be decoded; {_ALLOWED}")
+    if counts.ndim != 2:
+        raise IngestError(f"{path}: has {counts.shape[2]} bands; {_ALLOWED}")
+    if counts.dtype not in (np.uint8, np.uint16):
+        raise IngestError(f"{path}: its counts are {counts.dtype}; {_ALLOWED}")
+    return np.asarray(counts, dtype=np.uint16)
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """Read (columns, rows) from the header. Raises IngestError for other formats."""
+    head = file_head(path)
+    if head.startswith(b"\x89PNG\r\n\x1a\n") and len(head) >= 24:
+        return struct.unpack(">II", head[16:24])
+    pgm = _PGM.match(head)
+    if pgm is not None:
+        return int(pgm[1]), int(pgm[2])
+    if head[:4] in (b"II*\0", b"MM\0*"):
+        order, extents = "<" if head.startswith(b"II") else ">", dict[int, int]()
+        try:
+            with path.open("rb") as file:
+                file.seek(4)
+                file.seek(struct.unpack(f"{order}I", file.read(4))[0])
+                (entries,) = struct.unpack(f"{order}H", file.read(2))
+                for _ in range(entries):  # of the first directory; tags 256 and 257: width and length, 16 or 32 bits
+                    tag, kind, _count, value = struct.unpack(f"{order}HHI4s", file.read(12))
+                    if tag in (256, 257):
+                        (extents[tag],) = struct.unpack_from(f"{order}{'H' if kind == 3 else 'I'}", value)
+        except (OSError, struct.error) as error:
+            raise IngestError(f"{path}: is a damaged TIFF: {error}") from error
+        if len(extents) != 2:
+            raise IngestError(f"{path}: is a damaged TIFF: its first directory states no size")
+        return extents[256], extents[257]
+    raise IngestError(f"{path}: is no picture that is read; {_ALLOWED}")
+
+
+def read_flat_field(path: Path) -> Float64[np.ndarray, "rows columns"]:
+    """Read a relative response: an array as it is, a picture divided by its largest count. Raises IngestError."""
+    head = file_head(path)
+    try:
+        if head.startswith(b"\x93NUMPY"):
+            with path.open("rb") as file:
+                shape, kind = npy_header(file)
+            if len(shape) != 2 or max(shape) > _MAX_SIDE or kind.kind not in "iuf":
+                raise ValueError(f"holds an array of shape {shape} and type {kind}")
+            response = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
+        else:
+            counts = read_counts(path, picture_size(path))
+            response = counts / max(int(counts.max()), 1)
+    except (ValueError, EOFError) as error:
+        raise IngestError(f"{path}: is no flat field: {error}") from error
+    if not np.all(np.isfinite(response)) or response.min() <= 0.0 or response.max() > _MAX_RESPONSE:
+        raise IngestError(f"{path}: is no flat field; allowed: two dimensions, numbers above 0, about 1 at the largest")
+    return response

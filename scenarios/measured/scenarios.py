@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
@@ -153,7 +154,17 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
         images = store.load_images(p.cases, p.case)
         measurements = store.descent_measurements(p.case, images)
         matches = match_images(images)
-        conditions = {**_case_row(p, images), **_descent_conditions(p.case, measurements)}
+        axes = [
+            image.camera.moved(RigidTransform.from_rotation(attitude.world_from_body)).boresight()
+            for image, attitude in zip(images, measurements.attitudes, strict=True)
+        ]
+        conditions: dict[str, Scalar] = {
+            **_case_row(p, images),
+            **{f"altitude_{number}_m": one.altitude_m for number, one in enumerate(measurements.altitudes, start=1)},
+            "off_nadir_max_deg": max(float(np.degrees(np.arccos(np.clip(-axis[2], -1.0, 1.0)))) for axis in axes),
+            "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(measurements.sun_direction[2], -1.0, 1.0)))),
+            "truth_known": p.case.truth.velocity_m_s is not None,
+        }
         record_conditions(conditions)
         attempts = _run_algorithms(
             p, p.dimes, measurements, lambda answer: check_last_interval(answer, measurements), streams.case
@@ -165,7 +176,17 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
             attempt = attempts[algorithm]
             velocity = _velocity(attempt.answer)
             pairs = compare_with_poses(images, matches, _descent_poses(p.case, measurements, velocity))
-            row = _velocity_answer_row(attempt.answer, measurements)
+            details = None if attempt.answer is None else attempt.answer.details
+            chosen = details.chosen if isinstance(details, DimesDetails) else None
+            reported = np.full(2, np.nan) if velocity is None else velocity
+            row: dict[str, Scalar] = {
+                "velocity_estimated_x_m_s": float(reported[0]),
+                "velocity_estimated_y_m_s": float(reported[1]),
+                # contains the unknown error of the inertial velocity
+                "beside_inertial_m_s": _distance(velocity, measurements.interval_velocities_m_s[1, :2]),
+                # does not: the change of velocity from the first pair to the second against the inertial unit's
+                "pair_discrepancy_m_s": NAN if chosen is None else chosen.discrepancy_m_s,
+            }
             if true_velocity is not None:
                 row |= {**velocity_row("velocity", velocity, truth), **consistency_row(attempt.answer, truth)}
             if algorithm != p.algorithm:
@@ -178,9 +199,10 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
                     true_velocity_m_s=None if true_velocity is None else truth,
                 )
                 row |= scored(p.scores, case, {*row, *conditions})
-            arrays = velocity_products([image.counts for image in images], attempt.answer, truth)
-            products = {**arrays, **agreement_products(images, pairs)}
-            return algorithm_result(attempt, velocity is not None, row, products)
+            products = velocity_products([image.counts for image in images], attempt.answer, truth)
+            return algorithm_result(
+                attempt, velocity is not None, row, {**products, **agreement_products(images, pairs)}
+            )
 
         return case_result(p.algorithms, judge, conditions)
 
@@ -233,12 +255,10 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
 def _run_algorithms(
     p: AlgorithmSelection, options: Any, measurements: Any, check: Callable[[object], Answer], case: int
 ) -> Mapping[str, AlgorithmRun[Answer]]:
-    def run(spec: str) -> AlgorithmRun[Answer]:
-        return run_algorithm_on_copy(
-            lambda given: p.task.make(spec, options, p.executable, case).estimate(given), check, measurements
-        )
+    def estimate(spec: str, given: Any) -> Any:
+        return p.task.make(spec, options, p.executable, case).estimate(given)
 
-    return {spec: run(spec) for spec in p.algorithms}
+    return {spec: run_algorithm_on_copy(partial(estimate, spec), check, measurements) for spec in p.algorithms}
 
 
 def _case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[str, Scalar]:
@@ -286,46 +306,12 @@ def _descent_poses(
     if estimated is not None:
         velocities[:, :2] += estimated - velocities[1, :2]
     times = np.array([image.time_s for image in measurements.images])
-    steps = velocities * np.diff(times)[:, None]
-    positions = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    positions = np.concatenate([np.zeros((1, 3)), np.cumsum(velocities * np.diff(times)[:, None], axis=0)])
     measured = [picture.position_m for picture in case.pictures]
-    if all(position is not None for position in measured):
+    if None not in measured:
         positions = np.array(measured, dtype=np.float64)
-    return [
-        rigid(one.world_from_body, position) for one, position in zip(measurements.attitudes, positions, strict=True)
-    ]
-
-
-def _velocity_answer_row(estimate: VelocityEstimate | None, measurements: DescentMeasurements) -> dict[str, Scalar]:
-    """Return the columns of an answer and its difference from the inertial unit's velocity.
-
-    `beside_inertial_m_s` contains the unknown error of the inertial velocity. `pair_discrepancy_m_s` does not: it
-    compares the change of velocity from the first pair of pictures to the second with the inertial unit's; only DIMES
-    reports it.
-    """
-    velocity = _velocity(estimate)
-    details = None if estimate is None else estimate.details
-    chosen = details.chosen if isinstance(details, DimesDetails) else None
-    reported = np.full(2, np.nan) if velocity is None else velocity
-    return {
-        "velocity_estimated_x_m_s": float(reported[0]),
-        "velocity_estimated_y_m_s": float(reported[1]),
-        "beside_inertial_m_s": _distance(velocity, measurements.interval_velocities_m_s[1, :2]),
-        "pair_discrepancy_m_s": NAN if chosen is None else chosen.discrepancy_m_s,
-    }
-
-
-def _descent_conditions(case: store.StoredCase, measurements: DescentMeasurements) -> dict[str, Scalar]:
-    axes = [
-        image.camera.moved(RigidTransform.from_rotation(attitude.world_from_body)).boresight()
-        for image, attitude in zip(measurements.images, measurements.attitudes, strict=True)
-    ]
-    return {
-        **{f"altitude_{number}_m": one.altitude_m for number, one in enumerate(measurements.altitudes, start=1)},
-        "off_nadir_max_deg": max(float(np.degrees(np.arccos(np.clip(-axis[2], -1.0, 1.0)))) for axis in axes),
-        "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(measurements.sun_direction[2], -1.0, 1.0)))),
-        "truth_known": case.truth.velocity_m_s is not None,
-    }
+    rotations = [one.world_from_body for one in measurements.attitudes]
+    return [rigid(rotation, position) for rotation, position in zip(rotations, positions, strict=True)]
 
 
 def _site_answer_row(

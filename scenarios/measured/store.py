@@ -186,41 +186,30 @@ def _unchanged(folder: Path, named: StoredFile) -> Path:
 
 def load_images(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]:
     """Load the pictures of a case with their cameras in the body frame. Raises ValueError where a file has changed."""
-    detector, folder = cases.stored.detector, Path(cases.file).parent
-    images = []
+    folder, images = Path(cases.file).parent, []
     for picture in case.pictures:
         counts = read_picture(_unchanged(folder, picture.counts))
         flat = picture.flat_field
         calibration = DetectorCalibration(
             flat_field=np.ones(counts.shape) if flat is None else np.load(_unchanged(folder, flat), allow_pickle=False),
             exposure_s=picture.exposure_s,
-            transfer_row_s=detector.transfer_row_s,
-            clear_row_s=detector.clear_row_s,
-            rows_summed=detector.rows_summed,
-            offset_dn=detector.offset_dn,
-            full_scale_dn=detector.full_scale_dn,
+            **cases.stored.detector.model_dump(),
         )
-        images.append(
-            DetectorImage(counts, picture.time_s, read_cahvor(_unchanged(folder, picture.camera)), calibration)
-        )
+        camera = read_cahvor(_unchanged(folder, picture.camera))
+        images.append(DetectorImage(counts, picture.time_s, camera, calibration))
     return tuple(images)
 
 
 def descent_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) -> DescentMeasurements:
     """Return the inputs of a velocity estimator."""
-    altitudes = [
-        AltitudeMeasurement(
-            math.nan if one.altitude_m is None else one.altitude_m,
-            one.time_s if one.altitude_time_s is None else one.altitude_time_s,
-        )
-        for one in case.pictures
-    ]
+    attitudes, altitudes = [], []
+    for one in case.pictures:
+        attitudes.append(AttitudeMeasurement(Rotation.from_quat(np.array(one.world_from_body_xyzw)), one.time_s))
+        time_s = one.time_s if one.altitude_time_s is None else one.altitude_time_s
+        altitudes.append(AltitudeMeasurement(math.nan if one.altitude_m is None else one.altitude_m, time_s))
     return DescentMeasurements(
         images=images,
-        attitudes=tuple(
-            AttitudeMeasurement(Rotation.from_quat(np.array(one.world_from_body_xyzw)), one.time_s)
-            for one in case.pictures
-        ),
+        attitudes=tuple(attitudes),
         altitudes=tuple(altitudes),
         interval_velocities_m_s=np.array(case.interval_velocities_m_s, dtype=np.float64),
         sun_direction=np.array(case.sun_direction, dtype=np.float64),

@@ -212,7 +212,7 @@ def test_what_a_tracker_is_given_comes_back_as_it_was(tmp_path: Path) -> None:
     told = aim.aim(trackers.pose(0.0), mast)
     assert told is not None
     turned = RigidTransform.from_components([1.0, 2.0, 3.0], Rotation.from_rotvec([0.1, -0.2, 0.3]))
-    stop = replace(trackers.taken(told, trackers.pose(0.0)), world_from_rover=turned)
+    stop = replace(trackers.take_pictures(told, trackers.pose(0.0)), world_from_rover=turned)
     write_stop(tmp_path, stop)
     back = read_stop(tmp_path, known)
     np.testing.assert_array_equal(back.left.counts, stop.left.counts)

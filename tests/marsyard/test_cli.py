@@ -147,7 +147,7 @@ def test_a_killed_campaign_is_reported_and_resumed(tmp_path: Path, marsyard: Com
     before = (tmp_path / "run" / "campaign.json").read_bytes()
     reported = marsyard("report", tmp_path / "run")
     assert (reported.status, reported.err) == (3, "")
-    said = re.search(r"INCOMPLETE: (\d+) of 40 cases; it was killed; to go on: marsyard resume (\S+)", reported.out)
+    said = re.search(r"INCOMPLETE: (\d+) of 40 cases; it was killed; to continue: marsyard resume (\S+)", reported.out)
     assert said
     assert said[2] == str(tmp_path / "run")
     assert 0 < int(said[1]) == len(pd.read_parquet(tmp_path / "run" / "cases.parquet")) < 40

@@ -14,7 +14,7 @@ import pytest
 from marsyard.cli import app as cli
 from marsyard.cli import gallery as gallery_command
 from marsyard.cli.gallery import PAGE, PLATES, SHEET, SHEET_BYTES, SvgFigure, contact_sheet, displayed, write_gallery
-from marsyard.cli.render import Shot
+from marsyard.cli.pictures import Shot
 from marsyard.sim.sensor import PRESETS
 from marsyard.sim.terrain import sites
 

@@ -13,7 +13,7 @@ import pytest
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli import app as cli
-from marsyard.cli import nightly as nightly_command
+from marsyard.cli import nightly_plan
 from marsyard.cli.nightly_plan import PLAN_FILE, definition_of, night_seed, read_plan
 from tests.campaigns.fake_campaign import DISPERSIONS, REQUIREMENT, write_campaign
 
@@ -84,7 +84,7 @@ def test_a_killed_night_is_visible_and_compared_with_nothing(
         raise Killed
 
     with monkeypatch.context() as now:
-        now.setattr(nightly_command, "_run_one", kill)
+        now.setattr(nightly_plan, "run_planned", kill)
         with pytest.raises(Killed):
             nightly()
     assert (tmp_path / "out" / "nightly.md").read_text().startswith("# Night 1: RUNNING")
@@ -94,7 +94,7 @@ def test_a_killed_night_is_visible_and_compared_with_nothing(
     assert "was interrupted" in page
     assert "No figure has a history" in page
     with monkeypatch.context() as now:
-        now.setattr(nightly_command, "_run_one", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        now.setattr(nightly_plan, "run_planned", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         status, page = nightly()
     assert (status, page.splitlines()[0]) == (130, "# Night 3: INTERRUPTED")
 

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.cli import app as cli
-from marsyard.cli.render import ENDINGS
+from marsyard.cli.pictures import ENDINGS
 from marsyard.sim.camera import read_cahvor
 
 Command = Callable[..., tuple[int, str]]

@@ -142,7 +142,7 @@ def test_draws_as_table_json_and_figure(campaign: Path, tmp_path: Path) -> None:
     [
         (["--draw", "0"], "--draw 0: the campaign has 25 cases; allowed: 1 to 25"),
         (["--draw", "26"], "allowed: 1 to 25"),
-        (["--figure", "x.svg"], "say of how many cases with --draw N"),
+        (["--figure", "x.svg"], "give the number of cases with --draw N"),
         (["--draw", "3", "--figure", "x.pdf"], "--figure x.pdf: unknown kind of picture; allowed: .svg, .png"),
         (["--draw", "1", "--figure", "x.png"], "nothing is drawn in 1 case"),
         (["--draw", "3", "--figure", "/no/x.png"], "/no/x.png: cannot be written"),

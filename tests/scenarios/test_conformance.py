@@ -257,4 +257,4 @@ def test_inputs_are_what_instruments_deliver() -> None:
     assert abs(landing.apriori_site_world[2]) < 1e-9
     blank = inputs.blanked(descent, inputs.BLANKS["saturated"])
     assert {int(one.counts.min()) for one in blank.images} == {4095}
-    assert trackers.taken(trackers._box_ahead(), trackers.pose(0.0)).left.counts.std() > 100
+    assert trackers.take_pictures(trackers.aim_ahead(), trackers.pose(0.0)).left.counts.std() > 100

@@ -13,9 +13,16 @@ import pytest
 
 from marsyard import scenarios
 from marsyard.algorithms.interface import VelocityOutcome
-from marsyard.scenarios.fieldtest.ephemeris import sun_direction
 from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters
-from marsyard.scenarios.fieldtest.run import ElevationModel, Run, RunKey, field_camera, simulate_run
+from marsyard.scenarios.fieldtest.run import (
+    Category,
+    ElevationModel,
+    Run,
+    RunKey,
+    field_camera,
+    simulate_run,
+    sun_direction,
+)
 from marsyard.scenarios.fieldtest.scenario import (
     FieldTestScenario,
     build_start_scene,
@@ -24,7 +31,6 @@ from marsyard.scenarios.fieldtest.scenario import (
     scene_at,
     sun_at,
 )
-from marsyard.scenarios.fieldtest.triples import Category
 from marsyard.scenarios.optics import camera_optics
 from marsyard.scenarios.parts import ScoredFlight
 from marsyard.scenarios.views import Eye, site_scene

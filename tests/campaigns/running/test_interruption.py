@@ -63,7 +63,7 @@ def test_an_interrupted_campaign_keeps_its_rows(campaign_file: CampaignFile, tmp
     process.send_signal(kind)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 130
-    assert re.search(rb"interrupted; the rows so far are in \S+ \(\d+ of 500\)\. To go on: marsyard resume ", errors)
+    assert re.search(rb"interrupted; the rows so far are in \S+ \(\d+ of 500\)\. To continue: marsyard resume ", errors)
     assert b"Traceback" not in errors
     stored = record.read(tmp_path / "run")
     assert stored["state"] == "interrupted"
