@@ -153,6 +153,7 @@ def replay(
     from marsyard.campaigns.running.replay import replay as run_again
     from marsyard.campaigns.store.products import (
         case_directory,
+        pack_products,
         replaced_files,
         unpack_products,
         write_packed,
