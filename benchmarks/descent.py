@@ -42,7 +42,7 @@ def case(repeats: int) -> list[Figure]:
 
     def run_next() -> None:
         number = next(numbers)
-        parameters = campaign.with_values({**campaign.draws(number), "place.terrain": 0})
+        parameters = campaign.with_values({**campaign.draws(number), "location.terrain": 0})
         campaign.scenario.run(parameters, campaign.streams(number))
 
     return [

@@ -56,7 +56,7 @@ def recorded(campaign_name: str, cases: int) -> list[Descent]:
         Recorder.given.clear()
         row = campaign.scenario.run(campaign.parameters(case), campaign.streams(case)).row
         velocity = np.array([row["velocity_true_x_m_s"], row["velocity_true_y_m_s"]])
-        found.append(Descent(Recorder.given[0], velocity, bool(row["room"])))
+        found.append(Descent(Recorder.given[0], velocity, bool(row["feasible_overlap"])))
     return found
 
 

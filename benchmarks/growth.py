@@ -123,7 +123,7 @@ def _cases_over_terrains(samples: Sequence[int]) -> list[tuple[float, float]]:
     for count in samples:
         campaign = load_campaign("dimes-smoke", [f"terrain.samples={count}", "retain.showcase=none"])
         # one case again and again: cases differ by more than terrains do
-        parameters = campaign.with_values({**campaign.draws(0), "place.terrain": 0})
+        parameters = campaign.with_values({**campaign.draws(0), "location.terrain": 0})
         run = partial(campaign.scenario.run, parameters, campaign.streams(0))
         found.append((float(count**2), _minimum(run)))
     return found

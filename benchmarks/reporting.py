@@ -88,7 +88,7 @@ def _rows(rng: np.random.Generator, start: int, count: int) -> pa.Table:
         "case": np.arange(start, start + count),
         "outcome": np.where(valid, "VALID", causes),
         "answered": valid,
-        "room": np.ones(count, dtype=np.bool_),
+        "feasible_overlap": np.ones(count, dtype=np.bool_),
         "velocity_error_m_s": np.hypot(*error.T),
         "velocity_error_x_m_s": error[:, 0],
         "velocity_error_y_m_s": error[:, 1],

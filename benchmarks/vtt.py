@@ -102,7 +102,7 @@ def runs(repeats: int) -> list[Figure]:
         "camera": {"preset": "research-navcam"},
         "target": {"diameter_m": 0.9, "shape": 2, "yaw_deg": 74.0, "across": 0.1},
         "sun": {"azimuth_deg": 260.0, "elevation_deg": 45.0},
-        "legs": [{"motion": "approach", "step_share": 0.1, "goal_m": 2.0}],
+        "legs": [{"motion": "approach", "step_fraction": 0.1, "goal_m": 2.0}],
     }
     parameters = RoverScenarioParameters.model_validate(of_run)
     taken = core_seconds(lambda: run_case(parameters, Streams(1, "benchmark", 0)), repeats)

@@ -16,8 +16,8 @@ from marsyard.sim.sensor.presets import preset
 mpl.rcParams["svg.hashsalt"] = "marsyard"
 INCIDENCE_DEG = 30.0
 LAWS = {
-    "Lambert": Photometry(lunar_share=0.0, surge_amplitude=0.0),
-    "Lommel-Seeliger": Photometry(lunar_share=1.0, surge_amplitude=0.0),
+    "Lambert": Photometry(lunar_fraction=0.0, surge_amplitude=0.0),
+    "Lommel-Seeliger": Photometry(lunar_fraction=1.0, surge_amplitude=0.0),
     "Lunar-Lambert, Mars": Photometry(surge_amplitude=0.0),
     "with the opposition surge": Photometry(),
 }
@@ -70,8 +70,8 @@ def light() -> Figure:
     axes = figure.subplots()
     for (name, law), style in zip(LAWS.items(), ("-", "--", "-.", ":"), strict=True):
         surge = 1.0 + law.surge_amplitude / (1.0 + np.tan(phase / 2.0) / law.surge_width)
-        lunar = 2.0 * law.lunar_share * np.cos(incidence) / (np.cos(incidence) + np.cos(emission))
-        lambert = (1.0 - law.lunar_share) * np.cos(incidence)
+        lunar = 2.0 * law.lunar_fraction * np.cos(incidence) / (np.cos(incidence) + np.cos(emission))
+        lambert = (1.0 - law.lunar_fraction) * np.cos(incidence)
         axes.plot(np.degrees(emission), law.normalisation() * surge * (lunar + lambert), style, label=name)
     axes.axvline(INCIDENCE_DEG, color="0.7", linewidth=0.8)
     axes.set(xlabel="emission angle towards the sun (deg); the line: sun behind the camera", ylabel="I/F over albedo")

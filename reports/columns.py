@@ -26,7 +26,7 @@ _BOOKKEEPING = re.compile(
 #: Prefixes of the conditions that come first.
 _FIRST_DRIVERS = (
     "off_nadir_max", "attitude_rate_max", "altitude_1", "wind_speed", "horizontal_speed", "sun_elevation", "slip_mean",
-    "pose_error_share", "rock_diameter", "disparity_error_goal",
+    "pose_error_fraction", "rock_diameter", "disparity_error_goal",
 )  # fmt: skip
 _LARGEST_CATEGORY = 6
 

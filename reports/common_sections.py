@@ -31,7 +31,7 @@ from marsyard.reports.verdicts import judge_campaign
 from marsyard.reports.wording import NOTHING, coefficient, interval, note_text, number, p_text, percent, stated
 
 #: Column of true and false: whether the geometry leaves a feasible overlap for the algorithm.
-ROOM = "room"
+ROOM = "feasible_overlap"
 
 
 def answers_section(subject: Subject) -> Section | None:

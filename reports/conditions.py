@@ -22,7 +22,7 @@ from marsyard.reports.wording import note_text, number, percent, plain_value, st
 #: Prefixes of the condition columns in the order of the page; the first column of each prefix counts.
 CONDITIONS = (
     "altitude_1", "altitude_m", "attitude_rate_max", "off_nadir_max", "site", "terrain_kind", "relief", "rms_slope",
-    "sun_elevation", "horizontal_speed", "camera", "rock_diameter", "slip_mean", "tilt_max", "pose_error_share",
+    "sun_elevation", "horizontal_speed", "camera", "rock_diameter", "slip_mean", "tilt_max", "pose_error_fraction",
 )  # fmt: skip
 #: A column with up to so many values, and so many cases per value on average, gets a row for each value.
 MAX_KINDS, CASES_PER_KIND = 12, 10

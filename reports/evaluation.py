@@ -111,13 +111,13 @@ def next_look(verdicts: Sequence[Verdict], how: SamplingDesign, cases: int) -> i
     It may stop if every requirement is decided, or no result of the remaining cases can decide it. Requirements that
     are decided by the estimate do not count.
     """
-    if how.most_cases is None or cases >= how.most_cases:
+    if how.max_cases is None or cases >= how.max_cases:
         return None
-    left = how.most_cases - cases
-    share = planned_looks(how.most_cases)[-1].share
+    left = how.max_cases - cases
+    share = planned_looks(how.max_cases)[-1].share
     if not any(_open(verdict, left, share) for verdict in verdicts):
         return None
-    return next(look.cases for look in planned_looks(how.most_cases) if look.cases > cases)
+    return next(look.cases for look in planned_looks(how.max_cases) if look.cases > cases)
 
 
 def _open(verdict: Verdict, left: int, share: float) -> bool:

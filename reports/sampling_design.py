@@ -50,7 +50,7 @@ class SamplingDesign:
     design: `random`, `latin-hypercube` or `sobol`
     grids: paths of the parameters that were swept as a grid
     nominal: whether case 0 is the nominal one, without draws
-    most_cases: cases of the last look of a sequential campaign; else None
+    max_cases: cases of the last look of a sequential campaign; else None
     first_look: cases at the first verdict if cases were appended since; else None
     terrains: the terrains that the cases draw from; None if unknown
     """
@@ -58,7 +58,7 @@ class SamplingDesign:
     design: str = RANDOM
     grids: tuple[str, ...] = ()
     nominal: bool = False
-    most_cases: int | None = None
+    max_cases: int | None = None
     first_look: int | None = None
     terrains: TerrainSupply | None = None
 
@@ -86,11 +86,11 @@ class SamplingDesign:
 
     def risk_share(self, cases: int) -> float:
         """Fraction of the risk that a look at so many cases may spend."""
-        return 1.0 if self.most_cases is None else spent_fraction(planned_looks(self.most_cases), cases)
+        return 1.0 if self.max_cases is None else spent_fraction(planned_looks(self.max_cases), cases)
 
     def mask_first_look(self, frame: pd.DataFrame, chosen: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
         """Mask of the chosen rows of an earlier first look; None at the first look."""
-        if self.first_look is None or self.most_cases is not None or "case" not in frame:
+        if self.first_look is None or self.max_cases is not None or "case" not in frame:
             return None
         if not bool((frame["case"] >= self.first_look).any()):
             return None
@@ -112,14 +112,14 @@ def sampled(configuration: Mapping[str, Any]) -> SamplingDesign:
     design = table(configuration.get("design"))
     dispersions = table(configuration.get("dispersions"))
     grids = tuple(str(path) for path, one in dispersions.items() if table(one).get("distribution") == "grid")
-    most = configuration.get("most_cases")
-    most_cases = most if isinstance(most, int) and not isinstance(most, bool) and most > 0 else None
+    most = configuration.get("max_cases")
+    max_cases = most if isinstance(most, int) and not isinstance(most, bool) and most > 0 else None
     first = configuration.get("cases") if configuration.get("appended") else None
     return SamplingDesign(
         str(design.get("kind") or RANDOM),
         grids,
         design.get("nominal") is True,
-        most_cases,
+        max_cases,
         first if isinstance(first, int) else None,
         terrain_supply(configuration),
     )
@@ -128,7 +128,7 @@ def sampled(configuration: Mapping[str, Any]) -> SamplingDesign:
 def terrain_supply(configuration: Mapping[str, Any]) -> TerrainSupply | None:
     """Read the terrains from a configuration; None if unknown."""
     parameters, dispersions = table(configuration.get("parameters")), table(configuration.get("dispersions"))
-    for name in ("place", "world"):
+    for name in ("location", "world"):
         bank = table(parameters.get(name)).get("bank")
         if not isinstance(bank, int):
             continue

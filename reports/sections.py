@@ -198,7 +198,7 @@ def rerun_commands(run: StoredRun) -> list[str]:
     folder, words = run.command[0], list(run.command[1])
     blocks = run.configuration.get("appended")
     # a campaign that stops itself appends its blocks itself
-    added = [] if run.said("most_cases") or not isinstance(blocks, list | tuple) else blocks
+    added = [] if run.said("max_cases") or not isinstance(blocks, list | tuple) else blocks
     target = f"runs/{run.name}-again"
     if added:
         words += ["--out", target]

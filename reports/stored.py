@@ -10,6 +10,7 @@ from typing import Any
 
 import pandas as pd
 
+from marsyard.campaigns.definition.former_names import stored_columns_now, stored_configuration_now
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products
 from marsyard.reports.columns import axis_columns, driver_columns, primary_metric
@@ -96,6 +97,9 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
         record = dict(table(json.loads((directory / RECORD_FILE).read_text(encoding="utf-8"))))
     except (OSError, ValueError):
         record = {}
+    configuration = table(record.get("configuration"))
+    record["configuration"] = configuration = stored_configuration_now(configuration) if configuration else {}
+    record["requirements"] = configuration.get("requirements", record.get("requirements"))
     if requirements is not None:
         record["requirements"] = list(requirements)
     try:
@@ -110,18 +114,22 @@ def _frames(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.Dat
     import pyarrow.parquet as pq
 
     file = pq.ParquetFile(path)
+    stored = file.schema_arrow.names
+    renamed = stored_columns_now(stored, str(table(record.get("configuration")).get("scenario")))
     if file.metadata.num_rows <= LARGEST_WHOLE:
-        frame = _ordered(pd.read_parquet(path))
+        frame = _ordered(pd.read_parquet(path).rename(columns=renamed))
         return frame, frame
-    first = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas()
-    return _ordered(first), _ordered(pd.read_parquet(path, columns=_needed(file.schema_arrow.names, record, first)))
+    first = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas().rename(columns=renamed)
+    needed = _needed([renamed.get(name, name) for name in stored], record, first)
+    whole = pd.read_parquet(path, columns=[name for name in stored if renamed.get(name, name) in needed])
+    return _ordered(first), _ordered(whole.rename(columns=renamed))
 
 
 def _needed(names: Sequence[str], record: Mapping[str, Any], first: pd.DataFrame) -> list[str]:
     """Columns that are read for very many cases."""
     asked = record.get("requirements")
     stated = [one for one in asked if isinstance(one, Mapping)] if isinstance(asked, list) else []
-    wanted = {"case", "outcome", "answered", "terrain", "room", "error", "traceback"}
+    wanted = {"case", "outcome", "answered", "terrain", "feasible_overlap", "error", "traceback"}
     for one in stated:
         wanted.update(str(one.get("metric", "")).split(" + "))
         wanted.update(str(one.get("population", "")).split(" and "))

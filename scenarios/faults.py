@@ -45,7 +45,7 @@ class SizedFaults(Parameters):
         """Return the changed parameters of the detector by its tables; empty tables change nothing."""
         return {
             "optics": {"dust_discs": self.dust_discs} if self.dust_discs else {},
-            "defects": {"dead_share": self.bad_pixels, "hot_share": self.bad_pixels} if self.bad_pixels else {},
+            "defects": {"dead_fraction": self.bad_pixels, "hot_fraction": self.bad_pixels} if self.bad_pixels else {},
         }
 
 

@@ -81,13 +81,13 @@ def _answers_after_pictures(
 def stream_row(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]) -> dict[str, Scalar]:
     """Return the errors of a stream after each picture, NaN without a velocity; empty for other estimators.
 
-    `answered_after` is the number of pictures before the first velocity, 0 if there is none.
+    `pictures_before_answer` is the number of pictures before the first velocity, 0 if there is none.
     """
     errors = [float(np.hypot(*(velocity - true))) for _, velocity, true in _answers_after_pictures(estimate, truth)]
     if not errors:
         return {}
     first = next((number for number, error in enumerate(errors, start=1) if not np.isnan(error)), 0)
-    row: dict[str, Scalar] = {"stream_pictures": len(errors), "answered_after": first}
+    row: dict[str, Scalar] = {"stream_pictures": len(errors), "pictures_before_answer": first}
     return row | {f"velocity_error_after_{number}_m_s": error for number, error in enumerate(errors, start=1)}
 
 

@@ -74,7 +74,7 @@ class SiteGround:
         air = self.site.environment
         sky = air.sky_share(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
         return Photometry(
-            lunar_share=law.lunar_share,
+            lunar_fraction=law.lunar_fraction,
             surge_amplitude=law.surge_amplitude,
             surge_width=law.surge_width,
             sky_share=sky,

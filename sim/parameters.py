@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from marsyard.sim.renamed import current_key
 
 Positive = Annotated[float, Field(gt=0.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]
@@ -18,9 +20,19 @@ def bounded(low: float, high: float, description: str) -> Any:
 
 
 class Parameters(BaseModel):
-    """User parameters: unknown keys are errors, validated objects are immutable."""
+    """User parameters: unknown keys are errors, validated objects are immutable. Former names of keys are accepted."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _rename_former_keys(cls, given: Any) -> Any:
+        if not isinstance(given, Mapping) or cls.model_fields.keys() >= given.keys():
+            return given
+        return {
+            current_key(name, cls.model_fields, given) if isinstance(name, str) else name: value
+            for name, value in given.items()
+        }
 
 
 def merge_settings(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

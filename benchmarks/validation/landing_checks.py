@@ -57,7 +57,7 @@ def exact(site: str, rng: np.random.Generator) -> LandingScenarioParameters:
         {
             "site": site,
             "terrain": {"samples": 2048},
-            "place": {**BANK, "terrain": int(rng.integers(8)), "east_m": east, "north_m": north},
+            "location": {**BANK, "terrain": int(rng.integers(8)), "east_m": east, "north_m": north},
             "sun": {"azimuth_deg": rng.uniform(90.0, 270.0), "elevation_deg": rng.uniform(30.0, 65.0)},
             "detector": noise_free("xc-55").model_dump(),
             "flown": {
@@ -65,7 +65,7 @@ def exact(site: str, rng: np.random.Generator) -> LandingScenarioParameters:
                 "heading_deg": rng.uniform(0.0, 360.0),
                 "tilt_deg": rng.uniform(0.0, 5.0),
                 "tilt_towards_deg": rng.uniform(0.0, 360.0),
-                "climb_share": rng.normal(0.0, 0.01),
+                "climb_fraction": rng.normal(0.0, 0.01),
                 "roll_deg": roll,
                 "pitch_deg": pitch,
                 "yaw_deg": yaw,
@@ -107,7 +107,7 @@ def accuracy(quick: bool) -> Iterator[Measure]:
         tracks = float(np.median([float(row["tracks"]) for row in rows]))
         how = f"{where}, 8 to 15 m high, 0.2 of that apart, {tracks:.0f} tracks, scale and vertical exact"
         yield Measure("rotation's error, rms", _rms(rows, _value("rotation_error_deg")), "deg", bars[0], how)
-        moved = _rms(rows, _value("baseline_error_share"))
+        moved = _rms(rows, _value("baseline_error_fraction"))
         yield Measure("baseline's error, direction and length, over its length, rms", moved, "", bars[1], how)
         elevation = _rms(rows, lambda row: float(row.get("elevation_rms_m", np.nan)) / float(row["range_m"]))
         yield Measure("elevation's error over the height, rms", elevation, "", bars[2], how)

@@ -21,14 +21,14 @@ from marsyard.sim.render import CloudLayer, CloudParameters, DustySky, Photometr
 from marsyard.sim.terrain import Surface
 
 #: Brightness is then albedo times the cosine of incidence in the sun, and 0 in shadow.
-LAMBERT = Photometry(lunar_share=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
+LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
 FLAT_ALBEDO = 0.2
 FARTHEST_FROM_A_MAST_M = 40.0
 LAWS = {
-    "Lambert": Photometry(lunar_share=0.0, surge_amplitude=0.0),
+    "Lambert": Photometry(lunar_fraction=0.0, surge_amplitude=0.0),
     "Mars": Photometry(),
-    "dark lava": Photometry(lunar_share=0.6, surge_amplitude=0.9, surge_width=0.08),
-    "narrow surge": Photometry(lunar_share=1.0, surge_amplitude=1.5, surge_width=0.01),
+    "dark lava": Photometry(lunar_fraction=0.6, surge_amplitude=0.9, surge_width=0.08),
+    "narrow surge": Photometry(lunar_fraction=1.0, surge_amplitude=1.5, surge_width=0.01),
 }
 
 
@@ -40,7 +40,7 @@ def _flat(albedo: float = FLAT_ALBEDO) -> Surface:
 
 def run_opposition(quick: bool) -> Iterator[Measure]:
     """The peak's centre, found in the picture alone, against the point opposite the sun."""
-    law = Photometry(lunar_share=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
+    law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
     rng = np.random.default_rng(3)
     surface = _flat()
     for name, camera in cameras().items():
@@ -159,7 +159,7 @@ def _law(law: Photometry, cos_i: np.ndarray, cos_e: np.ndarray, cos_g: npt.Array
     """The law as `Photometry` states it, for unit albedo and K, written out again."""
     g = np.arccos(np.clip(cos_g, -1.0, 1.0))
     surge = 1.0 + law.surge_amplitude / (1.0 + np.tan(0.5 * g) / law.surge_width)
-    share = law.lunar_share
+    share = law.lunar_fraction
     return surge * (2.0 * share * cos_i / (cos_i + cos_e) + (1.0 - share) * cos_i)
 
 

@@ -29,7 +29,7 @@ DESCENT_PLACE = (1000.0, 1200.0)
 #: Where the large rock lies, its size, and how high the mast's camera stands.
 ROCK_PLACE, ROCK_DIAMETER_M, MAST_M = (50.0, 50.0), 2.5, 1.6
 #: Ground that is as bright as its albedo, from wherever it is seen.
-PAINT = Photometry(lunar_share=0.0, surge_amplitude=0.0, sky_share=0.0)
+PAINT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0)
 OVERHEAD = Sun(np.array([0.0, 0.0, 1.0]))
 
 
@@ -90,7 +90,7 @@ def level_pose(position: np.ndarray) -> RigidTransform:
 def law_of(where: Site) -> Photometry:
     given = where.photometry
     return Photometry(
-        lunar_share=given.lunar_share, surge_amplitude=given.surge_amplitude, surge_width=given.surge_width
+        lunar_fraction=given.lunar_fraction, surge_amplitude=given.surge_amplitude, surge_width=given.surge_width
     )
 
 

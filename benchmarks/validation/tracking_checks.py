@@ -91,7 +91,7 @@ def _lost(claim: str, lost: int, cases: int, how: str) -> Measure:
 
 
 def _sun_moved_deg(rows: list[dict[str, Scalar]]) -> float:
-    return float(np.median([float(row["sun_moved_deg"]) for row in rows]))
+    return float(np.median([float(row["sun_motion_deg"]) for row in rows]))
 
 
 def stereo(quick: bool) -> Iterator[Measure]:

@@ -22,6 +22,7 @@ from marsyard.campaigns.sampling.design import (
 from marsyard.campaigns.sampling.dispersion import Dispersion
 from marsyard.campaigns.sampling.dispersions import Derived, Fixed, Grid, InTurn, Normal
 from marsyard.scenarios.interface import Scenario
+from marsyard.sim.renamed import stream_name
 from marsyard.sim.streams import Streams
 
 
@@ -73,7 +74,10 @@ class Campaign:
         grid_point, first, size, index = position
         if stated.design.kind == "random":
             streams = self.streams(case)
-            drawn = {path: max(float(streams.generator(f"dispersion:{path}").random()), MIN_DRAW) for path in paths}
+            drawn = {
+                path: max(float(streams.generator(f"dispersion:{stream_name(path)}").random()), MIN_DRAW)
+                for path in paths
+            }
             for group in stated.correlations:
                 mixed = correlate_uniform(np.array([drawn[path] for path in group.parameters]), group.factor)
                 drawn.update(zip(group.parameters, mixed.tolist(), strict=True))
@@ -82,7 +86,9 @@ class Campaign:
                 (tuple(map(paths.index, group.parameters)), tuple(map(tuple, group.factor.tolist())))
                 for group in stated.correlations
             )
-            design = build_stratified_design(stated.design.kind, stated.seed, stated.name, first, size, paths, groups)
+            design = build_stratified_design(
+                stated.design.kind, stated.seed, stated.name, first, size, tuple(map(stream_name, paths)), groups
+            )
             drawn = dict(zip(paths, design[index].tolist(), strict=True))
         grids = {path: len(grid.points) for path, grid in stated.grids.items()}
         return {**drawn, **compute_grid_probabilities(grids, grid_point)}

@@ -17,6 +17,7 @@ from marsyard.campaigns.sampling.design import Correlation, Design
 from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, Grid, Normal
 from marsyard.sim.files import check_regular
 from marsyard.sim.parameters import Parameters
+from marsyard.sim.renamed import current_key
 
 Model = TypeVar("Model", bound=BaseModel)
 #: A key in nested tables and lists, part by part.
@@ -125,7 +126,7 @@ class CampaignConfiguration(Parameters):
     requirements: tuple[Requirement, ...] = ()
     retain: Retain = Retain()
     limits: Limits = Limits()
-    most_cases: _Cases | None = Field(
+    max_cases: _Cases | None = Field(
         default=None,
         description="cases of the last look at a campaign that stops itself when its verdicts are decided; set by "
         "--until-decided",
@@ -270,6 +271,17 @@ def description_at(model: type[BaseModel], path: str) -> str:
     *tables, name = path.split(".")
     below = _list_models(reduce(_find_inner_type, (int(part) if part.isdigit() else part for part in tables), model))
     return next((kind.model_fields[name].description or "" for kind in below if name in kind.model_fields), "")
+
+
+def current_path(model: type[BaseModel], path: str) -> str:
+    """Dotted path of a model's field by its current names; the path itself where the model has no such field."""
+    kind: Any = model
+    parts = []
+    for part in path.split("."):
+        fields = {name for one in _list_models(kind) for name in one.model_fields}
+        parts.append(current_key(part, fields))
+        kind = _find_inner_type(kind, int(part) if part.isdigit() else parts[-1])
+    return ".".join(parts)
 
 
 def _find_inner_type(kind: Any, part: str | int) -> Any:

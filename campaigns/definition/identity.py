@@ -34,7 +34,7 @@ from marsyard.scenarios.user_files import input_files
 #: Packages on whose code rows depend; reports and commands change no row.
 _CODE = ("sim", "algorithms", "scenarios", "campaigns")
 #: Keys of a configuration that change no row of a finished case.
-_KEYS_WITHOUT_EFFECT = frozenset({"appended", "description", "limits", "most_cases", "requirements", "retain"})
+_KEYS_WITHOUT_EFFECT = frozenset({"appended", "description", "limits", "max_cases", "requirements", "retain"})
 _HOME = Path(__file__).resolve().parents[2]
 
 

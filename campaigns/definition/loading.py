@@ -23,10 +23,12 @@ from marsyard.campaigns.definition.configuration import (
     CampaignConfiguration,
     Key,
     Requirement,
+    current_path,
     key_text,
     problems_of,
     read_tables,
 )
+from marsyard.campaigns.definition.former_names import use_current_names
 from marsyard.campaigns.definition.identity import list_algorithms
 from marsyard.campaigns.definition.requirements import fill_requirements
 from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
@@ -89,11 +91,14 @@ def load_campaign(
     """
     path = find_campaign(name_or_path)
     tables = read_tables(path)
+    selected = _known_scenario(tables)
+    if selected is not None:
+        tables = use_current_names(tables, selected)
     overridden: dict[tuple[str, ...], str] = {}
     words = ["marsyard", "run", name_or_path]
     for override in overrides:
         option = f"--set {override}"
-        tables = _apply_option(tables, _parse_override(override, option), option, overridden)
+        tables = _apply_option(tables, _parse_override(override, option, selected), option, overridden)
     if algorithms:
         tables = _select_algorithms(tables, algorithms, str(path), overridden)
     for key, option, value in (("cases", "-n", cases), ("seed", "--seed", seed)):
@@ -106,10 +111,12 @@ def load_campaign(
     return replace(_validate(str(path), tables, overridden), command=tuple(words))
 
 
-def _parse_override(override: str, option: str) -> dict[str, Any]:
+def _parse_override(override: str, option: str, selected: Scenario | None) -> dict[str, Any]:
     key, separator, value = override.partition("=")
     if not separator or not key.strip() or "\n" in override:
         raise ConfigurationError([Problem(option, "", "expected KEY=VALUE, such as --set render.backend=egl")])
+    if selected is not None and key.split(".")[0].strip() not in _FILE_KEYS:
+        key = current_path(selected.parameters_type, key.strip())
     try:
         try:
             stated = tomllib.loads(f"{key} = {value.strip()}")
@@ -125,10 +132,7 @@ def _select_algorithms(
 ) -> dict[str, Any]:
     """Tables with other algorithms; unchanged for an unknown scenario, which is reported later."""
     options = [f"--algorithm {spec}" for spec in algorithms]
-    try:
-        selected = _find_scenario(tables)
-    except UnknownScenarioError:
-        selected = None
+    selected = _known_scenario(tables)
     if selected is None:
         return tables
     if not isinstance(selected, HasAlgorithms):
@@ -149,6 +153,14 @@ def _find_scenario(tables: Mapping[str, Any]) -> Scenario | None:
     """Scenario of a campaign's tables; None where they name none. Raises UnknownScenarioError."""
     name = tables.get("scenario")
     return scenario(name) if isinstance(name, str) and name else None
+
+
+def _known_scenario(tables: Mapping[str, Any]) -> Scenario | None:
+    """Scenario of a campaign's tables; None for an unknown one, which is reported later."""
+    try:
+        return _find_scenario(tables)
+    except UnknownScenarioError:
+        return None
 
 
 def _apply_option(

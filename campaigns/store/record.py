@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.campaigns.definition.former_names import stored_configuration_now
 from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.errors import StoreError, writing
 from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
@@ -174,7 +175,7 @@ def read(directory: Path) -> dict[str, Any]:
 def stored_configuration(directory: Path) -> CampaignConfiguration:
     """Configuration of a stored campaign."""
     try:
-        return CampaignConfiguration.model_validate(read(directory)["configuration"])
+        return CampaignConfiguration.model_validate(stored_configuration_now(read(directory)["configuration"]))
     except (ValueError, KeyError) as error:
         raise StoreError(f"{directory / RECORD_FILE} is damaged: {error}") from error
 

@@ -5,7 +5,7 @@ import marsyard
 campaign = marsyard.load_campaign(
     "dimes-smoke",
     # small, so that it is built in a moment; a site's own terrain is 4 to 8 km wide
-    {"terrain.samples": 512, "terrain.spacing_m": 8.0, "place.bank": 1, "place.terrain": 0},
+    {"terrain.samples": 512, "terrain.spacing_m": 8.0, "location.bank": 1, "location.terrain": 0},
 )
 case = marsyard.run_case(campaign, 3)
 print(case.outcome, "answered" if case.answered else "no answer")

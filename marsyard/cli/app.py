@@ -25,6 +25,7 @@ from marsyard.cli.options import CampaignArgument, Exit, JsonOption, SetOption, 
 from marsyard.cli.render import gallery, render
 from marsyard.cli.report import compare, dashboard, report
 from marsyard.cli.terrain import app as terrain
+from marsyard.sim.renamed import RenamedWarning, current_options
 
 
 class _PlainFlags:
@@ -169,10 +170,25 @@ for panel, commands in PANELS.items():
         app.add_typer(terrain, name="terrain", cls=_Group, rich_help_panel=panel)
 
 
+_format_usual = warnings.formatwarning
+
+
+def _format_warning(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
+    return (
+        f"warning: {message}\n"
+        if issubclass(category, RenamedWarning)
+        else _format_usual(message, category, filename, lineno, line)
+    )
+
+
 def main() -> None:
     """Entry point of the program. A defect ends with a traceback and status 2, not with a verdict's status 1."""
     # without `pgrep` loky warns at each worker's end, and works all the same
     warnings.filterwarnings("ignore", message="Failed to kill subprocesses")
+    warnings.formatwarning = _format_warning
+    sys.argv[1:] = current_options(sys.argv[1:])
     try:
         app()
     except Exception:

@@ -133,7 +133,7 @@ def append(
     from marsyard.campaigns.store.record import stored_configuration
     from marsyard.cli import evidence
 
-    if stored_configuration(directory).most_cases is not None:
+    if stored_configuration(directory).max_cases is not None:
         raise CampaignError(f"{directory} stopped itself (--until-decided): more cases would buy a second chance")
     evidence.print_limits(campaign_with_block(directory, cases))
     executor = make_executor(jobs, cluster)
@@ -147,7 +147,7 @@ def replay(
     out: Annotated[
         Path | None, Option("--out", metavar="DIR", help="Folder of its products; by default DIR/cases/CASE.")
     ] = None,
-    step: Annotated[bool, Option("--step", help="Also write each stage's product into steps/.")] = False,
+    save_stages: Annotated[bool, Option("--save-stages", help="Also write each stage's product into stages/.")] = False,
 ) -> None:
     """Rerun one case, write and plot its intermediate results, and compare its row with the stored one."""
     from marsyard.campaigns.running.replay import replay as run_again
@@ -158,7 +158,7 @@ def replay(
         unpack_products,
         write_packed,
     )
-    from marsyard.cli.steps import write_steps
+    from marsyard.cli.stages import write_stages
     from marsyard.reports.cases import write_case_figures
 
     replayed = run_again(directory, case)
@@ -170,9 +170,9 @@ def replay(
         products = unpack_products(packed)
         with replaced_files(target) as folder:
             write_packed(folder, packed, replayed.row)
-            stages = write_steps(folder / "steps", products) if step else 0
+            stages = write_stages(folder / "stages", products) if save_stages else 0
             figures = [target / path.relative_to(folder) for path in write_case_figures(folder, products)]
-        lines = [f"stages: {stages} files in {target / 'steps'}"] if step else []
+        lines = [f"stages: {stages} files in {target / 'stages'}"] if save_stages else []
         written = [f"products: {target}", *lines, *(f"figure: {figure}" for figure in figures)]
     typer.echo(f"case {case}: {replayed.row['outcome']}")
     for line in (replayed.row["error"] and (replayed.row["traceback"] or replayed.row["error"]), replayed.note):

@@ -49,7 +49,7 @@ def evidence_limits(campaign: Campaign) -> list[str]:
         return limits
     # the distinct terrains of the cases: in turn, or as drawn
     terrains = min(cases, supply.terrains) if supply.in_turn else cases
-    path = next((path for path in ("place.terrain", "world.terrain") if path in configuration.dispersions), None)
+    path = next((path for path in ("location.terrain", "world.terrain") if path in configuration.dispersions), None)
     if not supply.in_turn and path is not None and cases <= _MAX_DRAWS:
         terrains = len({campaign.draws(case)[path] for case in range(int(configuration.design.nominal), cases)})
     # cases with a terrain each are limited by their number alone; others are counted by terrains
@@ -100,7 +100,7 @@ def run_until_decided(campaign: Campaign, directory: Path, executor: ExecutorCon
         raise CampaignError("--until-decided: the campaign has no requirement that is decided at a confidence")
     limit = configuration.total_cases
     first = configuration.model_copy(
-        update={"cases": planned_looks(limit)[0].cases, "appended": (), "most_cases": limit}
+        update={"cases": planned_looks(limit)[0].cases, "appended": (), "max_cases": limit}
     )
     command = (*campaign.command, "--until-decided")
     run_campaign(Campaign(first, campaign.scenario, command), directory, executor, watch)
@@ -113,12 +113,12 @@ def continue_until_decided(directory: Path, executor: ExecutorConfig, watch: Wat
 
     while True:
         configuration = record.stored_configuration(directory)
-        if configuration.most_cases is None:
+        if configuration.max_cases is None:
             return
         plain = configuration.model_dump(mode="json")
         how, cases = sampled(plain), configuration.total_cases
         look = next_look(judge_campaign(read_frame(directory), plain["requirements"], how), how, cases)
         if look is None:
-            watch.note(f"stopped after {cases} of at most {count(configuration.most_cases, 'case')}")
+            watch.note(f"stopped after {cases} of at most {count(configuration.max_cases, 'case')}")
             return
         append_cases(directory, look - cases, executor, watch)

@@ -17,6 +17,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from marsyard.campaigns.definition.former_names import stored_columns_now
 from marsyard.campaigns.errors import CampaignError, StoreError, writing
 from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_with
@@ -104,7 +105,8 @@ def read_frame(directory: Path) -> pd.DataFrame:
     if not path.is_file():
         raise StoreError(f"{directory} has no {TABLE_FILE}: the campaign did not end")
     try:
-        return pd.read_parquet(path)
+        frame = pd.read_parquet(path)
+        return frame.rename(columns=stored_columns_now(frame.columns, stored_configuration(directory).scenario))
     except (OSError, ValueError) as error:
         raise StoreError(f"{path}: not a table of cases: {error}") from error
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 #: Width of a column of drawn values with its margin.
 _VALUE_WIDTH = 12
-_EXTENT = ("least", "mean", "greatest")
+_EXTENT = ("minimum", "mean", "maximum")
 #: Number of quantiles of a distribution in the figure.
 _QUANTILES = 2000
 _FIGURES = (".svg", ".png")

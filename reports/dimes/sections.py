@@ -177,7 +177,7 @@ FIRING = kinds.SectionDeclaration(
     "the firing; the error is relative to the camera's true velocity then, swinging included.",
 )
 
-WITH, WITHOUT = "touchdown_speed_with_m_s", "touchdown_speed_without_m_s"
+WITH, WITHOUT = "touchdown_speed_corrected_m_s", "touchdown_speed_uncorrected_m_s"
 #: Minimum difference of the speeds by which a landing is helped or harmed, m/s.
 NOTABLE_M_S = 1.0
 #: Speeds above which the table gives the fraction of cases, m/s.

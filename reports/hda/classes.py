@@ -51,11 +51,11 @@ RATES: Mapping[str, tuple[str, str]] = {
     "truly safe, with a hazard of the map under them (false alarms)": ("false_alarms", "footprints_truly_safe"),
     "called safe by the map, not truly safe": ("footprints_called_safe_unsafe", "footprints_called_safe"),
     "called safe, with a hazard of twice the roughness limit, three cells across": (
-        "gross_called_safe",
+        "gross_hazards_called_safe",
         "footprints_called_safe",
     ),
-    "such hazards, called safe": ("gross_called_safe", "gross"),
-    "such hazards, with no hazard of the map under them": ("gross_unflagged", "gross"),
+    "such hazards, called safe": ("gross_hazards_called_safe", "gross_hazards"),
+    "such hazards, with no hazard of the map under them": ("gross_hazards_unflagged", "gross_hazards"),
 }
 _CLASSES_NOTE = note_text("hda.classes", confidence=stated(CONFIDENCE))
 
@@ -203,7 +203,7 @@ def limits_section(subject: Subject) -> Section | None:
 def curves(frame: pd.DataFrame) -> list[Curve]:
     """A curve for every change that was flown alone in several sizes; empty if changes were combined."""
     changes = PAPER["changes"]
-    if "tracks_right" not in frame:
+    if "tracks_correct" not in frame:
         return []
     sizes = [one["scale"] * numbers(frame, one["column"]) for one in changes]
     present = np.stack([np.abs(size) > _NONE * one["paper"] for size, one in zip(sizes, changes, strict=True)])
@@ -220,7 +220,7 @@ def curves(frame: pd.DataFrame) -> list[Curve]:
             for value in np.unique(rounded[chosen]):
                 flights = frame[chosen & (rounded == value)]
                 # a flight without tracks has tracked none of the visible features
-                tracked = pooled_rate(flights, "tracks_right", "features_in_view")
+                tracked = pooled_rate(flights, "tracks_correct", "features_in_view")
                 points.append(AtSize(float(value), tracked, len(flights), int(flag(flights, "tracked_well").sum())))
             found.append(Curve(one, points, knee(points, 1.0), knee(points, -1.0)))
     return found

@@ -21,7 +21,7 @@ from marsyard.scenarios.landing.parameters import LanderParameters
 
 PAPER = read_paper(Path(__file__).with_name("paper.toml"))
 #: Columns of every row of a landing case.
-_OWN = ("site_safe", "site_reported", "no_site_reported", "truly_safe_share")
+_OWN = ("site_safe", "site_reported", "no_site_reported", "true_safe_fraction")
 #: Minimum number of cases with a map for the section on map errors.
 MIN_MAPS = 8
 
@@ -64,7 +64,7 @@ THRESHOLD = kinds.SectionDeclaration(
                     kinds.pooled("footprints_called_safe_unsafe", "footprints_called_safe"),
                 ),
                 kinds.Rate(
-                    "found", "Site found, of those with one", kinds.flagged("site_reported", "roomy_exists"), False
+                    "found", "Site found, of those with one", kinds.flagged("site_reported", "wide_site_exists"), False
                 ),
                 kinds.Rate("safe", "Sites truly safe", kinds.flagged("site_safe", "site_reported"), False),
             ),
@@ -136,7 +136,7 @@ FAULTS = kinds.SectionDeclaration("landing-faults", "Faults", "Faults by size", 
 def map_rows(subject: Subject) -> pd.DataFrame | None:
     """Cases with a map, with errors as fractions of height and range; None if few, or without varying conditions."""
     frame = landing_rows(subject)
-    if frame is None or not (rates.varies(frame, "texture") and rates.varies(frame, "baseline_share")):
+    if frame is None or not (rates.varies(frame, "texture") and rates.varies(frame, "baseline_fraction")):
         return None
     shares = {
         "rms_share": numbers(frame, "elevation_rms_m") / numbers(frame, "height_m"),
@@ -156,7 +156,7 @@ _MAP_ERRORS = (
 #: Conditions of the map errors, as applied.
 MAP_EFFECTS = kinds.Scatter(
     x=(
-        kinds.Quantity("baseline_share", "baseline over height"),
+        kinds.Quantity("baseline_fraction", "baseline over height"),
         kinds.Quantity("texture", "texture over the site's"),
         kinds.Quantity("grid_px", "grid spacing (px)"),
         kinds.Quantity("level_error_deg", "error of the vertical (deg)"),
@@ -188,7 +188,7 @@ MAP_ERRORS = kinds.SectionDeclaration(
 TOUCHDOWN_ERRORS = (
     kinds.Quantity("touchdown_error_gps_m", "by averaged GPS, as in the paper"),
     kinds.Quantity("touchdown_error_m", "by truth"),
-    kinds.Quantity("touchdown_error_believed_m", "by the filter's estimate"),
+    kinds.Quantity("touchdown_error_estimated_m", "by the filter's estimate"),
 )
 _DEVIATIONS = ("gps_deviation_north_m", "gps_deviation_east_m")
 
@@ -271,10 +271,10 @@ ANSWERS = ("safe site, truly safe", "site, not safe", "no safe site", "not conve
 def site_shares(frame: pd.DataFrame) -> dict[str, rates.Share]:
     """Fractions of right answers by the truth of the ground, as far as they have cases."""
     reported, none, roomy, landed = (
-        rates.flag(frame, name) for name in ("site_reported", "none_exists", "roomy_exists", "landed")
+        rates.flag(frame, name) for name in ("site_reported", "no_safe_site_exists", "wide_site_exists", "landed")
     )
     refused, safe = rates.flag(frame, "no_site_reported"), rates.flag(frame, "site_safe")
-    narrow, right = rates.flag(frame, "safe_exists") & ~roomy, refused | (reported & safe)
+    narrow, right = rates.flag(frame, "safe_site_exists") & ~roomy, refused | (reported & safe)
     shares = {
         "chosen sites that are truly safe": rates.share_of(safe[reported], frame[reported]),
         "'no safe site', where none exists": rates.share_of(refused[none], frame[none]),
@@ -291,7 +291,9 @@ def site_shares(frame: pd.DataFrame) -> dict[str, rates.Share]:
 
 def outcome_counts(frame: pd.DataFrame) -> dict[str, dict[str, int]]:
     """Flights by truth (`GROUNDS`) and outcome (`ANSWERS`)."""
-    roomy, exists, none = (rates.flag(frame, name) for name in ("roomy_exists", "safe_exists", "none_exists"))
+    roomy, exists, none = (
+        rates.flag(frame, name) for name in ("wide_site_exists", "safe_site_exists", "no_safe_site_exists")
+    )
     given = dict(zip(ANSWERS, answers(frame).values(), strict=True))
     truths = dict(zip(GROUNDS, (roomy, exists & ~roomy, none), strict=True))
     return {

@@ -54,8 +54,8 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
 
     Raises ValueError where a recorded or own motion is below the ground at a picture, or an own motion is invalid.
     """
-    ground = float(surface.height(p.place.east_m, p.place.north_m))
-    below = np.array([p.place.east_m, p.place.north_m, ground])
+    ground = float(surface.height(p.location.east_m, p.location.north_m))
+    below = np.array([p.location.east_m, p.location.north_m, ground])
     times = faulty_times(p.faults, p.picture_times_s)
     if isinstance(p.flight, CustomMotion):
         place = DescentPlace(

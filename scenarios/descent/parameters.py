@@ -37,7 +37,7 @@ from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 PICTURES = 3
 
 
-class Place(Parameters):
+class Location(Parameters):
     """Terrain and position of the descent."""
 
     bank: Annotated[int, bounded(1, 100000, "terrains in the bank")] = 4
@@ -47,7 +47,7 @@ class Place(Parameters):
     north_m: Annotated[float, Field(description="position of the first picture on the periodic terrain")] = 0.0
 
     @model_validator(mode="after")
-    def _check_terrain(self) -> Place:
+    def _check_terrain(self) -> Location:
         if self.terrain >= self.bank:
             raise ValueError(f"terrain {self.terrain} is not in the bank; allowed: 0 to {self.bank - 1}")
         return self
@@ -77,8 +77,8 @@ class LandingParameters(Parameters):
 
     computation_s: Annotated[float, bounded(0.0, 1000.0, "time to the answer on the flight computer")] = 14.0
     processor_factor: Annotated[float, Field(gt=0.0, le=1e6, description="flight computer over host (assumed)")] = 600.0
-    least_steered_m_s: Annotated[float, bounded(0.0, 100.0, "speed up to which the thrusters do not steer")] = 5.0
-    most_steered_m_s: Annotated[float, bounded(0.0, 100.0, "steering limit: 80 m/s burn tilted by 15 deg")] = 20.0
+    min_steered_m_s: Annotated[float, bounded(0.0, 100.0, "speed up to which the thrusters do not steer")] = 5.0
+    max_steered_m_s: Annotated[float, bounded(0.0, 100.0, "steering limit: 80 m/s burn tilted by 15 deg")] = 20.0
     steering_error: Annotated[float, bounded(0.0, 1.0, "RMS relative error of the steering per axis")] = 0.1
     burn_error_m_s: Annotated[float, bounded(0.0, 50.0, "RMS of the burn's velocity error per axis")] = 1.0
 
@@ -133,7 +133,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
 
     site: Annotated[str | None, Field(description="preset of terrain, light and gravity; none: a plain terrain")] = None
     terrain_site: Annotated[str | None, Field(description="site of the terrain; filled in with `site`, not set")] = None
-    place: Place = Place()
+    location: Location = Location()
     terrain: CheckedTerrain = TerrainParameters()
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="own bodies on the ground")] = ()
     sun: SunParameters = SunParameters()

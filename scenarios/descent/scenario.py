@@ -71,16 +71,16 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains."""
-        return tuple(range(self.checked(parameters).place.bank))
+        return tuple(range(self.checked(parameters).location.bank))
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """The terrain below the descent; none with dunes of a fault, which are not in the bank."""
         p = self.checked(parameters)
-        return (p.place.terrain,) if faulty_terrain(p.faults, p.terrain) == p.terrain else ()
+        return (p.location.terrain,) if faulty_terrain(p.faults, p.terrain) == p.terrain else ()
 
     def input_terrain(self, p: DescentScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
         """A terrain of the bank."""
-        return TerrainBank(p.terrain, p.place.bank_seed), shared_input
+        return TerrainBank(p.terrain, p.location.bank_seed), shared_input
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
         """Pictures of a case without delivery faults, with the truth of their pixels."""

@@ -67,9 +67,9 @@ def touchdown(
     unsteered = true_m_s + burn
     punctual = p.computation_s <= available_s
     speed = 0.0 if believed_m_s is None else float(np.hypot(*believed_m_s))
-    if believed_m_s is None or not punctual or speed <= p.least_steered_m_s:
+    if believed_m_s is None or not punctual or speed <= p.min_steered_m_s:
         return Touchdown(unsteered, unsteered, punctual)
-    removed = believed_m_s * min(1.0, p.most_steered_m_s / speed)
+    removed = believed_m_s * min(1.0, p.max_steered_m_s / speed)
     return Touchdown(unsteered - removed + steering * np.hypot(*removed), unsteered, punctual)
 
 
@@ -93,10 +93,10 @@ def conditions(
     heights = height_above_ground(world.surface, np.stack([state.position_m for state in states]))
     row: dict[str, Scalar] = {
         "site": p.site or "plain",
-        "terrain": p.place.terrain,
+        "terrain": p.location.terrain,
         **p.faults.columns,
-        "place_east_m": float(states[0].position_m[0]),
-        "place_north_m": float(states[0].position_m[1]),
+        "location_east_m": float(states[0].position_m[0]),
+        "location_north_m": float(states[0].position_m[1]),
         **sun_columns(world.sun.direction),
         "horizontal_speed_m_s": float(np.hypot(*states[-1].velocity_m_s[:2])),
         "descent_rate_m_s": float(-np.diff([states[0].position_m[2], states[-1].position_m[2]])[0])
@@ -147,9 +147,9 @@ def instrument_errors(world: World, states: Sequence[State], measurements: Desce
     own_rotations = rotations - rotations.mean(axis=0)
     row: dict[str, Scalar] = {
         "attitude_error_common_deg": float(np.degrees(np.linalg.norm(rotations.mean(axis=0)))),
-        "attitude_error_own_deg": float(np.degrees(np.sqrt(np.mean(np.sum(own_rotations**2, axis=1))))),
+        "attitude_error_independent_deg": float(np.degrees(np.sqrt(np.mean(np.sum(own_rotations**2, axis=1))))),
         "altitude_error_common": float(relative.mean()),
-        "altitude_error_own": float(np.sqrt(np.mean((relative - relative.mean()) ** 2))),
+        "altitude_error_independent": float(np.sqrt(np.mean((relative - relative.mean()) ** 2))),
     }
     if len(changes):
         row["velocity_change_error_m_s"] = float(np.hypot(*(changes[-1] - true_changes[-1])))
@@ -163,8 +163,8 @@ def instrument_errors(world: World, states: Sequence[State], measurements: Desce
 def landing_row(p: LandingParameters, landed: Touchdown, measured_s: float, available_s: float) -> dict[str, Scalar]:
     """Columns of the landing; `answer_in_time` scales the measured computation time to the flight computer."""
     return {
-        "touchdown_speed_with_m_s": float(np.hypot(*landed.with_answer)),
-        "touchdown_speed_without_m_s": float(np.hypot(*landed.without_answer)),
+        "touchdown_speed_corrected_m_s": float(np.hypot(*landed.with_answer)),
+        "touchdown_speed_uncorrected_m_s": float(np.hypot(*landed.without_answer)),
         "answer_punctual": landed.punctual,
         "answer_in_time": p.processor_factor * measured_s <= available_s,
     }
@@ -196,4 +196,8 @@ def feasible_overlap_row(
         len(template_candidates(one, other, search_geometry(one, other, options), sun, options).pixels)
         for one, other in pairwise(views)
     )
-    return {"room": min(first, second) > 0, "room_first_pair": first, "room_second_pair": second}
+    return {
+        "feasible_overlap": min(first, second) > 0,
+        "feasible_overlap_first_pair": first,
+        "feasible_overlap_second_pair": second,
+    }

@@ -44,15 +44,15 @@ class World:
     def of(cls, p: DescentScenarioParameters) -> World:
         """Create a case's world; its terrain is read from the cache or built."""
         terrain = faulty_terrain(p.faults, p.terrain)
-        bank = TerrainBank(terrain, p.place.bank_seed)
-        surface = bank.terrain(p.place.terrain)
+        bank = TerrainBank(terrain, p.location.bank_seed)
+        surface = bank.terrain(p.location.terrain)
         elevation = float(np.radians(p.sun.elevation_deg))
         towards_sun = direction(np.radians(p.sun.azimuth_deg), elevation)
         if p.preset is None:
             return cls(surface, None, Sun(towards_sun), p.meshes)
         air = p.preset.environment
         sun = Sun(towards_sun, air.sun_radius_rad)
-        ground = SiteGround(p.preset, terrain, surface, bank.rocks(p.place.terrain))
+        ground = SiteGround(p.preset, terrain, surface, bank.rocks(p.location.terrain))
         return cls(surface, ground, sun, p.meshes, sunlight_ratio(air, elevation, p.detector))
 
     def scene(

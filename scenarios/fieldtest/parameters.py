@@ -110,14 +110,14 @@ class TripleParameters(Parameters):
     virtual_interval_s: Annotated[
         Positive, Field(le=60.0, description="time that is put between two pictures, s: that of the landings")
     ] = 3.75
-    most_speed_m_s: Annotated[
+    max_speed_m_s: Annotated[
         Positive, Field(description="greatest speed that the virtual interval may give, m/s: DIMES' own limit")
     ] = 30.0
-    overlap_share: Annotated[
+    overlap_fraction: Annotated[
         Positive, Field(description="distance between what two pictures are centred on, over the altitude (assumed)")
     ] = 0.3
-    least_step_m: Annotated[Positive, Field(description="least height between pictures apart, m (assumed)")] = 150.0
-    most_step_m: Annotated[Positive, Field(description="most height between pictures apart, m (assumed)")] = 390.0
+    min_step_m: Annotated[Positive, Field(description="least height between pictures apart, m (assumed)")] = 150.0
+    max_step_m: Annotated[Positive, Field(description="most height between pictures apart, m (assumed)")] = 390.0
 
 
 class FieldTestParameters(AlgorithmSelection, CustomScores):

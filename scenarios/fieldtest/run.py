@@ -95,14 +95,14 @@ def make_triples(
     """
     # pairs that overlap and whose distance DIMES can measure over the virtual interval
     lower = np.minimum(pictures.altitude_m[:, None], pictures.altitude_m)
-    paired = _distances(pictures.centre_m) <= parameters.overlap_share * lower
-    paired &= _distances(pictures.position_m[:, :2]) <= parameters.most_speed_m_s * parameters.virtual_interval_s
+    paired = _distances(pictures.centre_m) <= parameters.overlap_fraction * lower
+    paired &= _distances(pictures.position_m[:, :2]) <= parameters.max_speed_m_s * parameters.virtual_interval_s
     first = np.arange(len(pictures.flown) - 2)
     in_one_pass = pictures.flown[first] == pictures.flown[first + 2]
     consecutive = first[in_one_pass & paired[first, first + 1] & paired[first + 1, first + 2]]
     # all three pictures with a step down from each to the next, by GPS
     step = pictures.position_m[:, 2][:, None] - pictures.position_m[:, 2]
-    follows = paired & (step >= parameters.least_step_m) & (step <= parameters.most_step_m)
+    follows = paired & (step >= parameters.min_step_m) & (step <= parameters.max_step_m)
     descending = np.array(
         [
             (before, middle, after)

@@ -191,8 +191,8 @@ def _conditions(
         "clear_sky": run.clouds is None,
         "site": run.parameters.site,
         "terrain": p.site_names.index(run.parameters.site),
-        "place_east_m": float(case.states[1].position_m[0]),
-        "place_north_m": float(case.states[1].position_m[1]),
+        "location_east_m": float(case.states[1].position_m[0]),
+        "location_north_m": float(case.states[1].position_m[1]),
         **sun_columns(measurements.sun_direction),
         "horizontal_speed_m_s": float(np.hypot(*case.states[1].velocity_m_s[:2])),
     }
@@ -200,7 +200,7 @@ def _conditions(
     each = zip(case.states, measurements.attitudes, measurements.altitudes, true_altitudes, strict=True)
     for number, (state, attitude, altitude, true) in enumerate(each, start=1):
         errors.append((attitude.world_from_body * state.attitude.inv()).as_rotvec())
-        row[f"flown_{number}_s"] = state.time_s
+        row[f"picture_time_{number}_s"] = state.time_s
         row[f"pass_{number}"] = int(run.pictures.flown[numbers[number - 1]])
         row[f"altitude_{number}_m"] = float(true)
         row[f"altitude_error_{number}_m"] = altitude.altitude_m - float(true)
@@ -209,7 +209,7 @@ def _conditions(
         row[f"attitude_error_{number}_deg"] = float(np.degrees(np.linalg.norm(errors[-1])))
     for pair in (1, 2):
         row[f"attitude_change_{pair}_deg"] = float(np.degrees(np.linalg.norm(errors[pair] - errors[pair - 1])))
-        row[f"apart_{pair}_s"] = abs(case.states[pair].time_s - case.states[pair - 1].time_s)
+        row[f"interval_{pair}_s"] = abs(case.states[pair].time_s - case.states[pair - 1].time_s)
     row["off_nadir_max_deg"] = max(off_nadir_deg(state) for state in case.states)
     row["attitude_rate_max_deg_s"] = max(attitude_rate_deg_s(state) for state in case.states)
     return row

@@ -76,9 +76,9 @@ def hazard_counts(ground: Ground, at: SampledMap, truth: GroundTruth) -> dict[st
         "footprints_truly_safe": known & under.safe,
         "false_alarms": known & under.safe & at.flagged,
         "missed": known & ~under.safe & ~at.flagged,
-        "gross": known & gross,
-        "gross_called_safe": safe & gross,
-        "gross_unflagged": known & gross & ~at.flagged,
+        "gross_hazards": known & gross,
+        "gross_hazards_called_safe": safe & gross,
+        "gross_hazards_unflagged": known & gross & ~at.flagged,
     }
     for kind, ratio in over.items():
         classes = np.digitize(ratio, CLASSES)

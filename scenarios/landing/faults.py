@@ -25,13 +25,13 @@ class Faults(SizedFaults):
     laser_stuck: Annotated[float, bounded(0.0, 5.0, "excess of the stuck range over the height, as a fraction")] = 0.0
     gps_outage_s: Annotated[float, bounded(0.0, 300.0, "silence before the first picture; it lasts to the end")] = 0.0
     listed_bad_pixels: Annotated[float, bounded(0.0, 0.5, "`bad_pixels` that the camera lists and fills")] = 0.0
-    own_shadow_m: Annotated[float, bounded(0.0, 100.0, "diameter of the shadow's disc; raises the sun")] = 0.0
+    vehicle_shadow_m: Annotated[float, bounded(0.0, 100.0, "diameter of the shadow's disc; raises the sun")] = 0.0
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
         """Bad pixels are filled where the camera has a list of them."""
         fraction = max(self.bad_pixels, self.listed_bad_pixels)
         listed = fraction == self.listed_bad_pixels
-        defects = {"dead_share": fraction, "hot_share": fraction, "listed": listed} if fraction else {}
+        defects = {"dead_fraction": fraction, "hot_fraction": fraction, "listed": listed} if fraction else {}
         return {**super().detector_changes(), "defects": defects}
 
 
@@ -40,7 +40,7 @@ def faulty_sun_deg(faults: Faults, elevation_deg: float) -> float:
 
     A nadir camera sees the shadow only if the sun's zenith distance is below half of its angle of view.
     """
-    return 90.0 - 0.25 * (90.0 - elevation_deg) if faults.own_shadow_m else elevation_deg
+    return 90.0 - 0.25 * (90.0 - elevation_deg) if faults.vehicle_shadow_m else elevation_deg
 
 
 def faulty_helicopter(faults: Faults, helicopter: HelicopterParameters) -> HelicopterParameters:

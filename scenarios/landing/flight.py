@@ -46,9 +46,9 @@ class Flight:
             up_body = Rotation.from_rotvec(tilt).apply(upright)
             return cls(stated, believed_poses(p, stated, streams), up_body)
         helicopter = faulty_helicopter(p.faults, p.helicopter)
-        ground = float(surface.height(p.place.east_m, p.place.north_m))
+        ground = float(surface.height(p.location.east_m, p.location.north_m))
         height = helicopter.transit.height_m
-        over = np.array([p.place.east_m, p.place.north_m, ground + height])
+        over = np.array([p.location.east_m, p.location.north_m, ground + height])
         heading = -np.radians(p.flown.heading_deg)
         course = np.pi / 2 - np.radians(p.flown.heading_deg + p.flown.course_deg)
         gravity = p.preset.environment.gravity_m_s2
@@ -84,7 +84,7 @@ def calibrated_camera(p: LandingScenarioParameters, streams: Streams) -> CameraM
 def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams) -> tuple[State, State]:
     """The body's states at the pictures, as the parameters state them."""
     flown = p.flown
-    first = nadir_pose(surface, p.place.east_m, p.place.north_m, flown.height_m, flown.heading_deg)
+    first = nadir_pose(surface, p.location.east_m, p.location.north_m, flown.height_m, flown.heading_deg)
     towards = np.radians(flown.tilt_towards_deg)
     # turned about the horizontal axis to the right of the azimuth, the axis below moves towards it
     tilt = Rotation.from_rotvec(np.radians(flown.tilt_deg) * np.array([np.cos(towards), -np.sin(towards), 0.0]))
@@ -92,8 +92,8 @@ def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams
     # the body's x runs along the picture's columns to its right, y to its upper edge, z against the optical axis
     change = Rotation.from_rotvec(np.radians([flown.pitch_deg, flown.yaw_deg, flown.roll_deg]))
     course = np.radians(flown.heading_deg + flown.course_deg)
-    along = flown.baseline_share * flown.height_m
-    moved = np.array([along * np.sin(course), along * np.cos(course), flown.climb_share * flown.height_m])
+    along = flown.baseline_fraction * flown.height_m
+    moved = np.array([along * np.sin(course), along * np.cos(course), flown.climb_fraction * flown.height_m])
     interval = max(float(np.linalg.norm(moved)) / max(flown.speed_m_s, 1e-6), MIN_INTERVAL_S)
     velocity = flown.speed_m_s * np.array([np.sin(course), np.cos(course), 0.0])
     rates = np.radians(flown.rate_deg_s) * streams.generator("attitude rates").standard_normal((2, 3))
@@ -162,9 +162,9 @@ def choose_pair(
             overlap = 0.0
             if own is not None and other is not None:
                 overlap = float(cv2.intersectConvexConvex(own, other)[0] / cv2.contourArea(own))
-            worth = overlap * min(baseline / (parameters.wanted_share * distance), 1.0)
-            if (overlap >= parameters.least_overlap, worth) > best_worth:
-                best_worth = (overlap >= parameters.least_overlap, worth)
+            worth = overlap * min(baseline / (parameters.max_baseline_fraction * distance), 1.0)
+            if (overlap >= parameters.min_overlap, worth) > best_worth:
+                best_worth = (overlap >= parameters.min_overlap, worth)
                 best = PairChoice(i, j, baseline, overlap)
     if best is None:
         raise ValueError("no pair of pictures has poses that are numbers")

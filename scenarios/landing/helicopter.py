@@ -66,7 +66,7 @@ class HelicopterParameters(Parameters):
     @property
     def span_s(self) -> tuple[float, float]:
         """From the flight's start to its latest possible end."""
-        last = self.transit.pictures_s + self.guidance.wait_s + self.guidance.longest_s + self.guidance.rest_s
+        last = self.transit.pictures_s + self.guidance.wait_s + self.guidance.max_duration_s + self.guidance.rest_s
         return -self.transit.lead_s, last + 1.0
 
     @property

@@ -10,7 +10,7 @@ from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.hda import HdaOptions, TrackSeed
 from marsyard.scenarios.algorithm_selection import AlgorithmSelection
-from marsyard.scenarios.descent.parameters import Place, RenderParameters, SunParameters
+from marsyard.scenarios.descent.parameters import Location, RenderParameters, SunParameters
 from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.landing.faults import Faults
 from marsyard.scenarios.landing.helicopter import HelicopterParameters
@@ -43,13 +43,13 @@ class PassParameters(Parameters):
     """
 
     height_m: float = Field(default=15.0, gt=0.0, le=2000.0, description="above the ground below the first picture, m")
-    baseline_share: float = Field(default=0.2, ge=0.0, le=2.0, description="horizontal distance over height")
+    baseline_fraction: float = Field(default=0.2, ge=0.0, le=2.0, description="horizontal distance over height")
     speed_m_s: Annotated[float, Field(ge=0.0, le=200.0, description="along the course, m/s")] = 3.0
     heading_deg: Annotated[Angle, Field(description="azimuth of the picture's upper edge")] = 0.0
     course_deg: Annotated[Angle, Field(description="of the course from there, clockwise: 90 is along the rows")] = 90.0
     tilt_deg: Annotated[float, Field(ge=0.0, le=60.0, description="of the first picture's axis from nadir")] = 0.0
     tilt_towards_deg: Annotated[Angle, Field(description="azimuth towards which it is tilted")] = 0.0
-    climb_share: float = Field(default=0.0, gt=-0.9, le=5.0, description="change of height over height")
+    climb_fraction: float = Field(default=0.0, gt=-0.9, le=5.0, description="change of height over height")
     roll_deg: Annotated[Angle, Field(description="rotation about the optical axis between the pictures")] = 0.0
     pitch_deg: Annotated[Angle, Field(description="rotation about the picture's right")] = 0.0
     yaw_deg: Annotated[Angle, Field(description="rotation about the picture's up direction")] = 0.0
@@ -68,13 +68,15 @@ class NavigationParameters(Parameters):
 
 
 class PairParameters(Parameters):
-    """The criterion: overlap times baseline, which counts up to `wanted_share` of the range.
+    """The criterion: overlap times baseline, which counts up to `max_baseline_fraction` of the range.
 
     The paper names baseline and overlap; their weighting is assumed.
     """
 
-    wanted_share: float = Field(default=0.2, gt=0.0, le=2.0, description="maximum of baseline over range that counts")
-    least_overlap: float = Field(default=0.5, ge=0.0, le=1.0, description="of the first picture's ground in the second")
+    max_baseline_fraction: float = Field(
+        default=0.2, gt=0.0, le=2.0, description="maximum of baseline over range that counts"
+    )
+    min_overlap: float = Field(default=0.5, ge=0.0, le=1.0, description="of the first picture's ground in the second")
 
 
 class LanderParameters(Parameters):
@@ -103,7 +105,7 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     scale: Annotated[Literal["ground", "descent"], Field(description="which of the site's terrains")] = "ground"
     terrain_of: str | None = Field(default=None, description="site of the terrain; filled in, not to be set")
     terrain: CheckedTerrain = TerrainParameters()
-    place: Place = Place()
+    location: Location = Location()
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="custom meshes on the ground")] = ()
     texture: NonNegative = Field(default=1.0, le=10.0, description="contrast of the fine texture, over the site's own")
     sun: SunParameters = SunParameters()

@@ -41,7 +41,7 @@ class World:
     @classmethod
     def of(cls, p: LandingScenarioParameters, load_ground: LoadGround = SiteGround.from_bank) -> World:
         """The world of a case."""
-        ground = load_ground(site(p.site), p.terrain, p.place.bank_seed, p.place.terrain)
+        ground = load_ground(site(p.site), p.terrain, p.location.bank_seed, p.location.terrain)
         texture = p.preset.ground_texture
         textured = SiteTexture(
             coarsest_m=texture.coarsest_m, amplitudes=tuple(p.texture * one for one in texture.amplitudes)
@@ -80,7 +80,7 @@ def take_pictures(p: LandingScenarioParameters, world: World, flight: Flight, op
     detector = Detector.drawn(
         optics.fall_off, faulty_detector(p.faults, p.detector), streams.generator("detector response")
     )
-    caster = max(p.lander.caster_diameter_m, p.faults.own_shadow_m)
+    caster = max(p.lander.caster_diameter_m, p.faults.vehicle_shadow_m)
     lower = min(flight.states, key=lambda state: float(state.position_m[2]))
     # one scene for both pictures, as detailed as the lower one needs
     eye = Eye.of(optics.rays, lower.world_from_body, world.ground.surface)

@@ -49,16 +49,16 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains; none of a large bank, whose terrains few flights share (0.1 s each)."""
-        bank = self.checked(parameters).place.bank
+        bank = self.checked(parameters).location.bank
         return tuple(range(bank)) if bank <= KEPT_GROUNDS else ()
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """The terrain below the flight."""
-        return (self.checked(parameters).place.terrain,)
+        return (self.checked(parameters).location.terrain,)
 
     def input_terrain(self, p: LandingScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
         """A terrain of the bank."""
-        return TerrainBank(p.terrain, p.place.bank_seed), shared_input
+        return TerrainBank(p.terrain, p.location.bank_seed), shared_input
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
         """The two delivered pictures of a case, with the truth of their pixels."""

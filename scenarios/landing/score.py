@@ -38,15 +38,16 @@ DROPPED = (Fate.UNLIKE, Fate.OUT_OF_BOUNDS, Fate.NOT_RETURNED)
 MAX_ROLL_DEG, MAX_TILT_DEG, MAX_CLIMB = 10.0, 20.0, 0.2
 #: Columns of tracks, motion, structure and map.
 MOTION_COLUMNS = (
-    "features", "tracks", "features_in_view", "tracks_right", "tracked_share", "tracks_wrong_share", "inliers",
-    "parallax_px", "rotation_error_deg", "direction_error_deg", "length_error_m", "baseline_error_share",
-    "motion_residual_px", "points", "matched_share", "map_rows", "map_columns", "cell_m",
-    "matches_unlike", "matches_out_of_bounds", "matches_not_returned",
+    "features", "tracks", "features_in_view", "tracks_correct", "tracked_fraction", "tracks_outlier_fraction",
+    "inliers",
+    "parallax_px", "rotation_error_deg", "direction_error_deg", "length_error_m", "baseline_error_fraction",
+    "motion_residual_px", "points", "matched_fraction", "map_rows", "map_columns", "cell_m",
+    "matches_dissimilar", "matches_out_of_bounds", "matches_not_returned",
 )  # fmt: skip
 #: Columns of the ground under a lander, after the name of the position.
 PLACE_COLUMNS = ("east_m", "north_m", "slope_deg", "roughness_m", "hazard_distance_m")
 TOUCHDOWN_COLUMNS = (
-    "touchdown_error_gps_m", "touchdown_error_believed_m", "touchdown_error_m", "gps_deviation_north_m",
+    "touchdown_error_gps_m", "touchdown_error_estimated_m", "touchdown_error_m", "gps_deviation_north_m",
     "gps_deviation_east_m", "gps_solutions", "landing_turns", "landing_moved_m", "landing_after_s",
     "touchdown_sink_m_s", "touchdown_drift_m_s",
 )  # fmt: skip
@@ -64,11 +65,16 @@ def outcome_row(estimate: SiteEstimate) -> dict[str, Scalar]:
 def site_populations(truth: GroundTruth) -> dict[str, Scalar]:
     """Populations by the true ground: no safe site, safe sites without margin only, or sites with a margin.
 
-    A site with margin (`roomy_exists`) has safe positions all around up to a lander's radius. Every flight is in one of
-    `none_exists`, `narrow_exists` and `roomy_exists`.
+    A site with margin (`wide_site_exists`) has safe positions all around up to a lander's radius. Every flight is in
+    one of `no_safe_site_exists`, `narrow_site_exists` and `wide_site_exists`.
     """
     safe, margin = bool(np.any(truth.safe)), bool(np.any(truth.safe_with_margin))
-    return {"safe_exists": safe, "none_exists": not safe, "narrow_exists": safe and not margin, "roomy_exists": margin}
+    return {
+        "safe_site_exists": safe,
+        "no_safe_site_exists": not safe,
+        "narrow_site_exists": safe and not margin,
+        "wide_site_exists": margin,
+    }
 
 
 def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict[str, Scalar]:
@@ -175,10 +181,10 @@ def _tracks_row(details: HdaDetails, flight: Flight, pair: Pair) -> dict[str, Sc
         "features": len(tracks.first),
         "tracks": accepted,
         "features_in_view": int(inside.sum()),
-        "tracks_right": int(right.sum()),
-        "tracked_share": float(right.sum() / inside.sum()) if np.any(inside) else NAN,
+        "tracks_correct": int(right.sum()),
+        "tracked_fraction": float(right.sum() / inside.sum()) if np.any(inside) else NAN,
         "tracked_well": bool(np.any(inside) and right.sum() >= WELL_TRACKED * inside.sum()),
-        "tracks_wrong_share": float(np.mean(~right[tracks.accepted])) if accepted else NAN,
+        "tracks_outlier_fraction": float(np.mean(~right[tracks.accepted])) if accepted else NAN,
     }
 
 
@@ -192,7 +198,7 @@ def motion_errors(found: RigidTransform, true: RigidTransform) -> dict[str, Scal
         "rotation_error_deg": float(np.degrees((found.rotation * true.rotation.inv()).magnitude())),
         "direction_error_deg": float(np.degrees(2.0 * np.arcsin(min(direction / 2.0, 1.0)))),
         "length_error_m": length - true_length,
-        "baseline_error_share": float(np.linalg.norm(a - b)) / true_length if true_length > 0.0 else NAN,
+        "baseline_error_fraction": float(np.linalg.norm(a - b)) / true_length if true_length > 0.0 else NAN,
     }
 
 
@@ -207,7 +213,7 @@ def solved_row(details: HdaDetails) -> dict[str, Scalar]:
         }
     if details.matches is not None:
         matches = details.matches
-        row |= {"points": len(matches.points), "matched_share": float(matches.accepted.mean())}
+        row |= {"points": len(matches.points), "matched_fraction": float(matches.accepted.mean())}
         row |= {f"matches_{fate.name.lower()}": int(np.sum(matches.fates == fate)) for fate in DROPPED}
     if details.ground is not None:
         rows, columns = details.ground.elevation.elevation_m.shape
@@ -247,10 +253,10 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     )
     return {
         "site": p.site,
-        "terrain": p.place.terrain,
+        "terrain": p.location.terrain,
         **p.faults.columns,
-        "place_east_m": p.place.east_m,
-        "place_north_m": p.place.north_m,
+        "location_east_m": p.location.east_m,
+        "location_north_m": p.location.north_m,
         **sun_columns(case.world.sun.direction),
         **_true_motion_columns(case),
         "exposure_s": pair.images[0].calibration.exposure_s,
@@ -260,7 +266,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
         **_navigation_errors(case.flight, measurements),
         "covered_m2": float(covered.sum() * truth.step_m**2),
         **site_populations(truth),
-        "truly_safe_share": float(truth.safe.sum() / max(int(covered.sum()), 1)),
+        "true_safe_fraction": float(truth.safe.sum() / max(int(covered.sum()), 1)),
         "within_limits": bool(within_limits),
         "true_slope_median_deg": float(np.degrees(np.median(slopes))) if slopes.size else NAN,
         "texture": p.texture,
@@ -281,9 +287,9 @@ def _true_motion_columns(case: RenderedFlight) -> dict[str, Scalar]:
     return {
         "height_m": float(heights[0]),
         "baseline_m": float(np.linalg.norm(motion)),
-        "height_change_share": float(motion[2] / heights[0]),
-        "baseline_share": float(np.hypot(*motion[:2]) / heights[0]),
-        "turned_deg": float(np.linalg.norm(rotation_deg)),
+        "height_change_fraction": float(motion[2] / heights[0]),
+        "baseline_fraction": float(np.hypot(*motion[:2]) / heights[0]),
+        "pair_rotation_deg": float(np.linalg.norm(rotation_deg)),
         **{f"{axis}_deg": float(angle) for axis, angle in zip(("pitch", "yaw", "roll"), rotation_deg, strict=True)},
         "off_nadir_deg": float(np.degrees(np.arccos(np.clip(upright[2], -1.0, 1.0)))),
     }

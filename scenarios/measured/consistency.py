@@ -90,7 +90,7 @@ def agreement_row(pairs: Sequence[PairAgreement]) -> dict[str, Scalar]:
     medians = [float(np.median(pair.residuals_px)) for pair in pairs if pair.residuals_px.size]
     return {
         "matches": int(inliers.sum()),
-        "matches_wrong_share": 1.0 - float(inliers.mean()) if inliers.size else nan,
+        "outlier_fraction": 1.0 - float(inliers.mean()) if inliers.size else nan,
         "pairs_matched": len(medians),
         "residual_median_px": float(np.median(residuals)) if medians else nan,
         "residual_90_percent_px": float(np.quantile(residuals, 0.9, method="higher")) if medians else nan,

@@ -183,14 +183,14 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
                 "velocity_estimated_x_m_s": float(reported[0]),
                 "velocity_estimated_y_m_s": float(reported[1]),
                 # contains the unknown error of the inertial velocity
-                "beside_inertial_m_s": _distance(velocity, measurements.interval_velocities_m_s[1, :2]),
+                "inertial_difference_m_s": _distance(velocity, measurements.interval_velocities_m_s[1, :2]),
                 # does not: the change of velocity from the first pair to the second against the inertial unit's
                 "pair_discrepancy_m_s": NAN if chosen is None else chosen.discrepancy_m_s,
             }
             if true_velocity is not None:
                 row |= {**velocity_row("velocity", velocity, truth), **consistency_row(attempt.answer, truth)}
             if algorithm != p.algorithm:
-                row["apart_m_s"] = _distance(velocity, _velocity(attempts[p.algorithm].answer))
+                row["difference_m_s"] = _distance(velocity, _velocity(attempts[p.algorithm].answer))
             row |= {**agreement_row(pairs), **attempt.row}
             if attempt.answer is not None:
                 case = ScoredVelocity(
@@ -240,7 +240,7 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
             details = None if attempt.answer is None else attempt.answer.details
             row = _site_answer_row(attempt.answer, measurements, true_poses)
             if algorithm != p.algorithm:
-                row["apart_m"] = _distance(_site(attempt.answer), _site(attempts[p.algorithm].answer))
+                row["difference_m"] = _distance(_site(attempt.answer), _site(attempts[p.algorithm].answer))
             row |= attempt.row
             if attempt.answer is not None:
                 case = ScoredSite(measurements=measurements, answer=attempt.answer, true_poses=true_poses)
@@ -272,9 +272,9 @@ def _case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[st
     return {
         "measured_case": p.case.name,
         "pictures": len(images),
-        "lasted_s": images[-1].time_s - images[0].time_s,
-        "turned_most_deg": max(float(np.degrees(step.rotation.magnitude())) for step in steps),
-        "moved_most_m": max(float(np.linalg.norm(step.translation)) for step in steps) if has_positions else NAN,
+        "duration_s": images[-1].time_s - images[0].time_s,
+        "max_rotation_deg": max(float(np.degrees(step.rotation.magnitude())) for step in steps),
+        "max_translation_m": max(float(np.linalg.norm(step.translation)) for step in steps) if has_positions else NAN,
         "image_hash": digest.hexdigest(),
     }
 

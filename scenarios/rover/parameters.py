@@ -134,7 +134,7 @@ class LegParameters(Parameters):
 
     motion: Literal["stay", "approach", "back-off", "straight", "turn", "circle"] = "approach"
     steps: Annotated[int, bounded(1, 200, "number of steps; the maximum of an approach or back-off")] = 60
-    step_share: float = Field(default=0.1, gt=0.0, le=0.9, description="step length over the camera's distance")
+    step_fraction: float = Field(default=0.1, gt=0.0, le=0.9, description="step length over the camera's distance")
     step_m: Annotated[float | None, Field(description="length of a step instead; needed for straight")] = None
     step_deg: Annotated[Turn, Field(description="of a turn or circle")] = 5.0
     goal_m: Positive = Field(default=2.0, description="final horizontal distance of the rover's origin from the target")
@@ -228,7 +228,7 @@ class CameraParameters(Parameters):
     preset: Annotated[str, Field(description="key of `marsyard.sim.sensor.mast.MASTS`: pair, mast, rover")] = (
         "mer-navcam"
     )
-    own: Annotated[CustomPair | None, Field(description="a custom pair on the preset's mast")] = None
+    custom: Annotated[CustomPair | None, Field(description="a custom pair on the preset's mast")] = None
     detector: DetectorChoice | None = Field(default=None, description="of both cameras; by default the preset's")
     detector_noise: Annotated[bool, Field(description="whether pictures have detector noise and response")] = True
 
@@ -249,14 +249,14 @@ class CameraParameters(Parameters):
     @property
     def name(self) -> str:
         """The preset, or the file of the left camera."""
-        return self.preset if self.own is None else self.own.left.file or "own"
+        return self.preset if self.custom is None else self.custom.left.file or "custom"
 
     def mast(self) -> MastCalibration:
         """The design of the mast and its pair."""
         design = stereo_mast(self.preset)
-        if self.own is None:
+        if self.custom is None:
             return design
-        left, right = self.own.cameras()
+        left, right = self.custom.cameras()
         return replace(design, left=left, right=right)
 
     def settings(self) -> DetectorParameters:

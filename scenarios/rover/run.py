@@ -72,7 +72,7 @@ def goal_position(leg: LegParameters, target: TargetEstimate) -> Float64[np.ndar
 
 def step_length_m(leg: LegParameters, target: TargetEstimate) -> float:
     """Longest step: a fraction of the target's distance from the camera, or a length."""
-    return leg.step_share * target.range_m if leg.step_m is None else leg.step_m
+    return leg.step_fraction * target.range_m if leg.step_m is None else leg.step_m
 
 
 def is_finished(leg: LegParameters, done: int, target: TargetEstimate) -> bool:

@@ -70,8 +70,8 @@ class BandParameters(Parameters):
     """A range of steps: a boolean column of this name, by which requirements choose their cases."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z]\w*$")]
-    least: float = 0.0
-    most: float = 1.0
+    min: float = 0.0
+    max: float = 1.0
 
 
 class SharedDriveParameters(Parameters):
@@ -102,7 +102,7 @@ class SharedDriveParameters(Parameters):
         leg = self.drive.legs[0]
         if leg.motion in ("turn", "circle"):
             return abs(leg.step_deg) * (self.skip + 1)
-        return float(1.0 - (1.0 - leg.step_share) ** (self.skip + 1))
+        return float(1.0 - (1.0 - leg.step_fraction) ** (self.skip + 1))
 
 
 @dataclass(frozen=True)
@@ -289,7 +289,7 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
             "step": p.step,
             "with_scale": algorithm != "pure-ncc" and p.drive.vtt.scale,
             "pure_ncc": algorithm == "pure-ncc",
-            **{band.name: bool(band.least <= p.step <= band.most) for band in p.bands},
+            **{band.name: bool(band.min <= p.step <= band.max) for band in p.bands},
             **asdict(visibility),
             "on_face": visibility.in_view and (p.face_deg is None or visibility.obliquity_max_deg <= p.face_deg),
         }

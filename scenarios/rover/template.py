@@ -6,7 +6,7 @@ from pathlib import Path
 
 from marsyard.scenarios.template import CampaignTemplate
 
-_MAST = "--camera and --detector: tracking looks through a mast's stereo pair; see camera.preset and camera.own"
+_MAST = "--camera and --detector: tracking looks through a mast's stereo pair; see camera.preset and camera.custom"
 
 TRACKING = CampaignTemplate(
     file=Path(__file__).with_name("new.toml.j2"),

@@ -48,8 +48,8 @@ class HelicopterParameters(Parameters):
     climb_m_s: Annotated[float, bounded(0.0, 10.0, "climb on a pass")] = 1.0
     wander_m: Annotated[float, bounded(0.0, 200.0, "RMS distance from the line (assumed)")] = 8.0
     pointing_deg: Annotated[Angle, Field(description="RMS tilt along and across (assumed)")] = 9.0
-    most_tilt_deg: Annotated[Angle, Field(description="maximum tilt of the camera along and across")] = 30.0
-    swinging_share: Annotated[Fraction, Field(description="fraction of passes with a swinging camera (assumed)")] = 0.5
+    max_tilt_deg: Annotated[Angle, Field(description="maximum tilt of the camera along and across")] = 30.0
+    swinging_fraction: Annotated[Fraction, Field(description="of passes, with a swinging camera (assumed)")] = 0.5
     swing_rate_deg_s: Annotated[float, bounded(0.0, 120.0, "maximum rate of the swinging")] = 60.0
     swing_hz: Annotated[Positive, Field(le=5.0, description="frequency of the swinging, 1/s (assumed)")] = 0.6
     platform_deg: Annotated[float, bounded(0.0, 10.0, "RMS residual motion of the platform (assumed)")] = 0.2
@@ -203,7 +203,7 @@ def _draw_tilt(
 ) -> Tilt:
     """An angle of the gimbal: a new pointing every few seconds on the passes, none over the targets."""
     on_pass = np.any([(times > one.start_s) & (times < one.end_s) for one in passes], axis=0)
-    limit = p.most_tilt_deg
+    limit = p.max_tilt_deg
     pointing = np.clip(p.pointing_deg * rng.standard_normal(times.size), -limit, limit) * on_pass
     pointing = pointing + p.platform_deg * rng.standard_normal(times.size)
     swing_rad_s = 2.0 * np.pi * p.swing_hz
@@ -211,7 +211,7 @@ def _draw_tilt(
     largest = np.radians(p.swing_rate_deg_s) / np.sqrt(2.0) / swing_rad_s
     amplitudes = np.zeros(times.size)
     for one in passes:
-        swings = rng.uniform() < p.swinging_share
+        swings = rng.uniform() < p.swinging_fraction
         amplitude = largest * rng.uniform(0.2, 1.0)
         amplitudes[(times > one.start_s) & (times < one.end_s)] = amplitude if swings else 0.0
     return Tilt(_rest_curve(times, np.radians(pointing)), _rest_curve(times, amplitudes), swing_rad_s)

@@ -85,7 +85,7 @@ class SwingParameters(WindParameters):
     descent_rate_m_s: Annotated[float, bounded(20.0, 200.0, "descent rate of the canopy at the first picture")] = 75.0
     density_scale_height_m: Annotated[float, bounded(5000.0, 20000.0, "of the atmosphere; CO2 at 220 K")] = 11200.0
     cone_angle_deg: Annotated[float, bounded(0.0, 45.0, "largest angle of the coning lander from nadir")] = 15.0
-    cone_minor_share: Annotated[float, bounded(-1.0, 1.0, "minor over major half-axis; sign: sense")] = 0.5
+    cone_minor_fraction: Annotated[float, bounded(-1.0, 1.0, "minor over major half-axis; sign: sense")] = 0.5
     cone_direction_deg: Annotated[Phase, Field(description="azimuth of the cone's major axis")] = 0.0
     cone_phase_deg: Annotated[Phase, Field(description="phase of the coning at the first picture")] = 0.0
     cone_damping_ratio: Annotated[float, bounded(-0.05, 0.2, "damping of small coning over critical (assumed)")] = 0.01
@@ -190,7 +190,7 @@ def chain_of(p: SwingParameters, modes: Modes, gravity_m_s2: float, canopy_heigh
     first, second = p._moments(p.line_length_m)
     largest_rad = np.radians(p.cone_angle_deg) / modes.lander_tilt_ratio
     # the vertical component of the air's mean force over the cone balances the weight
-    upright = np.cos(largest_rad * np.sqrt(0.5 * (1.0 + p.cone_minor_share**2)))
+    upright = np.cos(largest_rad * np.sqrt(0.5 * (1.0 + p.cone_minor_fraction**2)))
     tangential = p._mass_kg * modes.support_m_s2 / (upright * p.descent_rate_m_s**2)
     return Chain(
         **p.model_dump(include=set(Chain._fields)),
@@ -421,7 +421,7 @@ def _cone_direction(p: SwingParameters, modes: Modes, tilt_ratio: float) -> tupl
     if p.cone_angle_deg == 0.0:
         return DOWN, np.zeros(3)
     largest, phase = np.radians(p.cone_angle_deg) / modes.lander_tilt_ratio, np.radians(p.cone_phase_deg)
-    smallest = largest * p.cone_minor_share
+    smallest = largest * p.cone_minor_fraction
     azimuth = np.radians(p.cone_direction_deg)
     major = np.array([np.sin(azimuth), np.cos(azimuth), 0.0])
     minor = np.array([np.cos(azimuth), -np.sin(azimuth), 0.0])

@@ -79,7 +79,7 @@ class Photometry:
     The Lunar-Lambert law is that of McEwen (1991); the surge has the form of Hapke's shadow-hiding term (1986). K makes
     A the spherical albedo of the law: the fraction of isotropic light that a surface reflects. The law is reciprocal.
 
-    - lunar_share: L, between 0 (Lambert) and 1 (Lommel-Seeliger). About 0.55 for Mars at small phase (McEwen 1991)
+    - lunar_fraction: L, between 0 (Lambert) and 1 (Lommel-Seeliger). About 0.55 for Mars at small phase (McEwen 1991)
     - surge_amplitude, surge_width: B0 and h
     - sky_share: D, diffuse irradiance from the sky over the direct sun's on a plane facing it
     - sky_radiance: radiance factor of an even sky in pixels without ground
@@ -88,7 +88,7 @@ class Photometry:
       irradiance of level ground
     """
 
-    lunar_share: float = 0.55
+    lunar_fraction: float = 0.55
     surge_amplitude: float = 0.7
     surge_width: float = 0.06
     sky_share: float = 0.15
@@ -98,12 +98,12 @@ class Photometry:
 
     def normalisation(self) -> float:
         """Compute K of the law."""
-        return 1.0 / _spherical_albedo(self.lunar_share, self.surge_amplitude, self.surge_width)
+        return 1.0 / _spherical_albedo(self.lunar_fraction, self.surge_amplitude, self.surge_width)
 
     def law(self, sun: Sun, caster_diameter_m: float) -> Float64[np.ndarray, "8"]:
         """Coefficients of the reflectance kernel, in its order."""
         bounced = self.surrounding_albedo * (max(float(sun.direction[2]), 0.0) + self.sky_share)
-        law = (self.lunar_share, self.surge_amplitude, self.surge_width, self.normalisation())
+        law = (self.lunar_fraction, self.surge_amplitude, self.surge_width, self.normalisation())
         return np.array([*law, self.sky_share, bounced, caster_diameter_m, sun.angular_radius_rad])
 
     def sky_coefficients(self, sun: Sun) -> Float64[np.ndarray, "4"]:
@@ -133,7 +133,7 @@ _scattered_irradiance = cache(scattered_irradiance)
 
 
 @cache
-def _spherical_albedo(lunar_share: float, surge_amplitude: float, surge_width: float) -> float:
+def _spherical_albedo(lunar_fraction: float, surge_amplitude: float, surge_width: float) -> float:
     """Spherical albedo of the law with A = K = 1, by Gauss-Legendre quadrature over incidence, emission and azimuth.
 
     ``2 int_0^1 [(1 / pi) int I/F cos e dOmega_e / cos i] cos i d(cos i)``. The substitution phi = pi s^3 samples the
@@ -146,7 +146,7 @@ def _spherical_albedo(lunar_share: float, surge_amplitude: float, surge_width: f
     cos_g = cos_i * cos_e + np.sqrt((1.0 - cos_i**2) * (1.0 - cos_e**2)) * np.cos(azimuth)
     tan_half = np.sqrt(np.clip(1.0 - cos_g, 0.0, None) / (1.0 + cos_g))
     surge = 1.0 + surge_amplitude / (1.0 + tan_half / surge_width)
-    radiance = surge * (2.0 * lunar_share * cos_i / (cos_i + cos_e) + (1.0 - lunar_share) * cos_i)
+    radiance = surge * (2.0 * lunar_fraction * cos_i / (cos_i + cos_e) + (1.0 - lunar_fraction) * cos_i)
     # both halves of the azimuth
     flux = 2.0 * np.einsum("ijk,j,k->i", radiance * cos_e, mu_weights, phi_weights) / np.pi
     return float(2.0 * np.sum(flux * mu_weights))

@@ -31,9 +31,9 @@ Delivered = UInt16[np.ndarray, "delivered_rows columns"]
 class DefectParameters(Parameters):
     """Defective pixels; none by default."""
 
-    hot_share: Annotated[Fraction, Field(description="fraction of hot pixels")] = 0.0
+    hot_fraction: Annotated[Fraction, Field(description="fraction of hot pixels")] = 0.0
     hot_e_s: Annotated[NonNegative, Field(description="mean dark current of a hot pixel at 0 deg C, e/s")] = 20000.0
-    dead_share: Annotated[Fraction, Field(description="fraction of pixels without response")] = 0.0
+    dead_fraction: Annotated[Fraction, Field(description="fraction of pixels without response")] = 0.0
     listed: Annotated[bool, Field(description="whether the camera fills them from neighbours by a list")] = False
 
 
@@ -102,13 +102,15 @@ class AutoExposureParameters(Parameters):
     target: Annotated[float, Field(gt=0.0, lt=1.0, description="target of the percentile over full scale")] = 0.75
     tolerance: Annotated[float, Field(gt=0.0, le=0.5, description="accepted relative distance from the target")] = 0.05
     pictures: Annotated[int, Field(ge=1, le=20, description="test pictures at most")] = 5
-    least_s: Annotated[float, Field(gt=0.0, le=10.0, description="shortest exposure, s")] = 1e-4
-    most_s: Annotated[float, Field(gt=0.0, le=10.0, description="longest exposure, s")] = 1.0
+    min_exposure_s: Annotated[float, Field(gt=0.0, le=10.0, description="shortest exposure, s")] = 1e-4
+    max_exposure_s: Annotated[float, Field(gt=0.0, le=10.0, description="longest exposure, s")] = 1.0
 
     @model_validator(mode="after")
     def _check_limits(self) -> AutoExposureParameters:
-        if self.least_s > self.most_s:
-            raise ValueError(f"the shortest exposure {self.least_s} s is longer than the longest {self.most_s} s")
+        if self.min_exposure_s > self.max_exposure_s:
+            raise ValueError(
+                f"the shortest exposure {self.min_exposure_s} s is longer than the longest {self.max_exposure_s} s"
+            )
         return self
 
 
@@ -141,19 +143,19 @@ class Detector:
         settings = {name: getattr(p, name) for name in names}
         calibration = DetectorCalibration(flat_field=measured.astype(np.float64), **settings)
         bad, hot = np.zeros(fall_off.shape, dtype=np.bool_), None
-        if p.defects.hot_share > 0.0:
+        if p.defects.hot_fraction > 0.0:
             # exponentially distributed over the hot pixels
-            is_hot = rng.random(fall_off.shape, dtype=np.float32) < p.defects.hot_share
+            is_hot = rng.random(fall_off.shape, dtype=np.float32) < p.defects.hot_fraction
             hot = np.zeros(fall_off.shape, dtype=np.float32)
             hot[is_hot] = p.defects.hot_e_s * rng.standard_exponential(int(is_hot.sum()), dtype=np.float32)
             bad |= hot > 0.0
-        if p.defects.dead_share > 0.0:
-            dead = rng.random(fall_off.shape, dtype=np.float32) < p.defects.dead_share
+        if p.defects.dead_fraction > 0.0:
+            dead = rng.random(fall_off.shape, dtype=np.float32) < p.defects.dead_fraction
             response = np.where(dead, np.float32(0.0), response)
             bad |= dead
         if p.optics.dust_discs > 0:
             response = response * dust_transmission(fall_off.shape, p.optics, rng)
-        has_list = p.defects.listed and (p.defects.hot_share > 0.0 or p.defects.dead_share > 0.0)
+        has_list = p.defects.listed and (p.defects.hot_fraction > 0.0 or p.defects.dead_fraction > 0.0)
         listed = _sum_rows(bad.astype(np.float32), p.rows_summed) > 0.0 if has_list else None
         return cls(p, response.astype(np.float32), calibration, hot, listed)
 
@@ -332,7 +334,7 @@ def auto_expose(
     tried: list[float] = []
     p = detector.parameters
     saturation = min(float(p.full_scale_dn), p.full_well_e / p.gain_e_dn + p.offset_dn)
-    exposure = float(np.clip(p.exposure_s, parameters.least_s, parameters.most_s))
+    exposure = float(np.clip(p.exposure_s, parameters.min_exposure_s, parameters.max_exposure_s))
     while True:
         current = detector.with_exposure(exposure)
         tried.append(exposure)
@@ -344,7 +346,7 @@ def auto_expose(
         factor = float(np.clip((parameters.target * saturation - p.offset_dn) / signal, 0.125, 8.0))
         factor = 0.25 if level >= 0.99 * saturation else factor
         converged = abs(factor - 1.0) <= parameters.tolerance
-        following = float(np.clip(exposure * factor, parameters.least_s, parameters.most_s))
+        following = float(np.clip(exposure * factor, parameters.min_exposure_s, parameters.max_exposure_s))
         if converged or following == exposure:
             return AutoExposure(current, tuple(tried), converged)
         if len(tried) == parameters.pictures:

@@ -45,7 +45,7 @@ class VisualOdometryParameters(Parameters):
     scale_error: Annotated[Fraction, Field(description="of the distance, constant in a run (stereo)")] = 0.015
     walk_m: Annotated[float, Field(ge=0.0, le=1.0, description="error per axis per root metre, m")] = 0.02
     floor_m: Annotated[float, Field(ge=0.0, le=1.0, description="error per axis new with every drive, m")] = 0.002
-    failure_share: Annotated[Fraction, Field(description="fraction of drives without convergence")] = 0.0
+    failure_fraction: Annotated[Fraction, Field(description="fraction of drives without convergence")] = 0.0
 
 
 class OdometryParameters(Parameters):
@@ -134,7 +134,7 @@ class Odometer:
         """Update the estimate after a true drive, with or without visual odometry; the number of draws is the same."""
         p = self.parameters
         wheels, walk, *tilt = np.split(rng.standard_normal(8), [2, 3, 5])
-        fails = bool(rng.random() < p.visual.failure_share)
+        fails = bool(rng.random() < p.visual.failure_fraction)
         if visual and not fails:
             start, end = driven.start.world_from_rover, driven.end.world_from_rover
             error = np.hypot(p.visual.walk_m * np.sqrt(driven.length_m), p.visual.floor_m) * tilt[1]

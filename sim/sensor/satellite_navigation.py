@@ -105,7 +105,7 @@ class RtkParameters(Parameters):
     latency_s: Annotated[float, Field(ge=0.0, le=2.0, description="from a solution's time to its delivery, s")] = 0.07
     fixed: SolutionErrors = _FIXED
     floating: SolutionErrors = _FLOATING
-    float_share: Annotated[Fraction, Field(description="fraction of the time with a floating solution")] = 0.1
+    float_fraction: Annotated[Fraction, Field(description="fraction of the time with a floating solution")] = 0.1
     float_s: Annotated[Positive, Field(description="mean duration of a floating solution, s")] = 60.0
     velocity_noise_m_s: Annotated[PerAxis, Field(description="of velocity, new in every solution")] = (0.03, 0.03, 0.05)
     velocity_wander_m_s: Annotated[PerAxis, Field(description="velocity wander, m/s")] = (0.01, 0.01, 0.02)
@@ -116,8 +116,8 @@ class RtkParameters(Parameters):
 
     @model_validator(mode="after")
     def _check_fixed_duration(self) -> RtkParameters:
-        if 0.0 < self.float_share < 1.0 and self.float_s * (1.0 / self.float_share - 1.0) < 1.0 / self.rate_hz:
-            raise ValueError(f"a float_share of {self.float_share} leaves fixed solutions less than one reading")
+        if 0.0 < self.float_fraction < 1.0 and self.float_s * (1.0 / self.float_fraction - 1.0) < 1.0 / self.rate_hz:
+            raise ValueError(f"a float_fraction of {self.float_fraction} leaves fixed solutions less than one reading")
         return self
 
 
@@ -159,7 +159,7 @@ class RtkReceiver:
     def drawn(cls, parameters: RtkParameters, span_s: tuple[float, float], rng: Generator) -> RtkReceiver:
         """Draw the errors for use within a time span."""
         p = parameters
-        floating = bool(rng.random() < p.float_share)
+        floating = bool(rng.random() < p.float_fraction)
         fixed, unfixed, velocity = (
             GaussMarkov.drawn(np.array(sd), time, span_s, rng)
             for sd, time in (
@@ -197,9 +197,9 @@ class RtkReceiver:
 
 def _draw_changes(p: RtkParameters, floating: bool, span_s: tuple[float, float], rng: Generator) -> Times:
     """Draw the times at which the type of solution changes: exponential durations, a stationary process."""
-    if p.float_share in (0.0, 1.0):
+    if p.float_fraction in (0.0, 1.0):
         return np.zeros(0)
-    means = {True: p.float_s, False: p.float_s * (1.0 / p.float_share - 1.0)}
+    means = {True: p.float_s, False: p.float_s * (1.0 / p.float_fraction - 1.0)}
     times: list[float] = []
     now = span_s[0]
     while True:

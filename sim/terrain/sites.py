@@ -80,7 +80,7 @@ class Environment(Parameters):
 class SitePhotometry(Parameters):
     """Parameters of the Lunar-Lambert law with an opposition surge, see `marsyard.sim.render.Photometry`."""
 
-    lunar_share: Annotated[float, Field(ge=0.0, le=1.0, description="L: 0 Lambert, 1 Lommel-Seeliger")] = 0.55
+    lunar_fraction: Annotated[float, Field(ge=0.0, le=1.0, description="L: 0 Lambert, 1 Lommel-Seeliger")] = 0.55
     surge_amplitude: Annotated[float, Field(ge=0.0, le=3.0, description="B0")] = 0.7
     surge_width: Annotated[float, Field(gt=0.0, le=1.0, description="h")] = 0.06
     rock_albedo: Annotated[float, Field(gt=0.0, lt=1.0, description="albedo of rocks")] = 0.15

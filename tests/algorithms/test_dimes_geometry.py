@@ -1,4 +1,4 @@
-"""Geometry of DIMES: ground and pixels, overlap and room, zero-phase spot, rectification."""
+"""Geometry of DIMES: ground and pixels, overlap and feasible_overlap, zero-phase spot, rectification."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def missed(measures: list[Measure]) -> list[str]:
 
 def _lose_drifts(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
     """Every second target is lost; the others do not drift at all."""
-    row = {"selectable": True, "sun_moved_deg": 5.0}
+    row = {"selectable": True, "sun_motion_deg": 5.0}
     monkeypatch.setattr(
         tracking_checks, "driven", lambda number, camera: row | {"drift_px": NAN if number % 2 else 0.1}
     )
@@ -57,7 +57,7 @@ def _lose_landing_pairs(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
     def errors(number: int) -> dict[str, dict[str, Any]]:
         value = NAN if number == 3 else 0.0
         row = {"site": landing_checks.SITES[number % 2], "range_m": 10.0, "tracks": 200.0, "elevation_rms_m": value}
-        row |= {"rotation_error_deg": value, "baseline_error_share": value}
+        row |= {"rotation_error_deg": value, "baseline_error_fraction": value}
         return {"paper": row, "ours": row}
 
     monkeypatch.setattr(landing_checks, "errors", errors)

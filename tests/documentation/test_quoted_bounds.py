@@ -64,7 +64,7 @@ def test_few_wrong_answers_to_a_wrong_altitude_are_quoted_with_their_intervals()
 
 
 def test_what_the_landings_show_counts_terrains() -> None:
-    terrains = int(load_campaign("dimes-landing").configuration.parameters["place"]["bank"])
+    terrains = int(load_campaign("dimes-landing").configuration.parameters["location"]["bank"])
     shown = f"{100.0 * proportion_lower(terrains, terrains, 0.9):.1f} %"
     assert f"Counting terrains, this shows {shown} at 90 % confidence" in text_of("dimes.md")
 

@@ -42,13 +42,13 @@ def test_importing_it_loads_nothing_else() -> None:
 
 
 def test_changes_are_written_as_toml_writes_them() -> None:
-    changes = {"terrain.samples": 1024, "place.east_m": 3.5, "compared": ["homography"], "site": "meridiani"}
+    changes = {"terrain.samples": 1024, "location.east_m": 3.5, "compared": ["homography"], "site": "meridiani"}
     campaign = marsyard.load_campaign("dimes-smoke", changes, cases=3)
     parameters = campaign.configuration.parameters
     assert parameters["terrain"]["samples"] == 1024
     assert parameters["compared"] == ["homography"]
     assert parameters["site"] == "meridiani"
-    assert "place.east_m" not in campaign.configuration.dispersions
+    assert "location.east_m" not in campaign.configuration.dispersions
     assert len(marsyard.draws(campaign, 3)) == 3
 
 

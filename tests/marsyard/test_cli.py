@@ -105,16 +105,16 @@ def test_replay_fails_where_rows_differ(finished: Path, marsyard: Command, tmp_p
 
 
 def test_stages_are_written_one_by_one(finished: Path, marsyard: Command, tmp_path: Path) -> None:
-    ended = marsyard("replay", finished, 0, "--step", "--out", tmp_path / "case")
+    ended = marsyard("replay", finished, 0, "--save-stages", "--out", tmp_path / "case")
     assert (ended.status, ended.err) == (0, "")
-    steps = tmp_path / "case" / "steps"
-    files = sorted(str(path.relative_to(steps)) for path in steps.rglob("*.*"))
+    stages = tmp_path / "case" / "stages"
+    files = sorted(str(path.relative_to(stages)) for path in stages.rglob("*.*"))
     assert files == ["01-picture.png", "02-title.json", "03-nested/01-0/01-x.npy"]
-    picture = cv2.imread(str(steps / "01-picture.png"), cv2.IMREAD_UNCHANGED)
+    picture = cv2.imread(str(stages / "01-picture.png"), cv2.IMREAD_UNCHANGED)
     assert picture is not None
     assert picture.dtype == np.uint16
     assert picture.tolist() == [[0, 1, 2], [3, 4, 5]]
-    assert f"stages: 3 files in {steps}" in ended.out
+    assert f"stages: 3 files in {stages}" in ended.out
 
 
 def _kill_when_rows_are_there(path: Path, directory: Path, cases: int) -> None:

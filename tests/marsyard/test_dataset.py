@@ -32,14 +32,14 @@ site = "heli-hazardous"
 [parameters.terrain]
 samples = 512
 
-[parameters.place]
+[parameters.location]
 bank = 1
 
 [parameters.lander]
 diameter_m = 1.0
 
 [dispersions]
-"place.east_m" = { distribution = "uniform", low = 0.0, high = 20.0, source = "anywhere" }
+"location.east_m" = { distribution = "uniform", low = 0.0, high = 20.0, source = "anywhere" }
 "flown.tilt_deg" = { distribution = "uniform", low = 0.0, high = 5.0, source = "assumed" }
 """
 
@@ -60,11 +60,11 @@ def contents(path: Path) -> dict[str, bytes]:
 def test_only_terrains_of_the_cases_are_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path / "cache"))
     path = tmp_path / "samples.toml"
-    drawn = '"place.terrain" = { distribution = "integer", low = 0, high = 19, source = "any" }'
+    drawn = '"location.terrain" = { distribution = "integer", low = 0, high = 19, source = "any" }'
     path.write_text(CAMPAIGN.replace("bank = 1", "bank = 20").replace("samples = 512", "samples = 256") + drawn)
     campaign = load_campaign(str(path))
     _prepare_inputs(campaign, range(2))
-    used = {campaign.parameters(case).model_dump()["place"]["terrain"] for case in range(2)}
+    used = {campaign.parameters(case).model_dump()["location"]["terrain"] for case in range(2)}
     assert len(list((tmp_path / "cache" / "terrain").iterdir())) == len(used)
 
 
@@ -110,7 +110,7 @@ def test_samples_hold_the_truth_of_their_pixels_and_are_gone_on_with(tmp_path: P
     assert np.median(cosine) > 0.99
 
     # the drawn values are the campaign's, and an interrupted set is gone on with, byte for byte
-    assert 0.0 <= told["drawn"]["place.east_m"] <= 20.0
+    assert 0.0 <= told["drawn"]["location.east_m"] <= 20.0
     before = [path.read_bytes() for path in shards]
     shards[0].unlink()
     assert made(tmp_path)[0] == 0
@@ -121,7 +121,7 @@ def test_samples_hold_the_truth_of_their_pixels_and_are_gone_on_with(tmp_path: P
 
 
 def test_descents_give_their_three_pictures(tmp_path: Path) -> None:
-    settings = ["terrain.samples=512", "place.bank=8"]
+    settings = ["terrain.samples=512", "location.bank=8"]
     words = [part for setting in settings for part in ("--set", setting)]
     out = tmp_path / "set"
     result = CliRunner().invoke(app, ["dataset", "dimes-smoke", "-n", "1", "--jobs", "1", "--out", str(out), *words])

@@ -60,7 +60,7 @@ def test_each_case_of_a_new_campaign_has_a_terrain_of_its_own(here: Path, system
     status, output = told("new", "mine", "--system", system, "-n", "1000")
     assert (status, "note:" in output) == (0, False), output
     campaign = load_campaign("mine.toml")
-    path = "world.terrain" if system == "tracking" else "place.terrain"
+    path = "world.terrain" if system == "tracking" else "location.terrain"
     assert len({campaign.draws(case)[path] for case in range(0, 1000, 7)}) == len(range(0, 1000, 7))
 
 
@@ -68,7 +68,7 @@ def test_a_new_campaign_without_failures_passes(here: Path) -> None:
     """230 cases show 99 % at 90 % confidence, on the terrains that the campaign draws."""
     assert told("new", "mine", "--system", "velocity", "--site", "gusev", "-n", "230")[0] == 0
     campaign = load_campaign("mine.toml")
-    terrains = [campaign.draws(case)["place.terrain"] for case in range(230)]
+    terrains = [campaign.draws(case)["location.terrain"] for case in range(230)]
     frame = pd.DataFrame({"case": range(230), "terrain": terrains, "answered": True, "velocity_error_m_s": 1.0})
     plain = campaign.configuration.model_dump(mode="json")
     (verdict,) = judge_campaign(frame.assign(outcome="VALID"), plain["requirements"], sampled(plain))
@@ -81,9 +81,9 @@ def test_what_limits_the_evidence_is_printed_before_a_run(here: Path) -> None:
     assert evidence_limits(load_campaign("few.toml", cases=230)) == []
     cases, terrains = evidence_limits(load_campaign("dimes-smoke"))
     assert cases.startswith("DIMES-VEL: 99 % at 90 % confidence takes at least 230 cases")
-    assert "draws from 8 terrains (place.bank = 8)" in terrains
-    assert "--set place.bank=2300 -n 254" in terrains
-    advised = load_campaign("dimes-smoke", ["place.bank=2300"], 254)
+    assert "draws from 8 terrains (location.bank = 8)" in terrains
+    assert "--set location.bank=2300 -n 254" in terrains
+    advised = load_campaign("dimes-smoke", ["location.bank=2300"], 254)
     assert evidence_limits(advised) == []
     # more cases on the same terrains do not help
     (terrains,) = evidence_limits(load_campaign("dimes-smoke", cases=1000))

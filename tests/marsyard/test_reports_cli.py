@@ -149,7 +149,7 @@ def _rows(n: int, failures: int) -> pd.DataFrame:
 
 def _next(n: int, failures: int, most: int, **changes: Any) -> int | None:
     asked = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9, **changes}
-    how = SamplingDesign(most_cases=most)
+    how = SamplingDesign(max_cases=most)
     return next_look(judge_campaign(_rows(n, failures), [asked], how), how, n)
 
 
@@ -178,7 +178,7 @@ def test_a_campaign_stops_itself_and_says_so(tmp_path: Path) -> None:
     run_until_decided(campaign, tmp_path / "run", ExecutorConfig(jobs=1), watch)
     stored = record.stored_configuration(tmp_path / "run")
     # All cases fail, but on one terrain, and that refutes a rate of half at none of the looks: it runs to its end.
-    assert (stored.total_cases, stored.most_cases) == (128, 128)
+    assert (stored.total_cases, stored.max_cases) == (128, 128)
     assert watch.notes[-1] == "stopped after 128 of at most 128 cases"
 
 

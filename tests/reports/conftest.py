@@ -119,7 +119,7 @@ def synthetic_record(frame: pd.DataFrame, requirements: Sequence[Mapping[str, An
         "cases": len(frame),
         "seed": 7,
         "dispersions": {
-            "place.terrain": {"distribution": "integer", "low": 0, "high": 3, "source": "bank of four terrains"},
+            "location.terrain": {"distribution": "integer", "low": 0, "high": 3, "source": "bank of four terrains"},
             "sun.elevation_deg": {"distribution": "uniform", "low": 20.0, "high": 60.0, "source": "landing season"},
             "descent.altitude_first_m": {"distribution": "normal", "mean": 2000.0, "sd": 20.0, "source": "paper, I"},
             "descent.horizontal_speed_m_s": {"distribution": "uniform", "low": 0.0, "high": 30.0, "source": "II.A"},

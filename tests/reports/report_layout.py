@@ -107,7 +107,7 @@ class TwinSampling(_Part):
     design: str
     grids: list[str]
     nominal: bool
-    most_cases: int | None
+    max_cases: int | None
     first_look: int | None = Field(description="cases at the first verdict, where cases were appended")
     terrains: TwinTerrains | None
     independent: bool

@@ -126,7 +126,7 @@ def test_the_page_and_its_twin_say_how_cases_were_drawn(make_rows: Rows, make_ru
         "design": "latin-hypercube",
         "grids": [],
         "nominal": True,
-        "most_cases": None,
+        "max_cases": None,
         "first_look": None,
         "terrains": None,
         "independent": False,

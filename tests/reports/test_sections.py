@@ -46,7 +46,9 @@ def test_answers_are_told_by_their_share_and_harm() -> None:
     answered, room = np.arange(n) >= 30, np.arange(n) >= 20
     magnitude = np.where(np.arange(n) == 100, 7.0, 1.0)
     magnitude[~answered] = np.nan
-    frame = pd.DataFrame({"answered": answered, "room": room, METRIC: magnitude, "terrain": np.arange(n) // 2})
+    frame = pd.DataFrame(
+        {"answered": answered, "feasible_overlap": room, METRIC: magnitude, "terrain": np.arange(n) // 2}
+    )
     shares = list(answer_shares(subject(frame)).values())
     assert [(one.hits, one.n) for one in shares] == [(170, 200), (170, 180), (20, 200), (1, 170)]
     # One of 170: Clopper-Pearson at 90 %, both sides: BetaInv(0.05; 1, 170) and BetaInv(0.95; 2, 169).
@@ -60,7 +62,7 @@ def test_answers_are_told_by_their_share_and_harm() -> None:
 def test_crashed_cases_of_unknown_room_count_as_failures_with_room(make_rows: Rows) -> None:
     frame = make_rows(50, answered=1.0, crashed=5)
     room: list[bool | None] = [True] * 45 + [None] * 5
-    shares = answer_shares(subject(frame.assign(room=pd.Series(room, dtype=object))))
+    shares = answer_shares(subject(frame.assign(feasible_overlap=pd.Series(room, dtype=object))))
     assert [(one.hits, one.n) for one in shares.values()] == [(45, 50), (45, 50), (0, 45), (0, 45)]
 
 
@@ -201,25 +203,25 @@ def test_landing_tells_good_and_harm() -> None:
     with_it = without - 4.0
     with_it[:10] = without[:10] + 2.0
     with_it[10:30] = without[10:30]
-    frame = pd.DataFrame({"touchdown_speed_with_m_s": with_it, "touchdown_speed_without_m_s": without})
+    frame = pd.DataFrame({"touchdown_speed_corrected_m_s": with_it, "touchdown_speed_uncorrected_m_s": without})
     frame.loc[100] = [np.nan, np.nan]  # crashed
     section = LANDING(subject(frame))
     assert section is not None
     assert (section.data["landings"], section.data["helped"], section.data["harmed"]) == (100, 0.7, 0.1)
     assert (section.data["largest_gain_m_s"], section.data["largest_loss_m_s"]) == pytest.approx((4.0, 2.0))
     assert cells(section, "faster than 20 m/s")[1:] == ["5.00 %", "25.00 %"]
-    assert LANDING(subject(frame[["touchdown_speed_with_m_s"]])) is None
+    assert LANDING(subject(frame[["touchdown_speed_corrected_m_s"]])) is None
 
 
 def test_page_and_twin_hold_every_section(make_rows: Rows, make_run: MakeRun) -> None:
     rng = np.random.default_rng(4)
     frame = make_rows(120).assign(
-        room=True,
+        feasible_overlap=True,
         descent_rate_m_s=rng.normal(75.0, 3.0, 120),
         fault=["dust", "cable noise"] * 60,
         fault_size=[0.1, 0.1, 0.2, 0.2] * 30,
-        touchdown_speed_with_m_s=rng.uniform(0.0, 10.0, 120),
-        touchdown_speed_without_m_s=rng.uniform(0.0, 30.0, 120),
+        touchdown_speed_corrected_m_s=rng.uniform(0.0, 10.0, 120),
+        touchdown_speed_uncorrected_m_s=rng.uniform(0.0, 30.0, 120),
     )
     directory = make_run(frame)
     text = write_report(directory).read_text(encoding="utf-8")

@@ -140,9 +140,9 @@ def test_what_cannot_be_judged_is_said(velocity: dict[str, Any], changes: dict[s
 
 
 def test_a_share_is_asked_of_a_column_of_true_and_false() -> None:
-    frame = _rows(100, 0).assign(answered=np.arange(100) >= 10, room=np.arange(100) >= 5)
+    frame = _rows(100, 0).assign(answered=np.arange(100) >= 10, feasible_overlap=np.arange(100) >= 5)
     availability = {"id": "AVAIL", "metric": "answered", "probability": 0.9, "confidence": 0.9}
-    of_all, of_room = (_judge(frame, availability, population=name) for name in ("all", "room"))
+    of_all, of_room = (_judge(frame, availability, population=name) for name in ("all", "feasible_overlap"))
     assert (of_all.n, of_all.failures, of_room.n, of_room.failures) == (100, 10, 95, 5)
     assert (of_all.status, of_room.status) == (Status.INSUFFICIENT, Status.PASS)
     # Decided by the estimate, 90 of 100 is 90 %; the bounds stay what they are.
@@ -152,32 +152,41 @@ def test_a_share_is_asked_of_a_column_of_true_and_false() -> None:
 
 
 def test_populations_of_columns_and_of_several() -> None:
-    frame = _rows(100, 20).assign(answered=np.arange(100) >= 10, room=np.arange(100) < 50)
+    frame = _rows(100, 20).assign(answered=np.arange(100) >= 10, feasible_overlap=np.arange(100) < 50)
     asked = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
-    both = _judge(frame, asked, population="valid and room")
+    both = _judge(frame, asked, population="valid and feasible_overlap")
     assert (both.n, both.failures) == (40, 10)
-    assert "room" in _judge(frame.assign(room=np.arange(100.0)), asked, population="room").note
+    assert (
+        "feasible_overlap"
+        in _judge(frame.assign(feasible_overlap=np.arange(100.0)), asked, population="feasible_overlap").note
+    )
 
 
 @pytest.mark.parametrize("outcome", ["VALID", "CRASHED", "BAD_ANSWER", "TIMED_OUT"])
 def test_a_case_of_unknown_membership_is_a_member_and_a_failure(outcome: str) -> None:
-    frame = _rows(100, 0).assign(room=np.arange(100) < 50).astype({"room": object})
+    frame = _rows(100, 0).assign(feasible_overlap=np.arange(100) < 50).astype({"feasible_overlap": object})
     frame.loc[90:93, "outcome"] = outcome
-    frame.loc[90:93, "room"] = None
+    frame.loc[90:93, "feasible_overlap"] = None
     asked = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
-    found = _judge(frame, asked, population="room")
+    found = _judge(frame, asked, population="feasible_overlap")
     assert (found.n, found.failures) == (54, 4)
     # the other part of the population is known, and false
     frame["near"] = np.arange(100) < 92
-    found = _judge(frame, asked, population="room and near")
+    found = _judge(frame, asked, population="feasible_overlap and near")
     assert (found.n, found.failures) == (52, 2)
 
 
 def test_crashes_do_not_meet_an_availability() -> None:
     """4 of 20 cases crash before anything is known of them; by the others alone the rate is 100 %."""
-    frame = _rows(20, 0).assign(room=True).astype({"room": object})
-    frame.loc[:3, ["outcome", "answered", "room"]] = ["CRASHED", False, None]
-    asked = {"id": "AVAIL", "metric": "answered", "probability": 0.95, "confidence": 0.9, "population": "room"}
+    frame = _rows(20, 0).assign(feasible_overlap=True).astype({"feasible_overlap": object})
+    frame.loc[:3, ["outcome", "answered", "feasible_overlap"]] = ["CRASHED", False, None]
+    asked = {
+        "id": "AVAIL",
+        "metric": "answered",
+        "probability": 0.95,
+        "confidence": 0.9,
+        "population": "feasible_overlap",
+    }
     found = _judge(frame, asked, decide_by="estimate")
     assert (found.status, found.n, found.failures) == (Status.FAIL, 20, 4)
 
@@ -330,18 +339,20 @@ def test_further_cases_of_correlated_cases_count_what_they_are_worth(velocity: d
 
 
 def _drawn_from(bank: int, **drawn: Any) -> SamplingDesign:
-    return sampled({"parameters": {"place": {"bank": bank}}, "dispersions": {"place.terrain": drawn} if drawn else {}})
+    return sampled(
+        {"parameters": {"location": {"bank": bank}}, "dispersions": {"location.terrain": drawn} if drawn else {}}
+    )
 
 
 def test_the_advice_names_the_terrains_that_limit_a_verdict(velocity: dict[str, Any]) -> None:
     """8 terrains never show 99 % at 90 %, however many cases there are: no number of further cases is named."""
     frame = _rows(400, 0).assign(terrain=np.arange(400) % 8)
-    how = _drawn_from(8, distribution="integer", low=0, high="place.bank - 1")
+    how = _drawn_from(8, distribution="integer", low=0, high="location.bank - 1")
     (verdict,) = judge_campaign(frame, [velocity], how)
     assert (verdict.status, verdict.further_cases) == (Status.INSUFFICIENT, None)
     said = (
-        "The campaign draws from 8 terrains (place.bank = 8); 99 % at 90 % confidence takes at least 230 terrains: run "
-        "the campaign again with --set place.bank=2300 -n 254."
+        "The campaign draws from 8 terrains (location.bank = 8); 99 % at 90 % confidence takes at least 230 terrains: "
+        "run the campaign again with --set location.bank=2300 -n 254."
     )
     assert said in verdict.note
     assert said in overall([verdict], frame).sentence
@@ -349,19 +360,19 @@ def test_the_advice_names_the_terrains_that_limit_a_verdict(velocity: dict[str, 
     # what is advised is enough: so many cases draw 230 different terrains, in more than 99 of 100 campaigns
     rng = np.random.default_rng(3)
     assert np.mean([np.unique(rng.integers(0, 2300, 254)).size >= 230 for _ in range(1000)]) > 0.99
-    in_turn = _drawn_from(8, distribution="in-turn", low=0, high="place.bank - 1")
-    assert "--set place.bank=230 -n 230" in judge_campaign(frame, [velocity], in_turn)[0].note
+    in_turn = _drawn_from(8, distribution="in-turn", low=0, high="location.bank - 1")
+    assert "--set location.bank=230 -n 230" in judge_campaign(frame, [velocity], in_turn)[0].note
     fixed = judge_campaign(frame.assign(terrain=0), [velocity], _drawn_from(8))[0]
-    assert "draws from 1 terrain (place.terrain = 1)" in fixed.note
+    assert "draws from 1 terrain (location.terrain = 1)" in fixed.note
     narrow = _drawn_from(100, distribution="integer", low=0, high=7)
-    assert 'dispersions."place.terrain"' in judge_campaign(frame, [velocity], narrow)[0].note
-    large = _drawn_from(1000, distribution="integer", low=0, high="place.bank - 1")
+    assert 'dispersions."location.terrain"' in judge_campaign(frame, [velocity], narrow)[0].note
+    large = _drawn_from(1000, distribution="integer", low=0, high="location.bank - 1")
     assert judge_campaign(frame, [velocity], large)[0].further_cases == 289
 
 
 def test_looks_of_a_campaign_that_stops_itself_share_the_risk(velocity: dict[str, Any]) -> None:
     # Of 640 cases the looks are at 20, 40, 80, 160, 320 and 640; the last adds half of them and has half of 10 %.
-    how = SamplingDesign(most_cases=640)
+    how = SamplingDesign(max_cases=640)
     (early,) = judge_campaign(_rows(320, 0), [velocity], how)
     assert early.bounds_confidence == pytest.approx(1.0 - 0.1 * 160 / 640)
     assert early.lower == proportion_lower(320, 320, early.bounds_confidence)

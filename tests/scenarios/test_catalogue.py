@@ -42,7 +42,7 @@ def _short_drive() -> SharedDriveParameters:
             },
             "variants": [{"diameter_m": 0.8, "height_m": 0.5, "shape": 8, "yaw_deg": 30.0, "sun_azimuth_deg": 260.0}],
             "targets": [{"across": 0.0, "up": 0.5}],
-            "bands": [{"name": name, "least": 0.0, "most": 10.0} for name in sorted(names)],
+            "bands": [{"name": name, "min": 0.0, "max": 10.0} for name in sorted(names)],
         }
     )
 

@@ -151,9 +151,9 @@ def test_answers_are_plain_numbers_before_they_are_scored() -> None:
 @pytest.mark.parametrize(
     ("name", "flags"),
     [
-        ("descent", {"room", "terrain"}),
+        ("descent", {"feasible_overlap", "terrain"}),
         ("fieldtest", {"one_direction", "clear_sky"}),
-        ("landing", {"roomy_exists", "none_exists", "within_limits"}),
+        ("landing", {"wide_site_exists", "no_safe_site_exists", "within_limits"}),
         ("rover", {"selectable", "navcam", "roll_compensated"}),
         ("rover-drive", {"selectable", "in_view", "on_face", "with_scale"}),
     ],

@@ -27,12 +27,12 @@ seed = 11
 samples = 1024
 spacing_m = 3.0
 
-[parameters.place]
+[parameters.location]
 bank = 2
 
 [dispersions]
-"place.terrain" = { distribution = "integer", low = 0, high = 1 }
-"place.east_m" = { distribution = "uniform", low = 0.0, high = 3000.0 }
+"location.terrain" = { distribution = "integer", low = 0, high = 1 }
+"location.east_m" = { distribution = "uniform", low = 0.0, high = 3000.0 }
 "descent.wind_east_m_s" = { distribution = "uniform", low = -20.0, high = 20.0 }
 "descent.cone_angle_deg" = { distribution = "uniform", low = 0.0, high = 20.0 }
 "descent.nod_rate_deg_s" = { distribution = "uniform", low = 0.0, high = 60.0 }
@@ -101,8 +101,8 @@ def test_drawn_values_were_applied(runs: Path) -> None:
     """The dispersed values show in what was simulated."""
     rows = _rows(runs / "A")
     assert set(rows["terrain"]) == {0, 1}
-    assert rows["place_east_m"].between(0.0, 3000.0).all()
-    assert rows["place_east_m"].nunique() == 5
+    assert rows["location_east_m"].between(0.0, 3000.0).all()
+    assert rows["location_east_m"].nunique() == 5
     assert rows["attitude_rate_max_deg_s"].nunique() == 5
 
 

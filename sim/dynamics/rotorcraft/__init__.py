@@ -67,10 +67,10 @@ class RotorcraftParameters(Parameters):
     heading_hz: Annotated[Positive, Field(le=5.0, description="natural frequency of yaw, 1/s")] = 0.5
     damping: Annotated[Positive, Field(le=2.0, description="damping ratio of the angles")] = 0.8
     thrust_lag_s: Annotated[Positive, Field(le=1.0, description="time constant of the thrust, s")] = 0.15
-    most_tilt_deg: Annotated[Positive, Field(le=30.0, description="maximum commanded pitch or roll, deg")] = 12.0
+    max_tilt_deg: Annotated[Positive, Field(le=30.0, description="maximum commanded pitch or roll, deg")] = 12.0
     gust_tilt_deg_s_m: Annotated[NonNegative, Field(le=10.0, description="tilt by a gust, deg per m/s")] = 0.8
     gust_yaw_deg_s_m: Annotated[NonNegative, Field(le=10.0, description="turn into a gust, deg per m/s")] = 0.8
-    place_gain: Annotated[Gain, Field(description="commanded speed per distance, 1/s")] = 0.5
+    position_gain: Annotated[Gain, Field(description="commanded speed per distance, 1/s")] = 0.5
     speed_gain: Annotated[Gain, Field(description="commanded acceleration per error of speed, 1/s")] = 1.2
     trim_gain: Annotated[NonNegative, Field(le=5.0, description="growth of trim per error of speed, 1/s2")] = 0.3
     delay_s: Annotated[NonNegative, Field(le=0.5, description="delay of the autopilot's command, s")] = 0.1
@@ -88,10 +88,10 @@ class RotorcraftParameters(Parameters):
             attitude_rad_s=turn * self.attitude_hz,
             attitude_damping=self.damping,
             heading_rad_s=turn * self.heading_hz,
-            max_tilt_rad=rad * self.most_tilt_deg,
+            max_tilt_rad=rad * self.max_tilt_deg,
             gust_tilt_s_m=rad * self.gust_tilt_deg_s_m,
             gust_yaw_s_m=rad * self.gust_yaw_deg_s_m,
-            position_gain=self.place_gain,
+            position_gain=self.position_gain,
             delay_steps=round(self.delay_s / self.step_s),
         )
 
@@ -130,7 +130,7 @@ class LandingGuidance(Parameters):
     descent_m_s: Annotated[Positive, Field(le=5.0, description="commanded speed of the descent, m/s")] = 0.7
     flare_range_m: Annotated[Positive, Field(le=20.0, description="laser range at which the flare begins, m")] = 1.5
     flare_m_s: Annotated[Positive, Field(le=5.0, description="commanded sink rate of the flare, m/s")] = 0.3
-    longest_s: Annotated[Positive, Field(le=600.0, description="limit of the landing's duration, s")] = 60.0
+    max_duration_s: Annotated[Positive, Field(le=600.0, description="limit of the landing's duration, s")] = 60.0
     rest_s: Annotated[NonNegative, Field(le=60.0, description="simulated time after the touchdown, s")] = 7.0
 
 
@@ -362,7 +362,7 @@ def landing_flight(
     Raises ValueError where the gusts or the laser's noise end before the longest possible flight.
     """
     step, before = flown.craft.step_s, len(flown.path.rows)
-    count = before + int(np.ceil((guidance.wait_s + guidance.longest_s) / step))
+    count = before + int(np.ceil((guidance.wait_s + guidance.max_duration_s) / step))
     air.check_lasts(count)
     if len(laser.noise_m) < count:
         raise ValueError(f"the laser's noise is known for {len(laser.noise_m)} knots; the flight may take {count}")

@@ -34,15 +34,19 @@ from marsyard.sim.sensor.tilt_compass import TiltCompassParameters, TiltCompassR
 class FilterParameters(Parameters):
     """Assumptions of the filter in addition to the parameters of its instruments."""
 
-    first_place_m: Annotated[Positive, Field(description="deviation of position before the first solution, m")] = 30.0
-    first_speed_m_s: Annotated[Positive, Field(description="deviation of velocity before that, m/s")] = 3.0
-    first_tilt_deg: Annotated[Positive, Field(description="deviation of pitch and roll before any reading, deg")] = 5.0
-    first_heading_deg: Annotated[Positive, Field(description="deviation of heading before any reading, deg")] = 20.0
+    initial_position_sd_m: Annotated[Positive, Field(description="deviation of position before the first fix, m")] = (
+        30.0
+    )
+    initial_velocity_sd_m_s: Annotated[Positive, Field(description="deviation of velocity before that, m/s")] = 3.0
+    initial_tilt_sd_deg: Annotated[Positive, Field(description="deviation of pitch and roll before readings, deg")] = (
+        5.0
+    )
+    initial_heading_sd_deg: Annotated[Positive, Field(description="deviation of heading before readings, deg")] = 20.0
     disturbance: Annotated[Positive, Field(description="assumed tilt error over acceleration over gravity")] = 3.0
-    unseen_m_s2: Annotated[Positive, Field(description="assumed unmodelled acceleration, m/s2")] = 0.3
+    unmodelled_acceleration_m_s2: Annotated[Positive, Field(description="assumed unmodelled acceleration, m/s2")] = 0.3
     gate: Annotated[Positive, Field(description="maximum normalised innovation of an accepted reading")] = 5.0
-    most_refused: Annotated[int, Field(ge=1, description="rejected solutions in a row before a restart")] = 10
-    most_repeats: Annotated[int, Field(ge=2, description="equal readings in a row of a stuck instrument")] = 8
+    max_rejected_fixes: Annotated[int, Field(ge=1, description="rejected solutions in a row before a restart")] = 10
+    max_repeated_fixes: Annotated[int, Field(ge=2, description="equal readings in a row of a stuck instrument")] = 8
 
 
 @dataclass(frozen=True)
@@ -141,8 +145,8 @@ class NavigationFilter:
         # in the order of the error vector
         deviations = np.concatenate(
             [
-                np.repeat([p.first_place_m, p.first_speed_m_s], 3),
-                np.radians([p.first_tilt_deg, p.first_tilt_deg, p.first_heading_deg]),
+                np.repeat([p.initial_position_sd_m, p.initial_velocity_sd_m_s], 3),
+                np.radians([p.initial_tilt_sd_deg, p.initial_tilt_sd_deg, p.initial_heading_sd_deg]),
                 np.repeat([gyro_bias, accelerometer_bias, 1.0], 3),
                 self.rtk.velocity_wander_m_s,
                 [float(np.radians(np.linalg.norm(np.array(heading_biases_deg))))],
@@ -201,14 +205,14 @@ class NavigationFilter:
         )
         arrivals = s.times_s + self.rtk.latency_s
         rows = np.column_stack([s.times_s, arrivals, s.positions_m, s.velocities_m_s, wanders, noises, s.fixed])
-        rows[_stuck(s.positions_m, self.parameters.most_repeats), kernels.GPS_POSITION] = np.nan
+        rows[_stuck(s.positions_m, self.parameters.max_repeated_fixes), kernels.GPS_POSITION] = np.nan
         return rows
 
     def _tilt_rows(self, r: TiltCompassReadings) -> Float64[np.ndarray, "n 5"]:
         """Readings in the kernels' columns."""
         rows = np.column_stack([r.times_s, r.up_body, 0.5 * np.pi - r.headings_rad])
         for column, values in ((kernels.UP, r.up_body), (kernels.YAW, r.headings_rad[:, None])):
-            rows[_stuck(values, self.parameters.most_repeats), column] = np.nan
+            rows[_stuck(values, self.parameters.max_repeated_fixes), column] = np.nan
         return rows
 
     def _tuning(self, step_s: float) -> kernels.Tuning:
@@ -231,12 +235,12 @@ class NavigationFilter:
             tan_dip=float(np.tan(np.radians(c.dip_deg))),
             lag_s=c.lag_s,
             disturbance=p.disturbance,
-            unmodelled_acceleration_m_s2=p.unseen_m_s2,
+            unmodelled_acceleration_m_s2=p.unmodelled_acceleration_m_s2,
             gate=p.gate,
-            max_rejected_fixes=p.most_refused,
-            first_position_m=p.first_place_m,
-            first_velocity_m_s=p.first_speed_m_s,
-            first_tilt_rad=float(np.radians(p.first_tilt_deg)),
+            max_rejected_fixes=p.max_rejected_fixes,
+            first_position_m=p.initial_position_sd_m,
+            first_velocity_m_s=p.initial_velocity_sd_m_s,
+            first_tilt_rad=float(np.radians(p.initial_tilt_sd_deg)),
         )
 
 

@@ -94,7 +94,7 @@ class Lava(Parameters):
     lobe_thickness_m: Annotated[NonNegative, Field(description="median thickness of a lobe, m")] = 1.5
     flow_to_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth the flows run to")] = 280.0
     lobe_contrast: Annotated[Fraction, Field(description="RMS of the lobes' log albedo")] = 0.05
-    aa_share: Annotated[Fraction, Field(description="fraction of the ground under a'a")] = 0.25
+    aa_fraction: Annotated[Fraction, Field(description="fraction of the ground under a'a")] = 0.25
     aa_block_m: Annotated[Positive, Field(description="size of its blocks, m")] = 6.0
     aa_relief_m: Annotated[NonNegative, Field(description="RMS height of its blocks, m")] = 0.45
     aa_contrast: Annotated[float, Field(ge=-1.0, le=1.0, description="log albedo of a'a over pahoehoe's")] = -0.06
@@ -130,7 +130,7 @@ class Lava(Parameters):
             size = scale * self.lobe_length_m
             field = draw_smooth_fields(ground.period_m, size, size, 0.0, rng)[..., 0]
             patches += np.float32(strength) * resample(field, blocks.side)
-        threshold = float(np.quantile(patches[::4, ::4], 1.0 - self.aa_share))
+        threshold = float(np.quantile(patches[::4, ::4], 1.0 - self.aa_fraction))
         cover = np.clip((patches - np.float32(threshold)) * np.float32(6.0) + np.float32(0.5), 0.0, 1.0)
         relief = np.float32(self.pahoehoe_relief_m) + np.float32(self.aa_relief_m - self.pahoehoe_relief_m) * cover
         relief *= rng.standard_normal(relief.shape, dtype=np.float32)

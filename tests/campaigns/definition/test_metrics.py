@@ -41,8 +41,8 @@ def _campaign(folder: Path, metric: str, population: str = "valid", bound: str =
         ("velocity_eror_m_s", "valid", "bound = 5.0", "metric", "did you mean 'velocity_error_m_s'?"),
         ("velocity_error_m_s + wind_m", "valid", "bound = 5.0", "metric", "unknown column of numbers 'wind_m'"),
         ("answerd", "valid", "", "metric", "did you mean 'answered'?"),
-        ("velocity_error_m_s", "valid and rooom", "bound = 5.0", "population", "did you mean 'room'?"),
-        ("room", "valid", "bound = 5.0", "metric", "unknown column of numbers 'room'"),
+        ("velocity_error_m_s", "valid and answer_in_tim", "bound = 5.0", "population", "did you mean 'answer_in_time'?"),
+        ("feasible_overlap", "valid", "bound = 5.0", "metric", "unknown column of numbers 'feasible_overlap'"),
     ],
 )
 def test_misspelt_columns_are_found_before_terrains_are_built(

@@ -147,9 +147,9 @@ def test_a_site_that_is_a_table_and_a_distribution_beyond_numbers_are_problems_o
         load_campaign(str(path))
     path.write_text(
         'name = "x"\nscenario = "descent"\ncases = 3\nseed = 1\n[dispersions]\n'
-        '"place.east_m" = {distribution = "poisson", mu = 1e300}\n'
+        '"location.east_m" = {distribution = "poisson", mu = 1e300}\n'
     )
     with pytest.raises(
-        ConfigurationError, match=r'dispersions\."place.east_m": poisson is not defined for mu = 1e\+300'
+        ConfigurationError, match=r'dispersions\."location.east_m": poisson is not defined for mu = 1e\+300'
     ):
         load_campaign(str(path))

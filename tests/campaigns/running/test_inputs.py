@@ -95,7 +95,7 @@ def test_eight_descents_over_gusev_need_eight_terrains() -> None:
     campaign = load_campaign("dimes-gusev", [], 8)
     assert len(find_used_inputs(campaign, range(8))) == 8
     parameters: list[Any] = [campaign.parameters(case) for case in range(8)]
-    assert {one.place.terrain for one in parameters} == set(find_used_inputs(campaign, range(8)))
+    assert {one.location.terrain for one in parameters} == set(find_used_inputs(campaign, range(8)))
 
 
 @pytest.mark.parametrize("name", ["hda-hazardous", "vtt-montecarlo", "vtt-accuracy", "dimes-fieldtest", "dimes-smoke"])

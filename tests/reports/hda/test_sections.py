@@ -96,9 +96,9 @@ def test_sites_against_the_truth() -> None:
 def test_crashed_flights_are_counted_as_not_finished() -> None:
     frame = landing_frame(10)
     gone = ["site_reported", "site_safe", "no_site_reported", "answered"]
-    frame = frame.astype(dict.fromkeys([*gone, "roomy_exists"], object))
+    frame = frame.astype(dict.fromkeys([*gone, "wide_site_exists"], object))
     frame.loc[0, gone] = None
-    frame.loc[0, "roomy_exists"] = True
+    frame.loc[0, "wide_site_exists"] = True
     assert sum(row["not finished"] for row in outcome_counts(frame).values()) == 1
 
 
@@ -145,16 +145,16 @@ def test_faults_by_size() -> None:
 
 def _changed(column: str, sizes: list[float], shares: list[float]) -> pd.DataFrame:
     """Flights with one change each, of a hundred features seen."""
-    frame = landing_frame(len(sizes)).assign(roll_deg=0.0, pitch_deg=0.0, yaw_deg=0.0, height_change_share=0.0)
+    frame = landing_frame(len(sizes)).assign(roll_deg=0.0, pitch_deg=0.0, yaw_deg=0.0, height_change_fraction=0.0)
     frame[column] = sizes
-    return frame.assign(features_in_view=100, tracks_right=100.0 * np.array(shares), tracked_well=True)
+    return frame.assign(features_in_view=100, tracks_correct=100.0 * np.array(shares), tracked_well=True)
 
 
 def test_knee_stands_where_the_curve_falls_below_nine_tenths() -> None:
     (curve,) = curves(_changed("roll_deg", [0.0, 8.0, 12.0, 16.0], [1.0, 0.96, 0.92, 0.52]))
     assert curve.knee_up == pytest.approx(12.2)
     assert np.isnan(curve.knee_down)
-    (curve,) = curves(_changed("height_change_share", [-0.4, -0.2, 0.0, 0.2], [0.4, 0.9, 1.0, 0.99]))
+    (curve,) = curves(_changed("height_change_fraction", [-0.4, -0.2, 0.0, 0.2], [0.4, 0.9, 1.0, 0.99]))
     assert curve.knee_down == pytest.approx(20.0)
     assert curve.knee_up == float("inf")
 
@@ -173,14 +173,14 @@ def test_map_errors_follow_their_drivers() -> None:
     rng = np.random.default_rng(4)
     n = 60
     frame = landing_frame(n).assign(
-        baseline_share=rng.uniform(0.05, 0.5, n),
+        baseline_fraction=rng.uniform(0.05, 0.5, n),
         texture=rng.uniform(0.1, 2.0, n),
         height_m=10.0,
         range_m=10.0,
         range_error_m=rng.normal(0.0, 0.1, n),
         slope_error_rms_deg=1.0,
     )
-    frame["elevation_noise_m"] = 0.01 / frame["baseline_share"]
+    frame["elevation_noise_m"] = 0.01 / frame["baseline_fraction"]
     frame["elevation_rms_m"] = np.abs(frame["range_error_m"])
     mapped = map_rows(_subject(frame))
     assert mapped is not None

@@ -68,7 +68,7 @@ def _shared(skips: int = 5) -> pd.DataFrame:
 def test_steps_stand_beside_fig_8() -> None:
     frame = _shared()
     frame.loc[0, ["selectable", "tracked", "true_track"]] = False  # a target on the edge counts for nothing
-    found = step_rates(subject(frame, legs=[{"motion": "approach", "step_share": 0.05}]))
+    found = step_rates(subject(frame, legs=[{"motion": "approach", "step_fraction": 0.05}]))
     at = {(one["line"], round(one["step"])): one for one in found}
     assert (at["vtt", 5]["good"].hits, at["vtt", 5]["good"].n, at["vtt", 5]["paper_percent"]) == (9, 9, 100.0)
     assert (at["vtt", 5]["all_targets"].hits, at["vtt", 5]["all_targets"].n) == (9, 10)
@@ -141,7 +141,7 @@ def test_table_iii_is_as_printed() -> None:
 
 
 def test_facts_of_single_runs() -> None:
-    frame = rows(4, target_moved_m=[0.1, 0.2, 0.3, 0.4], tracked=[True, True, True, False])
+    frame = rows(4, target_motion_m=[0.1, 0.2, 0.3, 0.4], tracked=[True, True, True, False])
     shown = {row[""]: row for row in table(SINGLE_RUNS(subject(frame, "vtt-checkout-2")))}
     moved = shown["target moved, first to last estimate (cm)"]
     assert (moved["Paper"], moved["Ours"]) == ("36", "25.0 (10.0 to 40.0)")

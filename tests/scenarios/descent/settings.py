@@ -9,7 +9,7 @@ from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 
 #: A small world that is built in a moment.
-WORLD: dict[str, Any] = {"terrain": {"samples": 1024, "spacing_m": 3.0}, "place": {"bank": 1}}
+WORLD: dict[str, Any] = {"terrain": {"samples": 1024, "spacing_m": 3.0}, "location": {"bank": 1}}
 FLAT = {"samples": 1024, "spacing_m": 3.0, "rms_slope_deg": 0.0, "craters_per_km2": 0.0}
 DESCENT = {
     "wind_east_m_s": 14.0,

@@ -72,7 +72,7 @@ def test_over_relief_errors_are_those_of_geometry() -> None:
     errors, expected = [], []
     for case in range(CASES):
         tracks, states, measurements, surface = _tracked(
-            case, terrain=RELIEF, place={"bank": 1, "east_m": 511.0 * case}
+            case, terrain=RELIEF, location={"bank": 1, "east_m": 511.0 * case}
         )
         errors.append(_errors(tracks, states))
         expected += [_formula(track, states, measurements, surface) for track in tracks]

@@ -23,7 +23,7 @@ def test_a_right_answer_takes_the_velocity_out() -> None:
 def test_steering_takes_out_no_more_than_it_can() -> None:
     fast = 2.0 * DRIFT
     landed = touchdown(EXACT, fast, fast.copy(), 17.0, _rng())
-    np.testing.assert_allclose(np.hypot(*landed.with_answer), 30.0 - EXACT.most_steered_m_s)
+    np.testing.assert_allclose(np.hypot(*landed.with_answer), 30.0 - EXACT.max_steered_m_s)
 
 
 def test_a_wrong_answer_does_harm() -> None:

@@ -58,7 +58,7 @@ def nine() -> CaseResult:
 def test_the_truth_is_of_what_the_answer_is_of(nine: CaseResult) -> None:
     """The inertial unit makes no errors here, so that its velocities are true of every span."""
     row: Any = nine.row
-    assert (nine.outcome, row["stream_pictures"], row["answered_after"]) == ("VALID", 9, 2)
+    assert (nine.outcome, row["stream_pictures"], row["pictures_before_answer"]) == ("VALID", 9, 2)
     assert np.isnan(row["velocity_error_after_1_m_s"])
     after = [row[f"velocity_error_after_{number}_m_s"] for number in range(2, 10)]
     # 400 Hz samples of a swinging descent, added up by the trapezoidal rule
@@ -77,9 +77,9 @@ def test_an_estimator_of_three_gets_those_of_a_descent_of_three(nine: CaseResult
     ]
     for name in ("velocity_true_x_m_s", "velocity_true_y_m_s"):
         assert nine.row[f"dimes.{name}"] == pytest.approx(three[name], rel=1e-12)
-    assert (nine.row["room_first_pair"], nine.row["room_second_pair"]) == (
-        three["room_first_pair"],
-        three["room_second_pair"],
+    assert (nine.row["feasible_overlap_first_pair"], nine.row["feasible_overlap_second_pair"]) == (
+        three["feasible_overlap_first_pair"],
+        three["feasible_overlap_second_pair"],
     )
     assert float(nine.row["dimes.velocity_error_m_s"]) < 1.0
     assert "dimes.stream_pictures" not in nine.row
@@ -101,7 +101,7 @@ def test_a_span_between_pictures() -> None:
     # the same instants of the same flight, told by other pictures
     for axis in "xy":
         assert two.row[f"velocity_true_{axis}_m_s"] == pytest.approx(nine.row[f"velocity_true_{axis}_m_s"], abs=1e-9)
-    assert "room" not in two.row
+    assert "feasible_overlap" not in two.row
     assert "velocity_change_error_m_s" not in two.row
 
 

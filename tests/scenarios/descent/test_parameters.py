@@ -20,7 +20,7 @@ SITES = ("gusev", "ivanpah")
 @pytest.mark.parametrize(
     ("wrong", "names"),
     [
-        ({"place": {"bank": 2, "terrain": 2}}, "0 to 1"),
+        ({"location": {"bank": 2, "terrain": 2}}, "0 to 1"),
         ({"descent": {"altitude_first_m": -5.0}}, "altitude_first_m"),
         ({"descent": {"wind_south_m_s": 1.0}}, "wind_south_m_s"),
         ({"render": {"backend": "vulkan"}}, "osmesa"),
@@ -63,7 +63,7 @@ def test_complete_parameters_are_read_back_as_they_were(stated: dict[str, Any]) 
 
 def test_a_site_is_lit_as_it_is() -> None:
     """Sunlight and reflectance are the site's; signals follow sunlight and air."""
-    small = {"terrain": {"samples": 256, "spacing_m": 16.0}, "place": {"bank": 1}}
+    small = {"terrain": {"samples": 256, "spacing_m": 16.0}, "location": {"bank": 1}}
     mars, earth = (World.of(DescentScenarioParameters.model_validate({"site": name} | small)) for name in SITES)
     assert mars.ground is not None
     assert mars.sun.angular_radius_rad == pytest.approx(0.00308, rel=0.01)

@@ -47,7 +47,9 @@ def test_a_simulated_flight_from_its_file_is_the_same_case(tmp_path: Path) -> No
     flown = create_flight(p, world.surface, Streams(1, "test", 0))
     times = np.arange(-5.0, flown.firing_s + 1.0, 0.02)
     truth = flown.motion.motion(times)
-    place = np.array([p.place.east_m, p.place.north_m, world.surface.height(p.place.east_m, p.place.north_m)])
+    place = np.array(
+        [p.location.east_m, p.location.north_m, world.surface.height(p.location.east_m, p.location.north_m)]
+    )
     file = _written(
         tmp_path,
         times + 1234.0,

@@ -33,8 +33,8 @@ def test_a_case_is_a_function_of_its_parameters_and_streams(nominal: CaseResult)
 def test_every_dispersion_of_the_catalogue_is_read_back() -> None:
     """Each under the end of its path, from the objects that were simulated; the fault by its name and size."""
     dispersed = load_campaign("dimes-gusev").draws(3)
-    drawn = {path: value for path, value in dispersed.items() if path != "place.terrain"}
-    tables: dict[str, Any] = {"place": dict(WORLD["place"]), "faults": {"late_s": 0.25}}
+    drawn = {path: value for path, value in dispersed.items() if path != "location.terrain"}
+    tables: dict[str, Any] = {"location": dict(WORLD["location"]), "faults": {"late_s": 0.25}}
     for path, value in drawn.items():
         *names, last = path.split(".")
         table = tables
@@ -99,7 +99,7 @@ def test_with_perfect_instruments_over_flat_ground_the_velocity_is_right(wind: t
 def test_perfect_instruments_are_told_to_be(nominal: CaseResult) -> None:
     """Over flat ground nothing is left but the altitude's way from the radar's last reading to the picture."""
     row = run(**PERFECT, terrain=FLAT).row
-    for name in ("attitude_error_common_deg", "attitude_error_own_deg"):
+    for name in ("attitude_error_common_deg", "attitude_error_independent_deg"):
         assert float(row[name]) < 1e-4 < float(nominal.row[name])
     # a tenth of a second at 0.3 m/s2 and at half a swing's 2 m/s: 0.1 m of 1400
     assert abs(float(row["altitude_error_common"])) < 1e-4 < abs(float(nominal.row["altitude_error_common"]))
@@ -111,7 +111,7 @@ def test_errors_of_instruments_are_of_their_class() -> None:
     rows = [run(case).row for case in range(4)]
     altitude = np.array([float(row["altitude_error_common"]) for row in rows])
     attitude = np.array([float(row["attitude_error_common_deg"]) for row in rows])
-    own = np.array([float(row["attitude_error_own_deg"]) for row in rows])
+    own = np.array([float(row["attitude_error_independent_deg"]) for row in rows])
     assert np.abs(altitude).max() < 0.015
     assert 0.01 < attitude.max() < 0.5
     # between pictures the gyros drift by little: tags that are off by 1 ms at 20 deg/s are most of it
@@ -134,7 +134,7 @@ def test_an_attitude_error_makes_the_velocity_error_it_must() -> None:
         tilt = np.radians(0.8) * np.array([np.cos(turn), np.sin(turn), 0.0])
         expected.append(np.cross(tilt, velocity)[:2])
         assert row["attitude_error_common_deg"] == pytest.approx(0.8, abs=1e-3)
-        assert float(row["attitude_error_own_deg"]) < 1e-3
+        assert float(row["attitude_error_independent_deg"]) < 1e-3
     np.testing.assert_allclose(errors, expected, atol=0.15, rtol=0.13)
     assert np.abs(expected).max() > 1.0
 
@@ -165,10 +165,10 @@ def test_conditions_are_read_from_the_simulated_objects(nominal: CaseResult) -> 
 
 def test_no_room_for_a_template_is_an_outcome_without_velocity() -> None:
     """Swinging from 42 deg to the other side the pictures do not share enough ground, by truth as by measurement."""
-    swinging = {"cone_angle_deg": 42.0, "cone_phase_deg": 0.0, "cone_minor_share": 0.0}
+    swinging = {"cone_angle_deg": 42.0, "cone_phase_deg": 0.0, "cone_minor_fraction": 0.0}
     result = run(descent=DESCENT | swinging)
     assert result.outcome == "NO_TEMPLATE_AREA"
-    assert result.row["room"] is False
+    assert result.row["feasible_overlap"] is False
     assert not result.answered
     for name in ("velocity", "firing_velocity"):
         assert math.isnan(float(result.row[f"{name}_error_m_s"]))
@@ -178,9 +178,9 @@ def test_no_room_for_a_template_is_an_outcome_without_velocity() -> None:
 def test_room_is_judged_by_truth_alone(nominal: CaseResult) -> None:
     """Altitudes measured at half make DIMES look in the wrong places; the geometry has not changed."""
     wrong = run(faults={"altitude_error": 0.4})
-    for name in ("room", "room_first_pair", "room_second_pair"):
+    for name in ("feasible_overlap", "feasible_overlap_first_pair", "feasible_overlap_second_pair"):
         assert wrong.row[name] == nominal.row[name]
-    assert nominal.row["room"] is True
+    assert nominal.row["feasible_overlap"] is True
 
 
 def test_in_the_dark_nothing_is_reported() -> None:
@@ -201,7 +201,7 @@ def test_real_terrain_can_be_descended_on(tmp_path: Path) -> None:
     """A terrain model from a file in the site's surround; the pictures are of it."""
     heights = 30.0 * np.sin(np.arange(200) / 9.0)[:, None] * np.cos(np.arange(200) / 7.0)
     np.savez(tmp_path / "dtm.npz", dem=heights, dem_gsd=8.0)
-    middle = {"place": {"bank": 1, "east_m": 1536.0, "north_m": 1536.0}}
+    middle = {"location": {"bank": 1, "east_m": 1536.0, "north_m": 1536.0}}
     source = {"source": {"dtm": str(tmp_path / "dtm.npz")}}
     result = run(site="gusev", terrain=WORLD["terrain"] | source, **middle)
     without = run(site="gusev", **middle)

@@ -63,5 +63,5 @@ def test_bad_pixels_are_listed_or_not() -> None:
         faulty_detector(Faults.model_validate({name: 0.01}), detector).defects
         for name in ("bad_pixels", "listed_bad_pixels")
     )
-    assert (plain.dead_share, plain.hot_share, plain.listed) == (0.01, 0.01, False)
-    assert (listed.dead_share, listed.hot_share, listed.listed) == (0.01, 0.01, True)
+    assert (plain.dead_fraction, plain.hot_fraction, plain.listed) == (0.01, 0.01, False)
+    assert (listed.dead_fraction, listed.hot_fraction, listed.listed) == (0.01, 0.01, True)

@@ -16,7 +16,7 @@ from marsyard.sim.streams import Streams
 GRAVITY, HEIGHT = 9.8, 10.0
 SITE = np.array([4.0, 3.0, 0.0])
 GROUND = GroundPatch(SITE[:2] - 15.0, 0.5, np.zeros((61, 61)))
-FLOATING: dict[str, object] = {"rtk": {"float_share": 1.0}, "transit": {"hover_s": 8.0}}
+FLOATING: dict[str, object] = {"rtk": {"float_fraction": 1.0}, "transit": {"hover_s": 8.0}}
 
 
 def _flown(case: int, **changes: object) -> tuple[Transit, Streams]:
@@ -141,7 +141,7 @@ def test_long_after_the_landing_the_receivers_error_is_another_one() -> None:
             wandering = {"wander_m": [0.42, 0.55, 0.8], "noise_m": [0.03, 0.03, 0.05], "correlation_s": 30.0}
             transit, streams = _flown(
                 case,
-                rtk={"float_share": 1.0, "floating": wandering},
+                rtk={"float_fraction": 1.0, "floating": wandering},
                 air={"gust_m_s": 0.0, "vertical_gust_m_s": 0.0},
                 transit={"hover_s": 8.0},
                 averaging_after_s=later,
@@ -154,7 +154,7 @@ def test_long_after_the_landing_the_receivers_error_is_another_one() -> None:
 
 
 def test_without_solutions_there_is_no_measured_touchdown() -> None:
-    transit, streams = _flown(0, rtk={"float_share": 0.0, "outages": [{"start_s": 6.0, "duration_s": 200.0}]})
+    transit, streams = _flown(0, rtk={"float_fraction": 0.0, "outages": [{"start_s": 6.0, "duration_s": 200.0}]})
     down = _down(transit, streams)
     assert down.gps_solutions == 0
     assert np.isnan(horizontal_distance_m(down.gps_m, SITE))
@@ -168,6 +168,6 @@ def test_a_stuck_altimeter_makes_a_hard_landing() -> None:
 
 
 def test_a_landing_that_takes_too_long_is_none() -> None:
-    transit, streams = _flown(0, guidance={"longest_s": 3.0})
+    transit, streams = _flown(0, guidance={"max_duration_s": 3.0})
     unit = RangingUnit.drawn(LaserParameters(), streams.generator("laser"))
     assert land(transit, SITE, GROUND, unit, streams) is None

@@ -21,8 +21,8 @@ def test_every_match_is_counted_by_what_became_of_it() -> None:
     row = solved_row(HdaDetails((view, view), matches=matches))
     assert row == {
         "points": 50,
-        "matched_share": 50 / 59,
-        "matches_unlike": 4,
+        "matched_fraction": 50 / 59,
+        "matches_dissimilar": 4,
         "matches_out_of_bounds": 3,
         "matches_not_returned": 2,
     }

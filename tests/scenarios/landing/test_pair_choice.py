@@ -28,7 +28,7 @@ def _poses(step_m: float, count: int = 40, turned_deg: float = 0.0, pitched_deg:
 
 
 def test_the_shortest_baseline_that_is_wanted_has_the_most_overlap() -> None:
-    choice = choose_pair(_poses(0.125), RANGES, CAMERA, PairParameters(wanted_share=0.2), HEIGHT)
+    choice = choose_pair(_poses(0.125), RANGES, CAMERA, PairParameters(max_baseline_fraction=0.2), HEIGHT)
     assert (choice.first, choice.second) == (0, 16)
     assert choice.baseline_m == pytest.approx(2.0)
     # 640 px of 7.4 um behind 6 mm are 7.89 m wide from 10 m; distortion, 1.8 % in the corners, makes it 8.04 m there
@@ -37,10 +37,14 @@ def test_the_shortest_baseline_that_is_wanted_has_the_most_overlap() -> None:
 
 def test_where_overlap_falls_before_the_baseline_is_there_their_product_is_greatest() -> None:
     """Of b (1 - b / w) the greatest is at half the width, 4.0 m, if so much is wanted."""
-    choice = choose_pair(_poses(0.125), RANGES, CAMERA, PairParameters(wanted_share=1.0, least_overlap=0.1), HEIGHT)
+    choice = choose_pair(
+        _poses(0.125), RANGES, CAMERA, PairParameters(max_baseline_fraction=1.0, min_overlap=0.1), HEIGHT
+    )
     assert choice.baseline_m == pytest.approx(4.0, abs=0.13)
     # with more overlap asked for, as much baseline as that leaves
-    choice = choose_pair(_poses(0.125), RANGES, CAMERA, PairParameters(wanted_share=1.0, least_overlap=0.7), HEIGHT)
+    choice = choose_pair(
+        _poses(0.125), RANGES, CAMERA, PairParameters(max_baseline_fraction=1.0, min_overlap=0.7), HEIGHT
+    )
     assert choice.baseline_m == pytest.approx(0.3 * 8.0, abs=0.13)
 
 
@@ -61,7 +65,7 @@ def test_pictures_without_a_range_count_by_the_commanded_height() -> None:
 
 
 def test_too_little_overlap_is_taken_if_there_is_nothing_else() -> None:
-    choice = choose_pair(_poses(5.0, 3), RANGES[:3], CAMERA, PairParameters(least_overlap=0.9), HEIGHT)
+    choice = choose_pair(_poses(5.0, 3), RANGES[:3], CAMERA, PairParameters(min_overlap=0.9), HEIGHT)
     assert (choice.first, choice.second) == (0, 1)
     with pytest.raises(ValueError, match="at least 2"):
         choose_pair(_poses(1.0, 1), RANGES[:1], CAMERA, PairParameters(), HEIGHT)

@@ -11,5 +11,5 @@ from marsyard.scenarios.landing.scenario import LandingScenario
 
 @pytest.mark.parametrize(("bank", "built"), [(1, 1), (KEPT_GROUNDS, KEPT_GROUNDS), (KEPT_GROUNDS + 1, 0), (10_000, 0)])
 def test_terrains_of_a_bank_too_large_to_keep_are_built_by_their_flights(bank: int, built: int) -> None:
-    parameters = LandingScenarioParameters.model_validate({"place": {"bank": bank}})
+    parameters = LandingScenarioParameters.model_validate({"location": {"bank": bank}})
     assert LandingScenario().shared_inputs(parameters) == tuple(range(built))

@@ -53,11 +53,11 @@ def truth(safe_places: int) -> GroundTruth:
 
 
 @pytest.mark.parametrize(
-    ("safe_places", "population"), [(0, "none_exists"), (3, "narrow_exists"), (25, "roomy_exists")]
+    ("safe_places", "population"), [(0, "no_safe_site_exists"), (3, "narrow_site_exists"), (25, "wide_site_exists")]
 )
 def test_every_flight_is_in_one_population(safe_places: int, population: str) -> None:
     row = site_populations(truth(safe_places))
-    populations = ("none_exists", "narrow_exists", "roomy_exists")
+    populations = ("no_safe_site_exists", "narrow_site_exists", "wide_site_exists")
     assert [name for name in populations if row[name]] == [population]
 
 
@@ -88,7 +88,7 @@ def test_no_ground_is_judged_where_nothing_landed() -> None:
 def test_every_hazardous_flight_has_a_requirement_on_its_answer() -> None:
     asked = load_campaign("hda-hazardous").configuration.requirements
     populations = {one.population for one in asked}
-    assert {"none_exists", "narrow_exists", "roomy_exists"} <= populations
-    (narrow,) = [one for one in asked if one.population == "narrow_exists"]
+    assert {"no_safe_site_exists", "narrow_site_exists", "wide_site_exists"} <= populations
+    (narrow,) = [one for one in asked if one.population == "narrow_site_exists"]
     # a verdict by confidence: "met" must be shown, not seen
     assert (narrow.metric, narrow.decide_by) == ("safe_or_no_site_reported", "confidence")

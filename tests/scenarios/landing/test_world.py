@@ -19,7 +19,7 @@ def test_a_camera_at_the_place_that_it_is_stated_for_sees_that_places_sun(site_n
 
 def test_a_detectors_electrons_do_not_depend_on_where_the_sun_stood_in_its_datasheet() -> None:
     """Responsivity is stated in proportion to the sunlight that is stated with it."""
-    small = {"terrain": {"samples": 256}, "place": {"bank": 1}}
+    small = {"terrain": {"samples": 256}, "location": {"bank": 1}}
     electrons = []
     for sun_au in (1.0, 1.5, 3.0):
         detector = {"preset": "xc-55", "sun_au": sun_au, "responsivity_e_s": 1e7 / sun_au**2}

@@ -64,7 +64,7 @@ def test_rows_tell_of_right_matches_alone() -> None:
     offsets[~right] = 500.0
     told = agreement_row([PairAgreement(PairMatches(np.zeros((2, 40, 2)), right), offsets)])
     assert (told["matches"], told["residual_median_px"], told["residual_90_percent_px"]) == (20, 5.0, 5.0)
-    assert told["matches_wrong_share"] == 0.5
+    assert told["outlier_fraction"] == 0.5
     few = agreement_row([PairAgreement(PairMatches(np.zeros((2, 40, 2)), np.arange(40) < 10), offsets)])
     assert np.isnan(few["residual_median_px"])
     assert few["pairs_matched"] == 0

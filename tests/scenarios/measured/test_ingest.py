@@ -144,10 +144,10 @@ def test_the_opportunity_frames(tmp_path: Path, shared_data: Path) -> None:
     assert 0.2 < row["residual_median_px"] < 1.0
     assert row["residual_90_percent_px"] < 2.0
     # by the mast's encoders: azimuth from -0.340 to 0.254 rad, elevation from -0.110 to -0.209
-    assert 33.0 < row["turned_most_deg"] < 36.0
-    assert np.isclose(row["moved_most_m"], 0.0671, atol=1e-3)
+    assert 33.0 < row["max_rotation_deg"] < 36.0
+    assert np.isclose(row["max_translation_m"], 0.0671, atol=1e-3)
     # the label says when: 143 s apart; and the fisheye's single frame cannot be a case of its own
-    assert np.isclose(row["lasted_s"], 143.258)
+    assert np.isclose(row["duration_s"], 143.258)
     (folder / "pictures.csv").write_text(f"case,file\nhazcam,{frames}/{hazcam}\n")
     with pytest.raises(IngestError, match="case 'hazcam' has 1 pictures; allowed for matching: 2 to 50"):
         ingest(folder, tmp_path / "out")

@@ -58,7 +58,9 @@ def test_descents_come_through_as_they_were_measured(tmp_path: Path, ned: bool) 
     # what turns in rounding: the axes there and back
     assert np.allclose(found, expected.velocity_m_s, rtol=0.0, atol=1e-6)
     assert np.isclose(row["velocity_error_m_s"], np.hypot(*(expected.velocity_m_s - TRUE)), atol=1e-6)
-    assert np.isclose(row["beside_inertial_m_s"], np.hypot(*(expected.velocity_m_s - TRUE - [9.0, -4.0])), atol=1e-6)
+    assert np.isclose(
+        row["inertial_difference_m_s"], np.hypot(*(expected.velocity_m_s - TRUE - [9.0, -4.0])), atol=1e-6
+    )
     assert row["pair_discrepancy_m_s"] < 1.0
     other = np.array([row[f"phase_correlation.velocity_estimated_{axis}_m_s"] for axis in "xy"], dtype=np.float64)
     assert np.isclose(row["phase_correlation.apart_m_s"], np.linalg.norm(other - found))
@@ -92,7 +94,7 @@ def test_positions_stand_in_for_inertial_velocities_and_for_truth(tmp_path: Path
     write_texts(folder, rows)
     row: dict[str, Any] = dict(ran(folder, tmp_path / "out").row)
     assert np.isclose(row["velocity_true_x_m_s"], TRUE[0])
-    assert np.isclose(row["beside_inertial_m_s"], row["velocity_error_m_s"])
+    assert np.isclose(row["inertial_difference_m_s"], row["velocity_error_m_s"])
     # the poses are exact: what is left is the matching of pictures with noise, rows summed by four
     assert row["residual_median_px"] < 1.0
     assert row["matches"] > 100
@@ -102,14 +104,14 @@ def test_landings_are_held_against_measured_and_true_poses(tmp_path: Path) -> No
     folder = landing_folder(tmp_path / "in", inputs.landing(), "landing", true_poses=True)
     row: dict[str, Any] = dict(ran(folder, tmp_path / "out", scores=[f"{__name__}:site_score"]).row)
     assert row["site_reported"]
-    assert row["rotation_error_deg"] == row["rotation_beside_poses_deg"]
+    assert row["rotation_error_deg"] == row["rotation_pose_difference_deg"]
     assert row["rotation_error_deg"] < 0.5
     assert row["residual_median_px"] < 0.5
-    assert np.isclose(row["moved_most_m"], np.linalg.norm([1.2, 0.2, -0.2]))
-    assert np.isclose(row["site_score_moved_m"], row["moved_most_m"])
+    assert np.isclose(row["max_translation_m"], np.linalg.norm([1.2, 0.2, -0.2]))
+    assert np.isclose(row["site_score_displacement_m"], row["max_translation_m"])
 
 
-@pytest.mark.parametrize(("turned_deg", "least", "most"), [(0.0, 0.0, 0.5), (0.5, 3.0, 12.0)])
+@pytest.mark.parametrize(("pair_rotation_deg", "least", "most"), [(0.0, 0.0, 0.5), (0.5, 3.0, 12.0)])
 def test_wrong_attitudes_show(tmp_path: Path, turned_deg: float, least: float, most: float) -> None:
     """An error about the direction of motion moves every match off its line by its angle in pixels."""
     folder = landing_folder(tmp_path / "in", inputs.landing(), "matching")

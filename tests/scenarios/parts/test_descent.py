@@ -128,7 +128,7 @@ def test_a_case_is_flown_measured_and_scored_by_what_the_parts_give() -> None:
     # the score is handed what the algorithm was, its answer, and the truth
     assert row["handed_altitude_m"] == pytest.approx(float(row["altitude_2_m"]) + 6.0, abs=1e-6)
     assert row["handed_error_m_s"] == pytest.approx(row["velocity_error_m_s"], abs=1e-9)
-    assert row["handed_touchdown_m_s"] == row["touchdown_speed_with_m_s"]
+    assert row["handed_touchdown_m_s"] == row["touchdown_speed_corrected_m_s"]
     assert row["handed_at_firing"] is True
 
 

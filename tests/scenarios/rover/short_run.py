@@ -10,5 +10,5 @@ SHORT: dict[str, Any] = {
     "start": {"distance_m": 3.6},
     "target": {"diameter_m": 0.8, "shape": 8, "yaw_deg": 30.0},
     "sun": {"azimuth_deg": 260.0, "elevation_deg": 50.0},
-    "legs": [{"motion": "approach", "goal_m": 3.3, "step_share": 0.1}],
+    "legs": [{"motion": "approach", "goal_m": 3.3, "step_fraction": 0.1}],
 }

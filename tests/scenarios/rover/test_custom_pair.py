@@ -42,7 +42,10 @@ def test_a_presets_pair_by_its_files_is_the_preset(
         write_cahvor(camera.moved(anywhere), tmp_path / f"{side}.cahvor")
     files = {side: str(tmp_path / f"{side}.cahvor") for side in ("left", "right")}
     placed = {"baseline_m": baseline_m, "toe_in_deg": toe_in_deg}
-    found, expected = CameraParameters.model_validate({"preset": name, "own": files | placed}).mast(), stereo_mast(name)
+    found, expected = (
+        CameraParameters.model_validate({"preset": name, "custom": files | placed}).mast(),
+        stereo_mast(name),
+    )
     points = np.array([[2.0, 0.3, -0.2], [4.0, -0.5, 0.4], [30.0, 1.0, 1.0]])
     for one, other in ((found.left, expected.left), (found.right, expected.right)):
         assert np.allclose(one.project(points)[0], other.project(points)[0], rtol=0.0, atol=1e-4)
@@ -53,7 +56,7 @@ def test_a_target_is_tracked_through_a_custom_pair(tmp_path: Path) -> None:
     camera, sheet = tmp_path / "cam0.yaml", tmp_path / "sensor.toml"
     camera.write_text(OPENCV)
     sheet.write_text(SHEET)
-    own = {"preset": "research-navcam", "own": {"left": str(camera), "baseline_m": 0.24}, "detector": str(sheet)}
+    own = {"preset": "research-navcam", "custom": {"left": str(camera), "baseline_m": 0.24}, "detector": str(sheet)}
     p = RoverScenarioParameters.model_validate({**SHORT, "camera": own})
     # all that the files said is in the campaign
     camera.unlink()
@@ -72,8 +75,11 @@ def test_a_target_is_tracked_through_a_custom_pair(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("stated", "message"),
     [
-        ({"own": {"left": "none.cahvor", "baseline_m": 0.2}}, "none.cahvor"),
-        ({"own": {"left": "small.yaml", "right": "large.yaml", "baseline_m": 0.2}}, "640 x 480 pixels, the right one"),
+        ({"custom": {"left": "none.cahvor", "baseline_m": 0.2}}, "none.cahvor"),
+        (
+            {"custom": {"left": "small.yaml", "right": "large.yaml", "baseline_m": 0.2}},
+            "640 x 480 pixels, the right one",
+        ),
         ({"detector": {"preset": "mer-descent-flown"}}, "rows_summed is 4; allowed for cameras on a mast: 1"),
     ],
 )

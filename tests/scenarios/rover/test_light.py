@@ -39,7 +39,7 @@ def test_pictures_of_a_run_are_lit_by_the_sun_of_their_time() -> None:
 
 def test_a_bright_sky_in_view_makes_full_frames_too_short() -> None:
     """Section 4.5: exposed for the subframe, what is about the target keeps its contrast, whatever else is in view."""
-    eastwards = {"start": {"distance_m": 9.0}, "legs": [{"motion": "approach", "goal_m": 8.5, "step_share": 0.1}]}
+    eastwards = {"start": {"distance_m": 9.0}, "legs": [{"motion": "approach", "goal_m": 8.5, "step_fraction": 0.1}]}
     sun_ahead = {"sun": {"azimuth_deg": 90.0, "elevation_deg": 30.0}}
     first = {
         of: run(**eastwards, **sun_ahead, exposure={"of": of}).stops[0].pictures for of in ("subframe", "full-frame")

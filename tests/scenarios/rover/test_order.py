@@ -27,7 +27,7 @@ def test_a_step_drives_by_what_was_tracked_and_mapped_before_it(monkeypatch: pyt
     record_calls(loop, "map_terrain", "map")
     record_calls(Vehicle, "drive", "drive and see how far")
     record_calls(loop, "visit_stop", "track")
-    leg = {"motion": "approach", "goal_m": 3.0, "step_share": 0.08, "autonav": True, "visual_odometry": True}
+    leg = {"motion": "approach", "goal_m": 3.0, "step_fraction": 0.08, "autonav": True, "visual_odometry": True}
     run = run_case(RoverScenarioParameters.model_validate({**SHORT, "legs": [leg]}), Streams(1, "rover tests", 0))
     steps = re.sub("d( d)+", "d", " ".join(word[0] for word in done))
     # the target is seen first; then each step is mapped, driven in parts that visual odometry joins, and tracked

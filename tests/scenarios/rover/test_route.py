@@ -45,7 +45,7 @@ def test_a_step_is_no_longer_than_asked() -> None:
 
 def test_an_approach_keeps_its_distance_and_offset() -> None:
     # 10 % of the camera's distance while that is far, and what is left at the end.
-    leg = LegParameters(motion="approach", step_share=0.1, goal_m=2.0)
+    leg = LegParameters(motion="approach", step_fraction=0.1, goal_m=2.0)
     (step,) = step_commands(leg, 0, at(8.0, 0.0))
     assert step.forward_m == pytest.approx(0.1 * np.hypot(8.0, 1.2))
     (last,) = step_commands(leg, 0, at(2.1, 0.0))

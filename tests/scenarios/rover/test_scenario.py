@@ -158,7 +158,7 @@ def test_trackers_share_the_pictures_of_a_drive() -> None:
         "drive": {**SHORT, "legs": [{"motion": "circle", "step_deg": 5.0, "steps": 2}]},
         "variants": [{"diameter_m": 0.8, "height_m": 0.5, "shape": 8, "yaw_deg": 30.0, "sun_azimuth_deg": 260.0}],
         "targets": [{"across": 0.0, "up": 0.5}, {"across": 0.4, "up": 0.5}],
-        "bands": [{"name": "at_10_deg", "least": 10.0, "most": 10.0}],
+        "bands": [{"name": "at_10_deg", "min": 10.0, "max": 10.0}],
     }
     wordless = "tests.scenarios.rover.trackers:Wordless"
     stated["drive"] = {**stated["drive"], "compared": ["pure-ncc", wordless]}

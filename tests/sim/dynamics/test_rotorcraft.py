@@ -32,7 +32,7 @@ SMOOTH = RotorcraftParameters(vibration=VibrationParameters(acceleration_m_s2=0.
 
 
 def _air(seed: int, **changes: float) -> Air:
-    span = TRANSIT.lead_s + TRANSIT.pictures_s + TAIL_S + GUIDANCE.wait_s + GUIDANCE.longest_s
+    span = TRANSIT.lead_s + TRANSIT.pictures_s + TAIL_S + GUIDANCE.wait_s + GUIDANCE.max_duration_s
     return Air.draw(AirParameters.model_validate(changes), CRAFT.step_s, span, np.random.default_rng(seed))
 
 

@@ -25,7 +25,7 @@ WILD = {
     "wind_north_m_s": -8.0,
     "gust_intensity_m_s": 3.0,
     "cone_angle_deg": 30.0,
-    "cone_minor_share": -0.6,
+    "cone_minor_fraction": -0.6,
     "cone_direction_deg": 70.0,
     "cone_phase_deg": 130.0,
     "nod_rate_deg_s": 60.0,
@@ -206,7 +206,7 @@ def test_modes_frequencies_and_damping_are_those_of_linear_theory() -> None:
     assert 1.0 < 2.0 * np.pi / modes.nod_rad_s < 2.5
 
 
-@pytest.mark.parametrize("changes", [{}, {"cone_minor_share": 0.0, "cone_phase_deg": 90.0}, {"cone_angle_deg": 0.0}])
+@pytest.mark.parametrize("changes", [{}, {"cone_minor_fraction": 0.0, "cone_phase_deg": 90.0}, {"cone_angle_deg": 0.0}])
 def test_finite_differences_give_velocity_rate_and_specific_force(changes: dict[str, float]) -> None:
     descent = _flown(**(WILD | changes))
     h, times = 1e-3, np.linspace(-9.9, descent.span_s[1] - 0.1, 400)
@@ -271,7 +271,7 @@ def test_drifts_with_the_mean_wind() -> None:
 
 @pytest.mark.parametrize("angle", [5.0, 30.0])
 def test_circular_cone_stays_at_its_angle_over_the_pictures(angle: float) -> None:
-    descent = _flown(**(STILL | {"cone_angle_deg": angle, "cone_minor_share": 1.0, "nod_rate_deg_s": 0.0}))
+    descent = _flown(**(STILL | {"cone_angle_deg": angle, "cone_minor_fraction": 1.0, "nod_rate_deg_s": 0.0}))
     assert _off_nadir_deg(descent, np.zeros(1))[0] == pytest.approx(angle, abs=1e-6)
     # wide cones are a little off linear theory's share of the lander in the tilt, so that it nods by a degree
     np.testing.assert_allclose(_off_nadir_deg(descent, np.linspace(-5.0, 7.5, 200)), angle, atol=0.04 * angle)
@@ -285,7 +285,7 @@ def test_circular_cone_stays_at_its_angle_over_the_pictures(angle: float) -> Non
 
 @pytest.mark.parametrize("phase", [0.0, 60.0, 90.0, 200.0])
 def test_plane_swing_reaches_the_angle_asked_for(phase: float) -> None:
-    swing = {"cone_angle_deg": 30.0, "cone_minor_share": 0.0, "cone_phase_deg": phase, "nod_rate_deg_s": 0.0}
+    swing = {"cone_angle_deg": 30.0, "cone_minor_fraction": 0.0, "cone_phase_deg": phase, "nod_rate_deg_s": 0.0}
     descent = _flown(**(STILL | swing))
     angles = _off_nadir_deg(descent, np.linspace(-6.0, 16.0, 2000))
     assert angles.max() == pytest.approx(30.0, rel=0.03)
@@ -294,7 +294,7 @@ def test_plane_swing_reaches_the_angle_asked_for(phase: float) -> None:
 
 @pytest.mark.parametrize("share", [0.5, -0.5])
 def test_cone_starts_at_its_azimuth_and_goes_round_in_its_sense(share: float) -> None:
-    cone = {"cone_angle_deg": 20.0, "cone_minor_share": share, "cone_direction_deg": 90.0, "nod_rate_deg_s": 0.0}
+    cone = {"cone_angle_deg": 20.0, "cone_minor_fraction": share, "cone_direction_deg": 90.0, "nod_rate_deg_s": 0.0}
     descent = _flown(**(STILL | cone))
     looking = -descent.motion(np.array([0.0, 1.0])).attitudes.as_matrix()[:, :, 2]
     # the camera looks east of nadir; a positive share goes on clockwise seen from above, to the south

@@ -128,7 +128,7 @@ def test_the_horizon_of_a_plane_is_where_its_mesh_ends(renderer: Renderer) -> No
     samples = np.zeros((64, 64, 2), dtype=np.float32)
     samples[..., 1] = 0.2
     surface = Surface.from_samples(samples, 0.5)
-    law = Photometry(lunar_share=0.0, surge_amplitude=0.0)
+    law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0)
     scene = Scene(surface, (0.0, 0.0), SUN, law, mesh_finest_m=0.04, mesh_reach_m=200.0, mesh_lines=801)
     camera = _camera((128, 64), 8e-3)
     pose = rigid(Rotation.from_euler("x", 7.0, degrees=True), np.array([0.0, 0.0, 1.0]))

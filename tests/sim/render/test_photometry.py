@@ -15,9 +15,9 @@ from marsyard.sim.terrain import Surface
 
 ALBEDO = 0.2
 LAWS = {
-    "Lambert": Photometry(lunar_share=0.0, surge_amplitude=0.0),
+    "Lambert": Photometry(lunar_fraction=0.0, surge_amplitude=0.0),
     "Mars": Photometry(),
-    "narrow surge": Photometry(lunar_share=1.0, surge_amplitude=1.5, surge_width=0.01),
+    "narrow surge": Photometry(lunar_fraction=1.0, surge_amplitude=1.5, surge_width=0.01),
 }
 each_law = pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
 
@@ -61,7 +61,7 @@ def test_albedo_is_the_reflected_fraction_of_light(law: Photometry) -> None:
     cos_i, cos_e = np.sqrt(1.0 - one), np.sqrt(1.0 - two)
     g = np.arccos(np.clip(cos_i * cos_e + np.sqrt(one * two) * np.cos(2.0 * np.pi * turn), -1.0, 1.0))
     surge = 1.0 + law.surge_amplitude / (1.0 + np.tan(0.5 * g) / law.surge_width)
-    disc = 2.0 * law.lunar_share * cos_i / (cos_i + cos_e) + (1.0 - law.lunar_share) * cos_i
+    disc = 2.0 * law.lunar_fraction * cos_i / (cos_i + cos_e) + (1.0 - law.lunar_fraction) * cos_i
     assert law.normalisation() * np.mean(surge * disc / cos_i) == pytest.approx(1.0, rel=0.01)
 
 
@@ -83,7 +83,7 @@ def test_the_opposition_peak_is_opposite_the_sun(
 ) -> None:
     """The peak's centre, found in the picture alone, within half a pixel."""
     camera = _hazcam() if wide else descent_camera(512)
-    law = Photometry(lunar_share=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
+    law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
     pose = rigid(Rotation.from_euler("zx", [40.0, 8.0], degrees=True), np.array([0.0, 0.0, 800.0]))
     for opposite in np.array([[150.3, 201.8], [330.6, 255.1]]):
         _, ray = camera.moved(pose).rays(opposite)

@@ -121,7 +121,7 @@ def test_dark_current_is_in_the_picture_with_its_shot_noise() -> None:
 
 
 def test_hot_and_dead_pixels_at_their_rates() -> None:
-    defects = DefectParameters(hot_share=0.01, dead_share=0.02, hot_e_s=5000.0)
+    defects = DefectParameters(hot_fraction=0.01, dead_fraction=0.02, hot_e_s=5000.0)
     detector = _detector((512, 512), defects=defects)
     assert detector.hot_e_s is not None
     hot = detector.hot_e_s > 0.0
@@ -183,7 +183,7 @@ def test_exposure_can_be_set_and_is_stated() -> None:
 
 def test_a_subframe_has_the_pixels_of_the_whole() -> None:
     parameters = DetectorParameters(
-        transfer_row_s=0.0, clear_row_s=0.0, optics=SHARP, defects=DefectParameters(hot_share=0.02)
+        transfer_row_s=0.0, clear_row_s=0.0, optics=SHARP, defects=DefectParameters(hot_fraction=0.02)
     )
     whole = Detector.drawn(EVEN, parameters, np.random.default_rng(6))
     part = whole.window(8, 16, (24, 32))

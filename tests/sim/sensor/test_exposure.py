@@ -35,7 +35,7 @@ def test_a_part_of_the_picture_is_exposed_for_itself() -> None:
 
 
 def test_says_when_it_cannot() -> None:
-    short = AutoExposureParameters(most_s=0.001)
+    short = AutoExposureParameters(max_exposure_s=0.001)
     found = auto_expose(_detector(0.001), GROUND, short, np.random.default_rng(2))
     assert not found.converged
     assert found.exposures_s == (0.001,)
@@ -46,6 +46,6 @@ def test_says_when_it_cannot() -> None:
 
 def test_refuses_nonsense() -> None:
     with pytest.raises(ValidationError, match="longer than the longest"):
-        AutoExposureParameters(least_s=0.1, most_s=0.01)
+        AutoExposureParameters(min_exposure_s=0.1, max_exposure_s=0.01)
     with pytest.raises(ValueError, match="without pixels"):
         auto_expose(_detector(0.01), GROUND, ASKED, np.random.default_rng(0), region=(slice(0, 0), slice(0, 0)))

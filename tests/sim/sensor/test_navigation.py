@@ -76,7 +76,7 @@ def _errors(path: FlownPath, imu: Imu, solution: NavigationSolution, at: np.ndar
 
 def test_errors_are_what_the_covariance_says() -> None:
     """Normalised errors squared over independent flights: chi-square, fifteen degrees a flight (99.8 % band)."""
-    floating = RtkParameters(float_share=0.3, float_s=10.0)
+    floating = RtkParameters(float_fraction=0.3, float_s=10.0)
     squares = []
     for seed in range(FLIGHTS):
         path, imu, solution = _flown(seed, rtk_class=floating, keep_s=(-3.0, 0.0, 2.5, 5.0))
@@ -121,7 +121,7 @@ def test_better_instruments_make_smaller_errors() -> None:
 
 def test_through_an_outage_it_coasts_as_its_covariance_says() -> None:
     """Eight seconds on inertial navigation: position drifts by decimetres, as a tilt of 0.2 deg makes it."""
-    away = RtkParameters(outages=(Outage(start_s=-3.0, duration_s=8.1),), float_share=0.0)
+    away = RtkParameters(outages=(Outage(start_s=-3.0, duration_s=8.1),), float_fraction=0.0)
     squares, sizes = [], []
     for seed in range(FLIGHTS):
         path, imu, solution = _flown(seed, rtk_class=away, keep_s=(5.0,))
@@ -155,7 +155,7 @@ def test_it_starts_anew_where_it_was_led_astray() -> None:
     """A filter that begins 20 m off: its covariance would refuse all solutions, but not for more than a second."""
     path, rng = _path(3), np.random.default_rng(4)
     span = path.span_s
-    imu, receiver = Imu.drawn(SMALL_UNIT, span, rng), RtkReceiver.drawn(RtkParameters(float_share=0.0), span, rng)
+    imu, receiver = Imu.drawn(SMALL_UNIT, span, rng), RtkReceiver.drawn(RtkParameters(float_fraction=0.0), span, rng)
     compass = TiltCompass.drawn(COMPASS, rng)
     solutions = receiver.measure(path, receiver.sampling.within(*span), rng)
     readings = compass.measure(path, compass.sampling.within(*span), rng)

@@ -137,7 +137,7 @@ def test_heading_errors_grow_as_stated_and_carry_the_position_aside() -> None:
 def test_where_visual_odometry_fails_the_wheels_are_believed() -> None:
     slip = SlipParameters(step_spread=0.0, wander_deg_m=0.0)
     drives = _drives(uphill_east(15.0), (STRAIGHT,), slip)
-    failing = EXACT.model_copy(update={"visual": VisualOdometryParameters(failure_share=1.0)})
+    failing = EXACT.model_copy(update={"visual": VisualOdometryParameters(failure_fraction=1.0)})
     _, failed = _followed(drives, failing, 0, visual=True)
     _, counted = _followed(drives, EXACT, 0)
     assert failed.visual_failed

@@ -23,7 +23,7 @@ def test_errors_have_the_stated_sizes_and_the_reported_deviation_is_theirs(kind:
     share = 1.0 if kind == "floating" else 0.0
     times = np.array([5.0])
     true = MOTION.motion(times)
-    drawn = [_measured(seed, times, float_share=share) for seed in range(400)]
+    drawn = [_measured(seed, times, float_fraction=share) for seed in range(400)]
     off = np.array([(s.positions_m - true.positions_m)[0] for _, s in drawn])
     # 400 values are known to 3.5 %; tolerance is three times that
     np.testing.assert_allclose(off.std(axis=0), getattr(RtkParameters(), kind).total_m, rtol=0.11)
@@ -40,7 +40,7 @@ def test_the_wander_is_correlated_over_its_time() -> None:
     times = np.array([0.0, 1.0, 120.0])
     off = np.array(
         [
-            (_measured(seed, times, float_share=1.0)[1].positions_m - MOTION.motion(times).positions_m)[:, :2] / 0.5
+            (_measured(seed, times, float_fraction=1.0)[1].positions_m - MOTION.motion(times).positions_m)[:, :2] / 0.5
             for seed in range(400)
         ]
     )
@@ -53,7 +53,7 @@ def test_the_wander_is_correlated_over_its_time() -> None:
 def test_solutions_change_with_the_stated_share_and_duration() -> None:
     times = np.arange(0.0, 400.0, 0.5)
     floating = np.array(
-        [_measured(seed, times, float_share=0.25, float_s=10.0)[0].floats(times) for seed in range(200)]
+        [_measured(seed, times, float_fraction=0.25, float_s=10.0)[0].floats(times) for seed in range(200)]
     )
     # 200 flights of about 10 cycles each
     assert floating.mean() == pytest.approx(0.25, abs=0.02)
@@ -71,5 +71,5 @@ def test_an_outage_is_silent_and_only_that() -> None:
 
 
 def test_a_share_that_leaves_nothing_is_refused() -> None:
-    with pytest.raises(ValueError, match="float_share"):
-        RtkParameters(float_share=0.999, float_s=1.0)
+    with pytest.raises(ValueError, match="float_fraction"):
+        RtkParameters(float_fraction=0.999, float_s=1.0)

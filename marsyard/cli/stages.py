@@ -1,4 +1,4 @@
-"""A case's products stage by stage, as files that other programs open: `marsyard replay --step`."""
+"""A case's products stage by stage, as files that other programs open: `marsyard replay --save-stages`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from marsyard.campaigns.errors import writing
 _PIXELS = (np.uint8, np.uint16)
 
 
-def write_steps(directory: Path, products: Mapping[str, Any]) -> int:
+def write_stages(directory: Path, products: Mapping[str, Any]) -> int:
     """Write each product to its own file, numbered in the order of the stages; return the number of files.
 
     A picture (8 or 16 bits, two dimensions, or three with three bands) is a PNG with unchanged counts; any other array

@@ -1,0 +1,56 @@
+"""Former names of keys, columns and command-line options, accepted for one release (`renamed.toml`)."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+import warnings
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+
+
+class RenamedWarning(FutureWarning):
+    """A former name was given."""
+
+
+@cache
+def _names(section: str) -> Mapping[str, str]:
+    with Path(__file__).with_suffix(".toml").open("rb") as file:
+        names: dict[str, str] = tomllib.load(file)[section]
+    return names
+
+
+def current_key(name: str, known: Collection[str], given: Collection[str] = ()) -> str:
+    """Current name of a key in a table with `known` keys; the name itself if it is known, or both are given."""
+    current = _names("keys").get(name)
+    if current is None or name in known or current not in known or current in given:
+        return name
+    return _warned(name, current)
+
+
+def current_column(name: str, exists: Callable[[str], bool]) -> str:
+    """Current name of a column, given which columns exist; it may follow a compared algorithm's name and a dot."""
+    algorithm, dot, column = name.rpartition(".")
+    for former, current in _names("columns").items():
+        match = re.fullmatch(former.replace("*", r"(\d+)"), column)
+        renamed = current.replace("*", match[1]) if match and match.groups() else current
+        if match and exists(renamed):
+            return algorithm + dot + _warned(column, renamed)
+    return name
+
+
+def current_options(words: Sequence[str]) -> list[str]:
+    """Words of a command line with the current names of options."""
+    return [_warned(word, _names("options").get(word, word)) for word in words]
+
+
+def stream_name(path: str) -> str:
+    """Name of the random stream of a dispersion."""
+    return _names("streams").get(path, path)
+
+
+def _warned(former: str, current: str) -> str:
+    if former != current:
+        warnings.warn(f"'{former}' is now '{current}'; the former name is accepted until 0.2", RenamedWarning, 3)
+    return current

@@ -1,0 +1,122 @@
+"""Former names of keys, columns and options: accepted with a warning that states the current name."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tomllib
+import warnings
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from marsyard.campaigns.definition.identity import identity_of
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.store import record
+from marsyard.cli.app import main
+from marsyard.reports.stored import read_run
+from marsyard.scenarios.registry import scenario, scenario_names
+from marsyard.scenarios.systems import row_columns
+from marsyard.sim import renamed
+from marsyard.sim.renamed import RenamedWarning
+
+TABLE = tomllib.loads(Path(renamed.__file__).with_suffix(".toml").read_text())
+CAMPAIGN = """
+name = "former"
+scenario = "descent"
+cases = 2
+seed = 3
+[parameters.place]
+bank = 2
+[dispersions]
+"place.terrain" = { distribution = "integer", low = 0, high = "place.bank - 1", source = "test" }
+"descent.cone_minor_share" = { distribution = "uniform", low = -1.0, high = 1.0, source = "test" }
+[[requirements]]
+id = "v"
+metric = "velocity_error_m_s"
+bound = 5.0
+probability = 0.9
+confidence = 0.9
+population = "valid and room"
+"""
+
+
+NAMES = (("place", "location"), ("cone_minor_share", "cone_minor_fraction"), ("room", "feasible_overlap"))
+
+
+def current(text: str) -> str:
+    for former, now in NAMES:
+        text = text.replace(former, now)
+    return text
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[Path, Path]:
+    paths = tmp_path / "former.toml", tmp_path / "current.toml"
+    paths[0].write_text(CAMPAIGN)
+    paths[1].write_text(current(CAMPAIGN))
+    return paths
+
+
+def test_a_campaign_with_former_names_is_the_same_campaign(files: tuple[Path, Path]) -> None:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", RenamedWarning)
+        former = load_campaign(str(files[0]))
+    expected = load_campaign(str(files[1]))
+    assert former.configuration == expected.configuration
+    assert former.draws(1) == expected.draws(1)
+    texts = {str(one.message) for one in caught}
+    assert "'place' is now 'location'; the former name is accepted until 0.2" in texts
+    assert {text.split("'")[1] for text in texts} == {"place", "cone_minor_share", "room"}
+
+
+def test_an_option_with_a_former_name_sets_the_parameter(files: tuple[Path, Path]) -> None:
+    with pytest.warns(RenamedWarning, match="'place' is now 'location'"):
+        campaign = load_campaign(str(files[1]), ["place.terrain=1"])
+    assert campaign.configuration.parameters["location"]["terrain"] == 1
+    assert set(campaign.configuration.dispersions) == {"descent.cone_minor_fraction"}
+
+
+def test_draws_are_those_of_the_former_names(files: tuple[Path, Path]) -> None:
+    campaign = load_campaign(str(files[1]))
+    uniform = campaign.streams(0).generator("dispersion:descent.cone_minor_share").random()
+    assert campaign.draws(0)["descent.cone_minor_fraction"] == pytest.approx(2.0 * uniform - 1.0, abs=1e-12)
+
+
+def test_a_stored_campaign_is_read_by_the_current_names(files: tuple[Path, Path], tmp_path: Path) -> None:
+    expected = load_campaign(str(files[1])).configuration
+    record.begin(tmp_path, expected, identity_of(expected), "test")
+    text = (tmp_path / "campaign.json").read_text()
+    for former, now in (*NAMES, ("most_cases", "max_cases")):
+        text = text.replace(f'"{now}', f'"{former}').replace(f".{now}", f".{former}").replace(f" {now}", f" {former}")
+    assert "place.terrain" in text
+    assert "valid and room" in text
+    (tmp_path / "campaign.json").write_text(text)
+    pd.DataFrame({"case": [0], "room": [True], "place_east_m": [1.0]}).to_parquet(tmp_path / "cases.parquet")
+    assert record.stored_configuration(tmp_path) == expected
+    run = read_run(tmp_path)
+    assert list(run.frame.columns) == ["case", "feasible_overlap", "location_east_m"]
+    assert run.parameter("location", "bank") == 2
+    assert run.record["requirements"][0]["population"] == "valid and feasible_overlap"
+
+
+def test_a_former_option_is_accepted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(sys, "argv", ["marsyard", "replay", str(tmp_path), "0", "--step"])
+    with pytest.warns(RenamedWarning, match="'--step' is now '--save-stages'"), pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    assert sys.argv[-1] == "--save-stages"
+
+
+def test_current_names_exist_and_former_ones_do_not() -> None:
+    """Each entry of the table is used: a key of some parameters, a column of some scenario."""
+    schemas = " ".join(json.dumps(scenario(name).parameters_type.model_json_schema()) for name in scenario_names())
+    schemas += json.dumps(type(load_campaign("dimes-smoke").configuration).model_json_schema())
+    for former, now in TABLE["keys"].items():
+        assert f'"{now}": {{' in schemas, now
+        assert former in ("own", "least", "most") or f'"{former}": {{' not in schemas, former
+    stated = [columns for name in scenario_names() if (columns := row_columns(name)) is not None]
+    for former, now in TABLE["columns"].items():
+        assert any(now in (*one.flags, *one.numbers) for one in stated), now
+        assert not any(former in (*one.flags, *one.numbers) for one in stated), former
