@@ -13,7 +13,15 @@ from marsyard.algorithms.dimes.binning import View, build_view
 from marsyard.algorithms.dimes.details import PairDetails, Track
 from marsyard.algorithms.dimes.estimator import conclude
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.validity import TrackMetrics, ValidityCheck, combinations, failed_checks, propagated
+from marsyard.algorithms.dimes.validity import (
+    TrackMetrics,
+    ValidityCheck,
+    combinations,
+    failed_checks,
+    propagated,
+    track_metrics,
+)
+from marsyard.algorithms.image.correlation import Peak
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DetectorImage
 from tests.algorithms.synthetic_descent import CAMERA, ROWS_SUMMED, calibration, velocity_of
@@ -174,3 +182,9 @@ def test_a_track_exactly_at_every_limit_is_valid() -> None:
 def test_options_say_what_is_wrong(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
         DimesOptions(**wrong)
+
+
+def test_a_surface_without_a_positive_peak_has_no_distinct_one() -> None:
+    metrics = track_metrics(0.02, np.zeros((9, 9)), Peak(4, 4, 0.0, on_border=False), DimesOptions())
+    assert metrics.second_peak_ratio == 1.0
+    assert ValidityCheck.SECOND_PEAK in failed_checks(metrics, DimesOptions())

@@ -41,7 +41,7 @@ def _campaign(folder: Path, metric: str, population: str = "valid", bound: str =
         ("velocity_eror_m_s", "valid", "bound = 5.0", "metric", "did you mean 'velocity_error_m_s'?"),
         ("velocity_error_m_s + wind_m", "valid", "bound = 5.0", "metric", "unknown column of numbers 'wind_m'"),
         ("answerd", "valid", "", "metric", "did you mean 'answered'?"),
-        ("velocity_error_m_s", "valid and answer_in_tim", "bound = 5.0", "population", "did you mean 'answer_in_time'?"),
+        ("velocity_error_m_s", "valid and answer_in_tim", "bound = 5.0", "population", "mean 'answer_in_time'?"),
         ("feasible_overlap", "valid", "bound = 5.0", "metric", "unknown column of numbers 'feasible_overlap'"),
     ],
 )

@@ -42,6 +42,11 @@ def test_rates_pool_footprints_over_flights() -> None:
     assert found.lower < 0.1 < found.upper
 
 
+def test_cases_with_one_footprint_count() -> None:
+    found = pooled_rate(pd.DataFrame({"hits": [1, 0, 1, 1], "of": [1, 1, 2, 0]}), "hits", "of")
+    assert (found.hits, found.of, found.flights, found.flights_hit) == (3, 4, 3, 2)
+
+
 def test_interval_of_a_rate_covers_the_truth() -> None:
     """Flights differ in their rates; intervals of 90 % that took footprints as independent would cover seldom."""
     rng = np.random.default_rng(3)

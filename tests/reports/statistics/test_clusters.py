@@ -120,3 +120,10 @@ def test_correlation_is_estimated_from_enough_terrains(terrains: int, failing: i
     success = ~((terrain < failing) & (np.arange(terrain.size) % 4 == 0))
     method = ClusterMethod.KORN_GRAUBARD if estimated else ClusterMethod.TERRAIN_COUNT
     assert clustered_evidence(success, terrain, 0.9).method is method
+
+
+def test_a_terrain_with_a_single_success_has_succeeded() -> None:
+    success, terrain = np.zeros(40, dtype=bool), np.repeat(np.arange(20), 2)
+    success[::4] = True  # one of two cases on every second terrain
+    evidence = clustered_evidence(success, terrain, 0.9)
+    assert evidence.upper == proportion_upper(10, 20, 0.9)

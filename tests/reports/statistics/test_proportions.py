@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from marsyard.reports.statistics.proportions import (
+    consumer_risk,
     further_cases_needed,
     minimum_sample_size,
     proportion_interval,
@@ -127,3 +128,9 @@ def test_additional_cases_needed() -> None:
     assert further_cases_needed(24, 0, 0.99, 0.9) == 230 - 24
     assert further_cases_needed(24, 1, 0.99, 0.9) == 388 - 24
     assert further_cases_needed(500, 0, 0.99, 0.9) == 0
+
+
+@pytest.mark.parametrize("n", [1, 5, 400])
+def test_no_success_is_no_evidence(n: int) -> None:
+    assert consumer_risk(0, n, 0.9) == 1.0
+    assert 0.0 < consumer_risk(1, n, 0.9) <= 1.0
