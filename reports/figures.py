@@ -151,23 +151,17 @@ def error_histogram(frame: pd.DataFrame, metric: str, bound: float | None) -> Fi
     axes.hist(drawn, bins=list(bins), color=SERIES[0], alpha=0.85)
     beyond = magnitude.size - drawn.size
     axes.set(xlabel=magnitude_label(metric), ylabel="cases", xlim=(0.0, edge * 1.02))
-    if beyond:
-        _overflow_bar(axes, beyond, edge)
+    if beyond:  # a hatched bar beyond the axis
+        axes.bar(1.11 * edge, beyond, width=0.07 * edge, color="none", edgecolor=SERIES[1], hatch="////")
+        axes.axvline(1.04 * edge, color=MUTED, linewidth=0.8)
+        text, at = f"{beyond:,}\n> {edge:.3g}", (1.11 * edge, beyond)
+        _annotate(axes, text, at, (0, 2), ha="center", va="bottom", fontsize=8)
+        axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= edge])
+        axes.set_xlim(0.0, 1.18 * edge)
+        axes.margins(y=0.25)
     _bound_line(axes, metric, bound, 0.98)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
-
-
-def _overflow_bar(axes: Axes, beyond: int, edge: float) -> None:
-    """Draw a hatched bar for the magnitudes beyond the axis, with their number."""
-    centre = 1.11 * edge
-    axes.bar(centre, beyond, width=0.07 * edge, color="none", edgecolor=SERIES[1], hatch="////")
-    axes.axvline(1.04 * edge, color=MUTED, linewidth=0.8)
-    text = f"{beyond:,}\n> {edge:.3g}"
-    _annotate(axes, text, (centre, beyond), (0, 2), ha="center", va="bottom", fontsize=8)
-    axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= edge])
-    axes.set_xlim(0.0, 1.18 * edge)
-    axes.margins(y=0.25)
 
 
 @in_page_style
