@@ -118,17 +118,22 @@ def page_context(
         "gallery": shlex.join(["marsyard", "report", str(run.directory), "--gallery"]),
     }
     pictured = [str(case.case) for case in context["shown"]]
-    context["explorer"] = _explorer(subject, pictured)
-    return {**context, **_error_sections(subject.run, metric, bound, pictured)}
-
-
-def _explorer(subject: Subject, pictured: Sequence[str]) -> dict[str, Any] | None:
-    """Data and script of the explorer; None without errors."""
-    metric = subject.metric
-    if metric is None or not np.isfinite(numbers(subject.frame, metric)).any():
-        return None
-    data, script = sections.explorer_data(subject.run, metric, subject.bound, pictured), sections.script()
-    return {"data": data, "json": sections.embedded(data), "script": script, "hash": sections.script_hash(script)}
+    if metric is None:
+        none = sections.CaseTable((), ())
+        context |= {"error_plates": [], "driver_plates": [], "statistics": Grid((), ())}
+        return context | {"explorer": None, "worst": none, "silent": none}
+    context["explorer"], drawn = None, subject.run
+    if np.isfinite(numbers(drawn.frame, metric)).any():
+        data, script = sections.explorer_data(drawn, metric, bound, pictured), sections.script()
+        hashed = sections.script_hash(script)
+        context["explorer"] = {"data": data, "json": sections.embedded(data), "script": script, "hash": hashed}
+    return context | {
+        "error_plates": sections.error_plates(drawn.frame, drawn.whole, metric, bound),
+        "driver_plates": sections.driver_plates(drawn.frame, metric, bound),
+        "statistics": statistics_grid(drawn.whole, metric),
+        "worst": sections.worst_cases(drawn, metric, pictured),
+        "silent": sections.unanswered_cases(drawn, metric, pictured),
+    }
 
 
 def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
@@ -187,20 +192,6 @@ def _kinds(frame: pd.DataFrame, column: str) -> list[str]:
     if column not in frame:
         return []
     return [str(value) for value in frame[column].dropna().unique()[:_MAX_KINDS]]
-
-
-def _error_sections(run: StoredRun, metric: str | None, bound: float | None, pictured: Sequence[str]) -> dict[str, Any]:
-    """Figures and tables of the page's metric; empty without a metric."""
-    if metric is None:
-        none = sections.CaseTable((), ())
-        return {"error_plates": [], "driver_plates": [], "statistics": Grid((), ()), "worst": none, "silent": none}
-    return {
-        "error_plates": sections.error_plates(run.frame, run.whole, metric, bound),
-        "driver_plates": sections.driver_plates(run.frame, metric, bound),
-        "statistics": statistics_grid(run.whole, metric),
-        "worst": sections.worst_cases(run, metric, pictured),
-        "silent": sections.unanswered_cases(run, metric, pictured),
-    }
 
 
 def page_environment() -> Environment:

@@ -124,10 +124,15 @@ def drivers_section(subject: Subject) -> Section | None:
     if not known:
         return None
     note = note_text("common.drivers", confidence=stated(CONFIDENCE))
-    blocks = [
-        Block(heading=f"Drivers of {name}", grid=Grid(_RANKED_HEAD, [_ranked_row(*one) for one in found]))
-        for name, found in known.items()
-    ]
+    head = ["Condition", "Cases", "Rank correlation", "Interval", "Share", "Interval", "p"]
+    blocks = []
+    for name, found in known.items():
+        rows = []
+        for column, one, p in found:
+            ranks = [coefficient(one.correlation), f"{coefficient(one.lower)} to {coefficient(one.upper)}"]
+            share = [percent(one.share), rates.range_text(one.share_lower, one.share_upper)]
+            rows.append([label(column), f"{one.n:,}", *ranks, *share, p_text(p)])
+        blocks.append(Block(heading=f"Drivers of {name}", grid=Grid(head, rows)))
     data = {
         name: [{"condition": column, **asdict(one), "corrected_p": p} for column, one, p in found]
         for name, found in known.items()
@@ -149,15 +154,6 @@ def ranked_drivers(frame: pd.DataFrame, metric: str, response: Float[np.ndarray,
     p_values = dict(zip(found, holm([one.p_value for one in found.values()]), strict=True))
     order = sorted(found, key=lambda column: (-found[column].share, column))
     return [(column, found[column], p_values[column]) for column in order]
-
-
-_RANKED_HEAD = ["Condition", "Cases", "Rank correlation", "Interval", "Share", "Interval", "p"]
-
-
-def _ranked_row(column: str, one: Driver, p: float) -> list[str]:
-    interval_of_rank = f"{coefficient(one.lower)} to {coefficient(one.upper)}"
-    share = [percent(one.share), rates.range_text(one.share_lower, one.share_upper)]
-    return [label(column), f"{one.n:,}", coefficient(one.correlation), interval_of_rank, *share, p_text(p)]
 
 
 #: Up to this ratio of the axis' ends it has ticks within its decades.
@@ -314,34 +310,6 @@ def consistency_section(subject: Subject) -> Section | None:
     return Section("consistency", "Consistency", "Stated covariances against errors", blocks, found)
 
 
-#: Off-nominal cases: valid, missing and wrong answers by fault and its size.
-FAULT_OUTCOMES = OutcomesBySize(
-    outcomes=lambda rows, subject: _fault_outcomes(rows, subject),
-    styles={"valid": ("valid", "full"), "invalid": ("invalid", "hatched"), "wrong": ("wrong", "crossed")},
-    cases="Cases",
-    caption="Full: answers within the bound. Hatched: no answer. Crossed: wrong answers.",
-    wording=lambda fault, size: (label(fault), "" if math.isnan(size) or fault == "none" else f"{size:g}"),
-    further=(
-        (
-            "Most frequent refusal",
-            "commonest_refusal",
-            lambda rows: commonest_refusal(rows),
-            lambda text: text or NOTHING,
-        ),
-    ),
-)
-
-
-def faults_section(subject: Subject) -> Section | None:
-    """Outcomes by fault and size; None without faults or bound."""
-    if subject.metric is None or subject.bound is None or not rates.is_flag(subject.frame, "answered"):
-        return None
-    note = note_text(
-        "common.faults", bound=f"{subject.bound:g}", unit=split_unit(subject.metric)[1], confidence=stated(CONFIDENCE)
-    )
-    return SectionDeclaration("faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), note=note)(subject)
-
-
 def _fault_outcomes(rows: Rows, subject: Subject) -> dict[str, Bool[np.ndarray, " n"]]:
     answered = rates.members(rows, "valid")
     within = rates.succeeded(rows, str(subject.metric), math.nan if subject.bound is None else subject.bound)
@@ -354,3 +322,24 @@ def commonest_refusal(rows: Rows) -> str:
         return ""
     refusals = rows.loc[~rates.members(rows, "valid"), "outcome"].value_counts()
     return str(refusals.index[0]) if len(refusals) else ""
+
+
+#: Off-nominal cases: valid, missing and wrong answers by fault and its size.
+FAULT_OUTCOMES = OutcomesBySize(
+    outcomes=_fault_outcomes,
+    styles={"valid": ("valid", "full"), "invalid": ("invalid", "hatched"), "wrong": ("wrong", "crossed")},
+    cases="Cases",
+    caption="Full: answers within the bound. Hatched: no answer. Crossed: wrong answers.",
+    wording=lambda fault, size: (label(fault), "" if math.isnan(size) or fault == "none" else f"{size:g}"),
+    further=(("Most frequent refusal", "commonest_refusal", commonest_refusal, lambda text: text or NOTHING),),
+)
+
+
+def faults_section(subject: Subject) -> Section | None:
+    """Outcomes by fault and size; None without faults or bound."""
+    if subject.metric is None or subject.bound is None or not rates.is_flag(subject.frame, "answered"):
+        return None
+    note = note_text(
+        "common.faults", bound=f"{subject.bound:g}", unit=split_unit(subject.metric)[1], confidence=stated(CONFIDENCE)
+    )
+    return SectionDeclaration("faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), note=note)(subject)

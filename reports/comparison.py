@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -264,7 +265,7 @@ def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[C
     paired = same_draws(first, second)
     theirs = {figure.name: figure for figure in of_each[1]}
     both = [(figure, theirs[figure.name]) for figure in of_each[0] if figure.name in theirs]
-    test = _paired_p if paired else _unpaired_p if have_same_terrains(first, second) else _disjoint_p
+    test = _paired_p if paired else partial(_unpaired_p, common=have_same_terrains(first, second))
     p_values = holm([test(frames[0], mine, frames[1], other) for mine, other in both])
     return paired, [Contrast(mine.name, mine, other, p) for (mine, other), p in zip(both, p_values, strict=True)]
 
@@ -318,17 +319,14 @@ def sample_of(frame: pd.DataFrame, figure: Figure) -> Sample:
     return Sample(figure.values, np.where(alone, -1.0 - groups, np.nan_to_num(named)).astype(np.int64))
 
 
-def _unpaired_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Figure) -> float:
-    return difference_p(sample_of(first, mine), sample_of(second, other))
-
-
-def _disjoint_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Figure) -> float:
-    """As `_unpaired_p`, for campaigns without common terrains: equal numbers are renumbered."""
+def _unpaired_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Figure, *, common: bool) -> float:
     here, there = sample_of(first, mine), sample_of(second, other)
-    if not here.terrains.size or not there.terrains.size:
-        return math.nan
-    apart = there.terrains + (1 + int(here.terrains.max()) - int(there.terrains.min()))
-    return difference_p(here, Sample(there.values, apart))
+    if not common:  # equal numbers are other terrains, so renumber them
+        if not here.terrains.size or not there.terrains.size:
+            return math.nan
+        apart = there.terrains + (1 + int(here.terrains.max()) - int(there.terrains.min()))
+        there = Sample(there.values, apart)
+    return difference_p(here, there)
 
 
 def _paired_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Figure) -> float:

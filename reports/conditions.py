@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from scipy import stats
 
 from marsyard.reports import rates
@@ -69,7 +69,13 @@ def cuts(frame: pd.DataFrame) -> Iterator[tuple[str, list[tuple[str, Bool[np.nda
                 chosen = [frame[column].eq(value).fillna(False).to_numpy(dtype=np.bool_) for value in values]
                 yield column, list(zip(map(plain_value, values), chosen, strict=True))
             elif kinds > 2 and pd.api.types.is_numeric_dtype(frame[column].dtype):
-                yield column, _bins(numbers(frame, column))
+                measured = numbers(frame, column)
+                known = measured[np.isfinite(measured)]
+                bins = int(np.clip(known.size // CASES_PER_BIN, 2, MAX_BINS))
+                edges = np.unique(np.quantile(known, np.linspace(0.0, 1.0, bins + 1)))
+                positions = np.where(np.isfinite(measured), np.digitize(measured, edges[1:-1]), -1)
+                names = [f"{number(low)} to {number(high)}" for low, high in pairwise(edges.tolist())]
+                yield column, [(name, positions == k) for k, name in enumerate(names)]
 
 
 _SPREAD_NOTE = note_text("common.terrains")
@@ -104,18 +110,6 @@ def terrain_spread(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
         "share": variance / (variance + within) if variance + within > 0.0 else 0.0,
         "p_value": float(stats.f.sf(between / within, k - 1, n - k)) if within > 0.0 else float("nan"),
     }
-
-
-def _bins(values: Float[np.ndarray, " n"]) -> list[tuple[str, Bool[np.ndarray, " n"]]]:
-    known = values[np.isfinite(values)]
-    count = int(np.clip(known.size // CASES_PER_BIN, 2, MAX_BINS))
-    edges = np.unique(np.quantile(known, np.linspace(0.0, 1.0, count + 1)))
-    places = np.digitize(values, edges[1:-1])
-    ranges = pairwise(edges.tolist())
-    return [
-        (f"{number(low)} to {number(high)}", np.isfinite(values) & (places == k))
-        for k, (low, high) in enumerate(ranges)
-    ]
 
 
 def _bin(chosen: pd.DataFrame, metric: str, name: str) -> dict[str, Any]:

@@ -115,20 +115,15 @@ def next_look(verdicts: Sequence[Verdict], how: SamplingDesign, cases: int) -> i
         return None
     left = how.max_cases - cases
     share = planned_looks(how.max_cases)[-1].share
-    if not any(_open(verdict, left, share) for verdict in verdicts):
-        return None
-    return next(look.cases for look in planned_looks(how.max_cases) if look.cases > cases)
-
-
-def _open(verdict: Verdict, left: int, share: float) -> bool:
-    """Whether a requirement is undecided, and the remaining cases can decide it."""
-    if verdict.status is not Status.INSUFFICIENT or verdict.decide_by == ESTIMATE:
-        return False
-    if not 0.0 < verdict.probability < 1.0 or not 0.0 < verdict.confidence < 1.0:
-        return False
-    confidence = confidence_at(verdict.confidence, share)
-    succeeded, n = verdict.n - verdict.failures, verdict.n + left
-    # bounds for independent cases: those for shared terrains are never tighter
-    may_pass = proportion_lower(succeeded + left, n, confidence) >= verdict.probability
-    may_fail = proportion_upper(succeeded, n, confidence) < verdict.probability
-    return may_pass or may_fail
+    for one in verdicts:
+        if one.status is not Status.INSUFFICIENT or one.decide_by == ESTIMATE:
+            continue
+        if not 0.0 < one.probability < 1.0 or not 0.0 < one.confidence < 1.0:
+            continue
+        confidence = confidence_at(one.confidence, share)
+        succeeded, n = one.n - one.failures, one.n + left
+        # bounds for independent cases: those for shared terrains are never tighter
+        may_pass = proportion_lower(succeeded + left, n, confidence) >= one.probability
+        if may_pass or proportion_upper(succeeded, n, confidence) < one.probability:
+            return next(look.cases for look in planned_looks(how.max_cases) if look.cases > cases)
+    return None

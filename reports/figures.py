@@ -151,23 +151,17 @@ def error_histogram(frame: pd.DataFrame, metric: str, bound: float | None) -> Fi
     axes.hist(drawn, bins=list(bins), color=SERIES[0], alpha=0.85)
     beyond = magnitude.size - drawn.size
     axes.set(xlabel=magnitude_label(metric), ylabel="cases", xlim=(0.0, edge * 1.02))
-    if beyond:
-        _overflow_bar(axes, beyond, edge)
+    if beyond:  # a hatched bar beyond the axis
+        axes.bar(1.11 * edge, beyond, width=0.07 * edge, color="none", edgecolor=SERIES[1], hatch="////")
+        axes.axvline(1.04 * edge, color=MUTED, linewidth=0.8)
+        text, at = f"{beyond:,}\n> {edge:.3g}", (1.11 * edge, beyond)
+        _annotate(axes, text, at, (0, 2), ha="center", va="bottom", fontsize=8)
+        axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= edge])
+        axes.set_xlim(0.0, 1.18 * edge)
+        axes.margins(y=0.25)
     _bound_line(axes, metric, bound, 0.98)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     return figure
-
-
-def _overflow_bar(axes: Axes, beyond: int, edge: float) -> None:
-    """Draw a hatched bar for the magnitudes beyond the axis, with their number."""
-    centre = 1.11 * edge
-    axes.bar(centre, beyond, width=0.07 * edge, color="none", edgecolor=SERIES[1], hatch="////")
-    axes.axvline(1.04 * edge, color=MUTED, linewidth=0.8)
-    text = f"{beyond:,}\n> {edge:.3g}"
-    _annotate(axes, text, (centre, beyond), (0, 2), ha="center", va="bottom", fontsize=8)
-    axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= edge])
-    axes.set_xlim(0.0, 1.18 * edge)
-    axes.margins(y=0.25)
 
 
 @in_page_style
@@ -219,7 +213,14 @@ def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: 
     if len(kinds) > 1 and not axis_columns(metric, [str(name) for name in frame.columns]):
         # otherwise the scatter figure has the legend
         axes.legend(bbox_to_anchor=(0.5, -0.18), **_BELOW)
-    _conditional_curves(axes, x[known], np.minimum(magnitude[known], 1.06 * edge))
+    bins = min(int(known.sum()) // _CASES_PER_POINT, _MAX_POINTS)
+    if bins >= _MIN_POINTS:  # median (solid) and 95 % quantile (dotted) of bins of equally many cases
+        of_x, limited = x[known], np.minimum(magnitude[known], 1.06 * edge)
+        parts = np.array_split(np.argsort(of_x, kind="stable"), bins)
+        middles = [float(np.median(of_x[part])) for part in parts]
+        for quantile, line in ((0.5, "-"), (0.95, ":")):
+            values = [float(np.quantile(limited[part], quantile)) for part in parts]
+            axes.plot(middles, values, line, color=INK, zorder=4)
     if bound is not None and bound <= top:
         axes.axhline(bound, color=REQUIREMENT, linewidth=1.4, linestyle="--", zorder=3)
     raster = bool(silent.sum() > LARGEST_VECTOR_SAMPLE)
@@ -242,17 +243,6 @@ def count_beyond_axis(frame: pd.DataFrame, metric: str, driver: str, bound: floa
     x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
     known = magnitude[np.isfinite(x) & np.isfinite(magnitude)]
     return int((known > _scatter_edge(known, bound)).sum())
-
-
-def _conditional_curves(axes: Axes, x: Float[np.ndarray, " n"], magnitude: Float[np.ndarray, " n"]) -> None:
-    """Draw median (solid) and 95 % quantile (dotted) of the errors in bins of equally many cases."""
-    bins = min(magnitude.size // _CASES_PER_POINT, _MAX_POINTS)
-    if bins < _MIN_POINTS:
-        return
-    parts = np.array_split(np.argsort(x, kind="stable"), bins)
-    middles = [float(np.median(x[part])) for part in parts]
-    for quantile, line in ((0.5, "-"), (0.95, ":")):
-        axes.plot(middles, [float(np.quantile(magnitude[part], quantile)) for part in parts], line, color=INK, zorder=4)
 
 
 @in_page_style

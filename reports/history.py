@@ -102,19 +102,17 @@ class History:
 
     def add(self, night: int, campaign: NightCampaign, figures: Sequence[NightFigure]) -> None:
         """Store the result of a campaign in a night."""
-        one = campaign
+        one, rows = campaign, []
+        for figure in figures:
+            values, terrains = figure.sample.values[:MAX_CASES], figure.sample.terrains[:MAX_CASES]
+            packed = values.astype("<f4").tobytes(), terrains.astype("<i8").tobytes()
+            rows.append((night, one.name, figure.figure, figure.rate, figure.level, *packed))
         with self._transaction():
             self._connection.execute(
                 "INSERT INTO campaigns VALUES (?, ?, ?, ?, ?, ?, ?)",
                 (night, one.name, one.definition, one.directory, one.verdict, one.exit_code, one.sentence),
             )
-            self._connection.executemany(
-                "INSERT INTO figures VALUES (?, ?, ?, ?, ?, ?, ?)",
-                [
-                    (night, one.name, figure.figure, figure.rate, figure.level, *_packed(figure.sample))
-                    for figure in figures
-                ],
-            )
+            self._connection.executemany("INSERT INTO figures VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
 
     def finish(self, night: int, state: str, changes: Sequence[tuple[str, str, float, bool]] = ()) -> None:
         """End a night with its changes: campaign, figure, corrected p, whether it is a regression."""
@@ -187,11 +185,6 @@ def utc_now() -> str:
     return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def _packed(sample: Sample) -> tuple[bytes, bytes]:
-    values, terrains = sample.values[:MAX_CASES], sample.terrains[:MAX_CASES]
-    return values.astype("<f4").tobytes(), terrains.astype("<i8").tobytes()
-
-
 def _unpacked(values: bytes, terrains: bytes) -> Sample:
     return Sample(np.frombuffer(values, "<f4").astype(np.float64), np.frombuffer(terrains, "<i8").astype(np.int64))
 
@@ -239,7 +232,10 @@ class Comparison:
 
 def changes(comparisons: Sequence[Comparison]) -> list[Change]:
     """The changed figures of a night, with a family-wise rate of false alarms of at most `FALSE_ALARMS`."""
-    pooled = [_pooled(one.before) for one in comparisons]
+    pooled: list[Sample | None] = []
+    for one in comparisons:
+        parts = ([getattr(sample, part) for sample in one.before] for part in ("values", "terrains"))
+        pooled.append(Sample(*map(np.concatenate, parts)) if one.before else None)
     permutations = math.ceil(_RESOLVED * len(comparisons) / _LEVEL)
     p_values = holm(
         [
@@ -277,13 +273,6 @@ def level_of(sample: Sample, rate: bool) -> float:
     if known.size == 0:
         return math.nan
     return float(known.mean() if rate else np.median(known))
-
-
-def _pooled(samples: Sequence[Sample]) -> Sample | None:
-    """The cases of several nights; None if there are none."""
-    if not samples:
-        return None
-    return Sample(*(np.concatenate([getattr(one, part) for one in samples]) for part in ("values", "terrains")))
 
 
 def night_text(

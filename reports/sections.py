@@ -138,7 +138,12 @@ def dispersion_grid(run: StoredRun) -> Grid:
         column = next((name for name in names if name in run.frame), None)
         shown = ", ".join(f"{key}={one}" for key, one in dispersion.items() if key not in _HIDDEN and one is not None)
         distribution = f"{dispersion.get('distribution', '?')}({shown})"
-        drawn = [NOTHING] * 3 if column is None else _extent(run.frame[column])
+        drawn = [NOTHING] * 3
+        if column is not None:
+            values = pd.to_numeric(run.frame[column], errors="coerce").dropna()
+            drawn[1] = f"{run.frame[column].nunique()} kinds"
+            if len(values) and not pd.api.types.is_bool_dtype(run.frame[column].dtype):
+                drawn = [_plain(float(value)) for value in (values.min(), values.mean(), values.max())]
         rows.append([str(path), distribution, *drawn, str(dispersion.get("source") or NOTHING)])
     return Grid(["Parameter", "Distribution", "Minimum", "Mean", "Maximum", "Source"], rows)
 
@@ -241,14 +246,6 @@ def _plain(value: object) -> str:
     if isinstance(value, float | np.floating):
         return f"{value:.0f}" if float(value).is_integer() else number(float(value))
     return str(value)
-
-
-def _extent(drawn: pd.Series) -> list[str]:
-    """Minimum, mean and maximum of the drawn values; the number of kinds if they are no numbers."""
-    values = pd.to_numeric(drawn, errors="coerce").dropna()
-    if values.empty or pd.api.types.is_bool_dtype(drawn.dtype):
-        return [NOTHING, f"{drawn.nunique()} kinds", NOTHING]
-    return [_plain(float(value)) for value in (values.min(), values.mean(), values.max())]
 
 
 def _only_values(frame: pd.DataFrame, column: str) -> str | None:

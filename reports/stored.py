@@ -106,7 +106,13 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
         frame, whole = _frames(path, record)
     except (OSError, ValueError) as error:
         raise StoreError(f"{path} cannot be read: {error}") from error
-    return StoredRun(directory, frame, whole, record, _showcases(directory / "cases", record.get("showcase")))
+    try:
+        names = [entry.name for entry in (directory / "cases").iterdir() if (entry / "products.json").is_file()]
+    except OSError:
+        names = []
+    kept = sorted(int(name) for name in names if name.isascii() and name.isdigit())
+    kept.sort(key=lambda case: case != record.get("showcase"))
+    return StoredRun(directory, frame, whole, record, tuple(kept))
 
 
 def _frames(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -120,23 +126,16 @@ def _frames(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.Dat
         frame = _ordered(pd.read_parquet(path).rename(columns=renamed))
         return frame, frame
     first = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas().rename(columns=renamed)
-    needed = _needed([renamed.get(name, name) for name in stored], record, first)
-    whole = pd.read_parquet(path, columns=[name for name in stored if renamed.get(name, name) in needed])
-    return _ordered(first), _ordered(whole.rename(columns=renamed))
-
-
-def _needed(names: Sequence[str], record: Mapping[str, Any], first: pd.DataFrame) -> list[str]:
-    """Columns that are read for very many cases."""
-    asked = record.get("requirements")
-    stated = [one for one in asked if isinstance(one, Mapping)] if isinstance(asked, list) else []
+    asked, names = record.get("requirements"), [renamed.get(name, name) for name in stored]
+    requirements = [one for one in asked if isinstance(one, Mapping)] if isinstance(asked, list) else []
     wanted = {"case", "outcome", "answered", "terrain", "feasible_overlap", "error", "traceback"}
-    for one in stated:
-        wanted.update(str(one.get("metric", "")).split(" + "))
-        wanted.update(str(one.get("population", "")).split(" and "))
-    metric = primary_metric(first, stated)
+    for one in requirements:
+        wanted.update(str(one.get("metric", "")).split(" + "), str(one.get("population", "")).split(" and "))
+    metric = primary_metric(first, requirements)
     if metric is not None:
         wanted.update([metric, *axis_columns(metric, names), *driver_columns(first, metric, max_columns=3)])
-    return [name for name in names if name in wanted]
+    whole = pd.read_parquet(path, columns=[name for name in stored if renamed.get(name, name) in wanted])
+    return _ordered(first), _ordered(whole.rename(columns=renamed))
 
 
 def _ordered(frame: pd.DataFrame) -> pd.DataFrame:
@@ -148,12 +147,3 @@ def _ordered(frame: pd.DataFrame) -> pd.DataFrame:
 def table(value: object) -> Mapping[str, Any]:
     """The value if it is a table, else an empty table."""
     return value if isinstance(value, Mapping) else {}
-
-
-def _showcases(cases: Path, chosen: object) -> tuple[int, ...]:
-    try:
-        names: Sequence[str] = [entry.name for entry in cases.iterdir() if (entry / "products.json").is_file()]
-    except OSError:
-        return ()
-    kept = sorted(int(name) for name in names if name.isascii() and name.isdigit())
-    return tuple(sorted(kept, key=lambda case: (case != chosen, case)))

@@ -45,7 +45,14 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
         )
     if not verdicts:
         table.add_row(Text("none asked"), "", "", "", "", "")
-    table.caption = _caption(verdicts)
+    lines = []
+    if any(not math.isnan(verdict.lower) for verdict in verdicts):
+        lines.append("Bounds: one-sided Clopper-Pearson at the stated confidence. Needed: further cases if none fails.")
+    if len(verdicts) > 1 and verdicts[0].note and len({verdict.note for verdict in verdicts}) == 1:
+        lines.append(verdicts[0].note)
+    else:
+        lines += [f"{verdict.requirement_id}: {verdict.note}" for verdict in verdicts if verdict.note]
+    table.caption = Text("\n".join(lines), style="dim", justify="left")
     return table
 
 
@@ -99,16 +106,3 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
         rows.append([name, *(number(q.estimate) for q in of_each)])
         rows.append([f"{name}, {confidence} bounds", *(interval(q.lower, q.upper) for q in of_each)])
     return [*rows, ["largest magnitude", *(number(s.largest) for s in summaries)]]
-
-
-def _caption(verdicts: Sequence[Verdict]) -> Text:
-    """Definitions of the columns, and notes on the verdicts."""
-    lines = []
-    if any(not math.isnan(verdict.lower) for verdict in verdicts):
-        lines.append("Bounds: one-sided Clopper-Pearson at the stated confidence. Needed: further cases if none fails.")
-    shared = {verdict.note for verdict in verdicts}
-    if len(verdicts) > 1 and len(shared) == 1 and verdicts[0].note:
-        lines.append(verdicts[0].note)
-    else:
-        lines += [f"{verdict.requirement_id}: {verdict.note}" for verdict in verdicts if verdict.note]
-    return Text("\n".join(lines), style="dim", justify="left")

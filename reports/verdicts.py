@@ -3,9 +3,10 @@
 A requirement asks that `|metric| <= bound`, or a true column, holds for a fraction of a population at a confidence. Its
 status follows from one-sided Clopper-Pearson bounds of the success rate. MET BY RATE: decided by the estimate, whose
 rate reaches the fraction, but not at the confidence. Cases on shared terrains get bounds that allow for correlation
-(`marsyard.reports.statistics.clusters`); repeated looks keep their joint risk (`marsyard.reports.bounds`). Cases that
-are no independent random draws (Latin hypercube, Sobol, grids) have neither bounds nor confidence: their rate decides
-only requirements that are decided by the estimate.
+(`marsyard.reports.statistics.clusters`). Looks at appended cases keep their joint risk
+(`marsyard.reports.statistics.sequential.LaterLook`); each planned look spends a fraction of the risk. Cases that are no
+independent random draws (Latin hypercube, Sobol, grids) have neither bounds nor confidence: their rate decides only
+requirements that are decided by the estimate.
 """
 
 from __future__ import annotations
@@ -18,13 +19,19 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Bool, Int
 
 from marsyard.reports import rates
-from marsyard.reports.bounds import Looks, compute_bounds
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
-from marsyard.reports.statistics.clusters import ClusteredEvidence, ClusterMethod
-from marsyard.reports.statistics.proportions import consumer_risk, minimum_sample_size
-from marsyard.reports.statistics.sequential import LaterLook
+from marsyard.reports.statistics.clusters import ClusteredEvidence, ClusterMethod, clustered_evidence
+from marsyard.reports.statistics.proportions import (
+    consumer_risk,
+    further_cases_needed,
+    minimum_sample_size,
+    proportion_lower,
+    proportion_upper,
+)
+from marsyard.reports.statistics.sequential import LaterLook, confidence_at
 from marsyard.reports.wording import count, percent, stated
 
 #: Value of a requirement's `decide_by` that has the rate seen compared with the probability.
@@ -168,6 +175,88 @@ class Verdict:
         )
 
 
+Success = Bool[np.ndarray, " n"]
+Groups = Int[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Looks:
+    """Earlier and planned looks at a campaign.
+
+    before: cases of an earlier first look; None at a first look
+    share: fraction of the risk that this look may spend; 1 where no looks were planned
+    """
+
+    before: Success | None = None
+    share: float = 1.0
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """One-sided bounds of a success rate.
+
+    lower, upper: the bounds that decide, each at its own confidence
+    plain_lower, plain_upper: bounds for independent cases
+    clustered: evidence of shared terrains; None where no terrain is shared
+    further_cases: cases, or whole terrains where these are counted, that pass the requirement if none fails
+    """
+
+    lower: float
+    upper: float
+    lower_confidence: float
+    upper_confidence: float
+    plain_lower: float
+    plain_upper: float
+    clustered: ClusteredEvidence | None
+    further_cases: int
+
+
+def compute_bounds(
+    success: Success, groups: Groups | None, probability: float, confidence: float, looks: Looks
+) -> Bounds:
+    """Bounds of the success rate of at least one case; `groups` numbers the terrains from 0, None if unknown."""
+    n, failures = success.size, int((~success).sum())
+    first = n if looks.before is None else int(looks.before.sum())
+    levels = _confidences(first, n, probability, confidence, looks)
+    plain = proportion_lower(n - failures, n, levels[0]), proportion_upper(n - failures, n, levels[1])
+    if groups is None or int(groups.max()) + 1 == n:
+        needed = _cases_needed(first, n, failures, probability, confidence, looks)
+        return Bounds(*plain, *levels, *plain, None, needed - n)
+    shared = clustered_evidence(success, groups, confidence)
+    before = np.ones(n, dtype=np.bool_) if looks.before is None else looks.before
+    if np.unique(groups[before]).size != first:  # independent cases that the first look was worth
+        first = math.floor(clustered_evidence(success[before], groups[before], confidence).effective_n)
+    levels = _confidences(first, shared.effective_n, probability, confidence, looks)
+    lower, upper = (clustered_evidence(success, groups, level) for level in levels)
+    shared = replace(lower, upper=upper.upper)
+    if shared.method is ClusterMethod.TERRAIN_COUNT:
+        # the tolerance keeps whole numbers whole
+        size, weight, failed = shared.terrains, 1.0, math.ceil(shared.terrains - shared.effective_successes - 1e-9)
+    else:
+        weight = shared.effective_n / n
+        size, failed = math.floor(shared.effective_n), math.ceil(failures * weight)
+    needed = _cases_needed(first, size, failed, probability, confidence, looks)
+    return Bounds(shared.lower, shared.upper, *levels, *plain, shared, math.ceil((needed - size) / weight))
+
+
+def _confidences(
+    first: int, n: float | int, probability: float, confidence: float, looks: Looks
+) -> tuple[float, float]:
+    """Confidences of the lower and of the upper bound."""
+    if looks.before is None:
+        level = confidence_at(confidence, looks.share)
+        return level, level
+    passing, failing = (LaterLook(p, 1.0 - confidence, first) for p in (1.0 - probability, probability))
+    return 1.0 - passing.risk_of_bound(n), 1.0 - failing.risk_of_bound(n)
+
+
+def _cases_needed(first: int, n: int, failures: int, probability: float, confidence: float, looks: Looks) -> int:
+    """Total of cases that pass the requirement if no more fail."""
+    if looks.share < 1.0:
+        return n + further_cases_needed(n, failures, probability, confidence_at(confidence, looks.share))
+    return LaterLook(1.0 - probability, 1.0 - confidence, first).cases_needed(n, failures)
+
+
 def judge_campaign(
     frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], how: SamplingDesign = INDEPENDENT
 ) -> list[Verdict]:
@@ -238,18 +327,13 @@ def _decide(verdict: Verdict, chosen: pd.DataFrame, how: SamplingDesign, frame: 
         return judged
     if by_rate:
         return replace(judged, further_cases=min_cases_for_rate(verdict.probability) - n)
-    return _advise(judged, bounds.further_cases, how)
-
-
-def _advise(verdict: Verdict, further: int, how: SamplingDesign) -> Verdict:
-    """Add the number of further cases, or the advice why these cannot help."""
-    shared = verdict.clustered
-    counted = shared is not None and shared.method is ClusterMethod.TERRAIN_COUNT
-    supply = how.terrains
-    if not counted or supply is None or (verdict.terrains or 0) + further <= supply.terrains:
-        return replace(verdict, further_cases=further)
+    # further cases, or the advice why these cannot help
+    shared, supply, further = bounds.clustered, how.terrains, bounds.further_cases
+    are_counted = shared is not None and shared.method is ClusterMethod.TERRAIN_COUNT
+    if not are_counted or supply is None or (terrains or 0) + further <= supply.terrains:
+        return replace(judged, further_cases=further)
     fewest = minimum_sample_size(verdict.probability, verdict.confidence)
-    return replace(verdict, advice=supply.advice(fewest, verdict.probability, verdict.confidence))
+    return replace(judged, advice=supply.advice(fewest, verdict.probability, verdict.confidence))
 
 
 def _status_by_rate(rate: float, n: int, probability: float) -> Status:
