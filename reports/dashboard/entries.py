@@ -7,6 +7,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,9 +85,8 @@ class Entry:
 def find_campaigns(directories: Sequence[Path]) -> list[Path]:
     """Campaigns in or below folders, each once, ordered by path."""
     found: dict[Path, Path] = {}
-    for directory in directories:
-        for one in _below(directory, _DEPTH):
-            found.setdefault(one.resolve(), one)
+    for one in (below for directory in directories for below in _below(directory, _DEPTH)):
+        found.setdefault(one.resolve(), one)
     return sorted(found.values())
 
 
@@ -107,25 +107,19 @@ def read_entries(paths: Iterable[Path]) -> tuple[list[Entry], list[str]]:
     entries, problems = [], []
     for path in paths:
         try:
-            entries.append(_entry(path, _twin(path)))
+            entries.append(_read_entry(path))
         except (CampaignError, OSError, ValueError, KeyError, TypeError) as error:
             problems.append(f"{path}: {error}")
     return sorted(entries, key=lambda one: (one.started, one.name, one.slug), reverse=True), problems
 
 
-def _twin(path: Path) -> Mapping[str, Any]:
-    file = path / TWIN_FILE
-    try:
+def _read_entry(path: Path) -> Entry:
+    file, twin = path / TWIN_FILE, table(None)
+    with suppress(OSError, ValueError):
         twin = table(json.loads(file.read_text(encoding="utf-8")))
-        if twin.get("schema") == SCHEMA and file.stat().st_mtime >= (path / TABLE_FILE).stat().st_mtime:
-            return twin
-    except (OSError, ValueError):
-        pass
-    write_report(path)
-    return table(json.loads(file.read_text(encoding="utf-8")))
-
-
-def _entry(path: Path, twin: Mapping[str, Any]) -> Entry:
+    if twin.get("schema") != SCHEMA or file.stat().st_mtime < (path / TABLE_FILE).stat().st_mtime:
+        write_report(path)
+        twin = table(json.loads(file.read_text(encoding="utf-8")))
     record = table(json.loads((path / RECORD_FILE).read_text(encoding="utf-8")))
     parameters = table(table(record.get("configuration")).get("parameters"))
     system = system_of(str(table(record.get("configuration")).get("scenario")))
@@ -153,20 +147,14 @@ def _entry(path: Path, twin: Mapping[str, Any]) -> Entry:
 
 
 def _shown(verdict: Mapping[str, Any]) -> ShownRequirement:
-    return ShownRequirement(
-        requirement=str(verdict.get("requirement_id") or "?"),
-        statement=str(verdict.get("statement") or ""),
-        status=str(verdict.get("status") or ""),
-        estimate=_number(verdict.get("estimate")),
-        lower=_number(verdict.get("lower")),
-        probability=_number(verdict.get("probability")),
-        margin=_number(verdict.get("margin")),
-        n=int(verdict.get("n") or 0),
-        failures=int(verdict.get("failures") or 0),
-        confidence=_number(verdict.get("confidence")),
-        decide_by=str(verdict.get("decide_by") or ""),
-        note=str(verdict.get("note") or ""),
-    )
+    values: dict[str, Any] = {
+        name: str(verdict.get(name) or "") for name in ("statement", "status", "decide_by", "note")
+    }
+    for name in ("estimate", "lower", "probability", "margin", "confidence"):
+        values[name] = _number(verdict.get(name))
+    for name in ("n", "failures"):
+        values[name] = int(verdict.get(name) or 0)
+    return ShownRequirement(requirement=str(verdict.get("requirement_id") or "?"), **values)
 
 
 def slug_of(path: Path, name: str) -> str:
@@ -205,9 +193,7 @@ _TREND, _WIDTH, _HEIGHT = 24, 120.0, 26.0
 
 @dataclass(frozen=True)
 class Sparkline:
-    """Observed rates over time, oldest first: points of the line, the last of them, and the height of the required
-    rate.
-    """
+    """Observed rates over time, oldest first: points of the line, the last one, and the height of the required rate."""
 
     points: str
     last: tuple[float, float]
@@ -251,25 +237,18 @@ def requirement_rows(entries: Sequence[Entry], stated: Mapping[str, StatedRequir
     for entry in entries:
         for shown in entry.shown:
             cells.setdefault(shown.requirement, []).append(Cell(entry, shown))
-    return [_row(name, found, stated.get(name)) for name, found in cells.items()]
-
-
-def _row(name: str, listed: Sequence[Cell], stated: StatedRequirement | None) -> RequirementRow:
-    found = sorted(listed, key=lambda cell: not cell.entry.finished)
-    latest: dict[str, Cell] = {}
-    for cell in found:
-        latest.setdefault(cell.entry.name, cell)
-    cells = list(latest.values())
-    same = [cell for cell in found if cell.entry.name == cells[0].entry.name and cell.entry.finished]
-    return RequirementRow(
-        requirement=name,
-        statement=stated.statement if stated else (cells[0].shown.statement if cells else ""),
-        kind=(stated.kind or "") if stated else "",
-        source=stated.source if stated else "",
-        cells=cells,
-        all_cells=found,
-        trend=sparkline([cell.shown for cell in reversed(same)]),
-    )
+    rows = []
+    for name, listed in cells.items():
+        found, requirement = sorted(listed, key=lambda cell: not cell.entry.finished), stated.get(name)
+        latest: dict[str, Cell] = {}
+        for cell in found:
+            latest.setdefault(cell.entry.name, cell)
+        ours = list(latest.values())
+        same = [cell.shown for cell in found if cell.entry.name == ours[0].entry.name and cell.entry.finished]
+        statement = requirement.statement if requirement else (ours[0].shown.statement if ours else "")
+        kind, source = (requirement.kind or "", requirement.source) if requirement else ("", "")
+        rows.append(RequirementRow(name, statement, kind, source, ours, found, sparkline(same[::-1])))
+    return rows
 
 
 def sparkline(shown: Sequence[ShownRequirement]) -> Sparkline | None:

@@ -10,12 +10,12 @@ import math
 import os
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.requirements import StatedRequirement, shipped_requirements
-from marsyard.reports.campaign import PAGE_FILE, VERIFICATION_FILE, page_environment, write_whole
+from marsyard.reports.campaign import PAGE_FILE, TWIN_FILE, VERIFICATION_FILE, page_environment, write_whole
 from marsyard.reports.cases import shown_case
 from marsyard.reports.dashboard.entries import (
     MAX_FURTHER_VERDICTS,
@@ -31,12 +31,15 @@ from marsyard.reports.dashboard.entries import (
 )
 from marsyard.reports.sections import embedded, replay_command, script_hash
 from marsyard.reports.stored import read_run
+from marsyard.reports.traceability import algorithm_cells, verification_csv
 from marsyard.reports.wording import percent
 
 INDEX = "index.html"
 #: Maximum number of kept cases of a campaign with a page.
 _MAX_CASES = 24
 _TEMPLATES = Path(__file__).parents[1] / "templates"
+#: Functions by which the templates format numbers.
+_FORMATS = {"margin": margin_text, "basis": basis_text, "evidence": evidence_text, "percent": percent}
 
 
 @dataclass(frozen=True)
@@ -59,21 +62,24 @@ def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, St
     for entry in entries:
         _write_campaign(directory / "c" / entry.slug, entry)
     script = (_TEMPLATES / "dashboard.js").read_text(encoding="utf-8")
-    index = _rendered(
+    values = {
+        "System": {entry.system for entry in entries},
+        "Site": {site for entry in entries for site in entry.sites},
+        "Algorithm": {algorithm for entry in entries for algorithm in entry.algorithms},
+        "Commit": {entry.commit for entry in entries},
+    }
+    index = _render(
         "dashboard.html.j2",
         rows=rows,
         entries=entries,
         problems=problems,
-        filters=_filters(entries),
-        margin=margin_text,
-        basis=basis_text,
-        evidence=evidence_text,
+        filters=[(name.lower(), name, sorted(found - {""})) for name, found in values.items()],
         most=MAX_FURTHER_VERDICTS,
         coverage=coverage(rows),
-        percent=percent,
         data=embedded(_data(rows)),
         script=script,
         hash=script_hash(script),
+        **_FORMATS,
     )
     write_whole(directory / INDEX, index)
     write_whole(directory / VERIFICATION_FILE, _matrix(rows))
@@ -83,16 +89,20 @@ def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, St
 def _write_campaign(folder: Path, entry: Entry) -> None:
     """Write a campaign's page, its report, and pages of its kept cases."""
     page, report = folder / INDEX, entry.directory / PAGE_FILE
-    source = entry.directory / "report.json"
-    if page.is_file() and page.stat().st_mtime > source.stat().st_mtime:
+    if page.is_file() and page.stat().st_mtime > (entry.directory / TWIN_FILE).stat().st_mtime:
         return
     folder.mkdir(parents=True, exist_ok=True)
     if report.is_file():
-        _link_or_copy(report, folder / PAGE_FILE)
+        # a hard link, or a copy where the disk does not allow links
+        partial = folder / f"{PAGE_FILE}.partial"
+        partial.unlink(missing_ok=True)
+        try:
+            os.link(report, partial)
+        except OSError:
+            shutil.copyfile(report, partial)
+        partial.replace(folder / PAGE_FILE)
     cases = _write_cases(folder, entry)
-    shown = {"margin": margin_text, "basis": basis_text, "evidence": evidence_text, "percent": percent}
-    text = _rendered("dashboard_campaign.html.j2", entry=entry, cases=cases, **shown)
-    write_whole(page, text)
+    write_whole(page, _render("dashboard_campaign.html.j2", entry=entry, cases=cases, **_FORMATS))
 
 
 def _write_cases(folder: Path, entry: Entry) -> list[dict[str, str]]:
@@ -109,7 +119,7 @@ def _write_cases(folder: Path, entry: Entry) -> list[dict[str, str]]:
         row = run.whole[run.whole["case"] == case] if "case" in run.whole else run.whole[:0]
         values = {str(name): str(value) for name, value in row.iloc[0].items()} if len(row) else {}
         command = replay_command(run, str(case))
-        text = _rendered("dashboard_case.html.j2", entry=entry, shown=shown, values=values, command=command)
+        text = _render("dashboard_case.html.j2", entry=entry, shown=shown, values=values, command=command)
         write_whole(folder / f"case-{case}.html", text)
         place = _rank_among_worst(entry, case)
         rank = "" if place == len(entry.worst) else ("the largest error" if place == 0 else "among the largest errors")
@@ -120,28 +130,6 @@ def _write_cases(folder: Path, entry: Entry) -> list[dict[str, str]]:
 def _rank_among_worst(entry: Entry, case: int) -> int:
     """Index of a case among those of the largest errors; their number where it is none of them."""
     return entry.worst.index(str(case)) if str(case) in entry.worst else len(entry.worst)
-
-
-def _link_or_copy(source: Path, target: Path) -> None:
-    """Hard-link a file into the site, or copy it where the disk does not allow links."""
-    partial = target.with_name(f"{target.name}.partial")
-    partial.unlink(missing_ok=True)
-    try:
-        os.link(source, partial)
-    except OSError:
-        shutil.copyfile(source, partial)
-    partial.replace(target)
-
-
-def _filters(entries: Sequence[Entry]) -> list[tuple[str, str, list[str]]]:
-    """Attribute, name and values of each filter."""
-    found: dict[str, set[str]] = {
-        "System": {entry.system for entry in entries},
-        "Site": {site for entry in entries for site in entry.sites},
-        "Algorithm": {algorithm for entry in entries for algorithm in entry.algorithms},
-        "Commit": {entry.commit for entry in entries},
-    }
-    return [(name.lower(), name, sorted(values - {""})) for name, values in found.items()]
 
 
 def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
@@ -170,33 +158,24 @@ def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
 
 def _matrix(rows: Sequence[RequirementRow]) -> str:
     """Traceability matrix as CSV: the latest verdict of each campaign, also requirements without a campaign."""
-    from marsyard.reports.traceability import algorithm_cells, verification_csv
-
     found: list[dict[str, Any]] = []
+    shown_as = {
+        "verdict": "status",
+        "decided_by": "decide_by",
+        "cases": "n",
+        "rate": "estimate",
+        "lower_bound": "lower",
+    }
+    shown_as |= {name: name for name in ("probability", "confidence", "failures", "note")}
     for row in rows:
         about = {"requirement": row.requirement, "statement": row.statement, "kind": row.kind, "source": row.source}
         if not row.cells:
             found.append({**about, "verdict": "NO CAMPAIGN"})
         for cell in row.cells:
-            shown = asdict(cell.shown)
-            found.append(
-                {
-                    **about,
-                    "campaign": cell.entry.name,
-                    **algorithm_cells(cell.entry.tested),
-                    "verdict": cell.shown.status,
-                    "probability": shown["probability"],
-                    "confidence": shown["confidence"],
-                    "decided_by": shown["decide_by"],
-                    "cases": shown["n"],
-                    "failures": shown["failures"],
-                    "rate": shown["estimate"],
-                    "lower_bound": shown["lower"],
-                    "note": shown["note"],
-                }
-            )
+            shown = {column: getattr(cell.shown, name) for column, name in shown_as.items()}
+            found.append({**about, "campaign": cell.entry.name, **algorithm_cells(cell.entry.tested), **shown})
     return verification_csv(found)
 
 
-def _rendered(template: str, **context: Any) -> str:
+def _render(template: str, **context: Any) -> str:
     return page_environment().get_template(template).render(context)

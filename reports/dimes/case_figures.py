@@ -22,6 +22,7 @@ from scipy import ndimage
 from marsyard.reports.presentation import numbers, plane, save_figures
 from marsyard.reports.svg import INK, draw_pictures, in_page_style, show_subframe
 
+Picture = Float[np.ndarray, "_ _"]
 TEMPLATE, MATCH, WINDOW = "#ff4b3e", "#35d46b", "#4aa3ff"
 #: Side of a template's square on a delivered picture if the products lack it, pixels.
 _DEFAULT_SIDE = 15.0
@@ -45,16 +46,16 @@ class Track:
     valid: whether it passed the validity checks
     values: its columns of the products' table
     patch, window: rectified template and search window
-    place: row and column of the matched template's centre in the window
+    position: row and column of the matched template's centre in the window
     """
 
     pair: int
     template: int
     valid: bool
     values: Mapping[str, float]
-    patch: Float[np.ndarray, "_ _"] | None
-    window: Float[np.ndarray, "_ _"] | None
-    place: tuple[float, float] | None
+    patch: Picture | None
+    window: Picture | None
+    position: tuple[float, float] | None
 
 
 def is_dimes_case(products: Mapping[str, Any]) -> bool:
@@ -71,8 +72,16 @@ def tracks(products: Mapping[str, Any]) -> list[Track]:
         return []
     if table.size == 0 or table.shape[1] != len(names):
         return []
-    rows = [dict(zip(names, (float(value) for value in row), strict=True)) for row in table]
-    return [_track(products, row) for row in rows if row.get("pair") in _PAIRS and row.get("template") in _TEMPLATES]
+    found = []
+    for row in (dict(zip(names, (float(value) for value in values), strict=True)) for values in table):
+        if row.get("pair") not in _PAIRS or row.get("template") not in _TEMPLATES:
+            continue
+        pair, template = int(row["pair"]), int(row["template"])
+        patch, window = (plane(products.get(f"{part}_{pair}_{template}")) for part in ("template", "window"))
+        match = numbers(products.get(f"match_{pair}_{template}"))
+        position = (float(match[0]), float(match[1])) if match is not None and match.size == 2 else None
+        found.append(Track(pair, template, row.get("valid", 0.0) == 1.0, row, patch, window, position))
+    return found
 
 
 @in_page_style
@@ -93,21 +102,16 @@ def draw_dimes_pair(products: Mapping[str, Any], pair: int) -> Figure:
     return figure
 
 
-def has_dimes_details(products: Mapping[str, Any]) -> bool:
-    """Whether products hold DIMES' own table of tracks, which may be empty."""
-    return "tracks" in products
-
-
-def delivered_pictures(products: Mapping[str, Any]) -> list[Float[np.ndarray, "_ _"]]:
+def draw_delivered_pictures(products: Mapping[str, Any]) -> Figure:
     """The three pictures with binned columns; raises ValueError if one is missing."""
-    return [_picture(products, f"image_{number}") for number in (1, 2, 3)]
+    return draw_pictures([_picture(products, f"image_{number}") for number in (1, 2, 3)])
 
 
 def write_dimes_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
     """Write `dimes.png` into a folder, or `pictures.png` if the algorithm has no DIMES details; returns the path."""
-    if has_dimes_details(products):
+    if "tracks" in products:
         return save_figures(directory, {"dimes": draw_dimes_case(products)})
-    return save_figures(directory, {"pictures": draw_pictures(delivered_pictures(products))})
+    return save_figures(directory, {"pictures": draw_delivered_pictures(products)})
 
 
 def _row_heights(products: Mapping[str, Any], pair: int) -> dict[str, float]:
@@ -133,12 +137,16 @@ def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> No
     if "rectified" in grid:
         upper = grid["rectified"].subgridspec(1, 2)
         for side, picture in enumerate(pictures):
-            _draw_rectified(figure.add_subplot(upper[side]), products, picture, ours, (pair, side))
+            _draw_rectified(figure.add_subplot(upper[side]), products, picture, ours, pair, side)
     if "templates" in grid:
         middle = grid["templates"].subgridspec(1, 2 * _MAX_TRACKS)
         for place in range(_MAX_TRACKS):
             panels = [figure.add_subplot(middle[2 * place + k]) for k in (0, 1)]
-            _draw_template_window(panels, ours[place] if place < len(ours) else None)
+            if place < len(ours):
+                _draw_template_window(panels, ours[place])
+            else:
+                for axes in panels:
+                    axes.set_axis_off()
     lower = grid["delivered"].subgridspec(1, 2)
     for side, (picture, stem, colour) in enumerate(
         zip(pictures, ("template", "match"), (TEMPLATE, MATCH), strict=True)
@@ -152,14 +160,9 @@ def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> No
 
 
 def _draw_rectified(
-    axes: Axes,
-    products: Mapping[str, Any],
-    picture: Float[np.ndarray, "_ _"],
-    ours: Sequence[Track],
-    place: tuple[int, int],
+    axes: Axes, products: Mapping[str, Any], picture: Picture, ours: Sequence[Track], pair: int, side: int
 ) -> None:
-    """One picture of a pair in the virtual nadir camera; `place` is (pair, side)."""
-    pair, side = place
+    """One picture of a pair in the virtual nadir camera."""
     lattice = numbers(products.get(f"rectified_{pair}_{side}"))
     frame, gsd = numbers(products.get(f"rectified_frame_{pair}")), numbers(products.get(f"gsd_{pair}"))
     if lattice is None or lattice.ndim != 3 or lattice.shape[2] != 2 or frame is None or frame.size != 3:
@@ -183,19 +186,15 @@ def _draw_rectified(
             square(ground, len(track.patch), TEMPLATE, track.valid)
         else:
             square(ground, len(track.window), WINDOW, True)
-            square(_matched_ground(track, ground, spacing), len(track.patch), MATCH, track.valid)
+            if track.position is not None:
+                # the window is centred on `ground`
+                middle = 0.5 * (len(track.window) - 1)
+                offset = np.array([track.position[1] - middle, middle - track.position[0]])
+                square(ground + spacing * offset, len(track.patch), MATCH, track.valid)
     axes.set_title(f"Picture {pair + side + 1} rectified{'' if side == 0 else ': windows'}", fontsize=9)
 
 
-def _matched_ground(track: Track, ground: Float[np.ndarray, "2"], gsd_m: float) -> Float[np.ndarray, "2"]:
-    """Ground position of the match; the window is centred on `ground`."""
-    if track.place is None or track.window is None:
-        return np.full(2, np.nan)
-    middle = 0.5 * (len(track.window) - 1)
-    return np.asarray(ground + gsd_m * np.array([track.place[1] - middle, middle - track.place[0]]))
-
-
-def _rectify(picture: Float[np.ndarray, "_ _"], lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndarray, "m m"]:
+def _rectify(picture: Picture, lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndarray, "m m"]:
     """Resample the picture at the interpolated pixels of a lattice; NaN outside the picture."""
     places = np.linspace(0.0, lattice.shape[0] - 1.0, _RECTIFIED_PX)
     v, u = np.meshgrid(places, places, indexing="ij")
@@ -206,12 +205,8 @@ def _rectify(picture: Float[np.ndarray, "_ _"], lattice: Float[np.ndarray, "n n 
     return np.asarray(np.where(seen, values, np.nan))
 
 
-def _draw_template_window(axes: Sequence[Axes], track: Track | None) -> None:
+def _draw_template_window(axes: Sequence[Axes], track: Track) -> None:
     """Draw a template and its search window with the match; nothing for what is missing."""
-    if track is None:
-        for one in axes:
-            one.set_axis_off()
-        return
     line = "-" if track.valid else _DASHES
     parts = ((track.patch, f"Template {track.template + 1}", TEMPLATE, line), (track.window, "Window", WINDOW, "-"))
     for one, (picture, title, colour, style) in zip(axes, parts, strict=True):
@@ -222,8 +217,8 @@ def _draw_template_window(axes: Sequence[Axes], track: Track | None) -> None:
         one.set_facecolor(INK)
         one.spines[:].set(visible=True, edgecolor=colour, linewidth=2.2, linestyle=style)
         one.set_title(title, fontsize=9)
-    if track.place is not None and track.patch is not None and track.window is not None:
-        _draw_square(axes[1], track.place[::-1], float(len(track.patch)), MATCH, track.valid)
+    if track.position is not None and track.patch is not None and track.window is not None:
+        _draw_square(axes[1], track.position[::-1], float(len(track.patch)), MATCH, track.valid)
 
 
 def _mark_tracks(axes: Axes, ours: Sequence[Track], stem: str, colour: str) -> None:
@@ -258,22 +253,7 @@ def _draw_square(axes: Axes, centre: tuple[float, float], side: float, colour: s
         axes.add_patch(Rectangle(corner, side, side, fill=False, edgecolor=colour, linewidth=1.8, linestyle=line))
 
 
-def _track(products: Mapping[str, Any], row: Mapping[str, float]) -> Track:
-    pair, template = int(row["pair"]), int(row["template"])
-    key = f"{pair}_{template}"
-    place = numbers(products.get(f"match_{key}"))
-    return Track(
-        pair=pair,
-        template=template,
-        valid=row.get("valid", 0.0) == 1.0,
-        values=row,
-        patch=plane(products.get(f"template_{key}")),
-        window=plane(products.get(f"window_{key}")),
-        place=(float(place[0]), float(place[1])) if place is not None and place.size == 2 else None,
-    )
-
-
-def _picture(products: Mapping[str, Any], key: str) -> Float[np.ndarray, "_ _"]:
+def _picture(products: Mapping[str, Any], key: str) -> Picture:
     """A delivered picture with columns binned to square pixels, as in DIMES."""
     counts = plane(products.get(key))
     if counts is None:

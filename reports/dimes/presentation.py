@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from marsyard.reports.columns import label
@@ -25,21 +24,19 @@ from marsyard.reports.presentation import (
     save_figures,
 )
 from marsyard.reports.section import plate
-from marsyard.reports.svg import INK, MARKERS, MUTED, SERIES, draw_pictures, in_page_style
+from marsyard.reports.svg import INK, MARKERS, MUTED, SERIES, in_page_style
 from marsyard.reports.wording import note_text, number
 
 #: Columns of the tracks that the page shows elsewhere or has no width for.
 _NOT_SHOWN = ("pair", "template", "valid", "ground_east_m", "ground_north_m")
-_LEGEND = note_text("dimes.legend")
-_PLAIN_LEGEND = note_text("dimes.plain_legend")
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
     """A DIMES case; its pictures alone if the algorithm left no DIMES details."""
-    if not figures.has_dimes_details(products):
-        pictures = draw_pictures(figures.delivered_pictures(products))
+    if "tracks" not in products:
+        pictures = figures.draw_delivered_pictures(products)
         shown = plate(pictures, f"{key}pictures", "The three pictures that the algorithm was given.", wide=True)
-        return CaseView(_velocities(products), [shown], [], [], _PLAIN_LEGEND)
+        return CaseView(_velocities(products), [shown], [], [], note_text("dimes.plain_legend"))
     pairs = enumerate(("first and second picture", "second and third picture"))
     plates = [
         plate(figures.draw_dimes_pair(products, k), f"{key}pair{k}", f"Pair {k + 1}: {name}.") for k, name in pairs
@@ -71,7 +68,6 @@ def _velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 #: Pictures in a row of a stream's figure.
 _MAX_IN_ROW = 10
-_STREAM_LEGEND = note_text("dimes.stream_legend")
 
 
 def _stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"] | None:
@@ -95,10 +91,18 @@ def view_stream(products: Mapping[str, Any], key: str) -> CaseView:
         answered = bool(np.isfinite(row[2]))
         values = [number(float(value)) for value in (*row, np.hypot(row[2] - row[4], row[3] - row[5]))]
         rows.append(TableRow([str(place), *(values if answered else ["" for _ in values])], answered))
-    head = ["After picture", "From (s)", "To (s)", "East (m/s)", "North (m/s)", "True east", "True north"]
-    caption = "Pictures, and the estimate after each."
-    drawn = plate(draw_stream_case(products), f"{key}stream", caption, wide=True)
-    return CaseView([], [drawn], [*head, "Error (m/s)"], rows)
+    head = [
+        "After picture",
+        "From (s)",
+        "To (s)",
+        "East (m/s)",
+        "North (m/s)",
+        "True east",
+        "True north",
+        "Error (m/s)",
+    ]
+    drawn = plate(draw_stream_case(products), f"{key}stream", "Pictures, and the estimate after each.", wide=True)
+    return CaseView([], [drawn], head, rows)
 
 
 def _require_stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"]:
@@ -125,28 +129,26 @@ def draw_stream_case(products: Mapping[str, Any]) -> Figure:
             axes.imshow(picture, cmap="gray", vmin=low, vmax=max(high, low + 1.0), aspect="auto")
             axes.set_box_aspect(1.0)
             axes.set_title(str(place + 1), fontsize=9)
+    answered = table[np.isfinite(table[:, 2])]
+    start, end = answered[:, 0], answered[:, 1]
+    centres = 0.5 * (start + end)
     for component, (name, axes) in enumerate(zip(("east", "north"), lower.subplots(1, 2), strict=True)):
-        _draw_component(axes, table[np.isfinite(table[:, 2])], component)
+        estimated, true = answered[:, 2 + component], answered[:, 4 + component]
+        axes.hlines(true, start, np.maximum(end, start), color=INK, linewidth=1.0)
+        axes.plot(centres, true, color=INK, linewidth=1.0, label="true")
+        style: dict[str, Any] = {"fmt": MARKERS[component], "color": SERIES[component], "ecolor": MUTED}
+        axes.errorbar(centres, estimated, xerr=0.5 * (end - start), label="answered", **style)
+        if len(answered):
+            axes.legend()
         axes.set(xlabel="Time tag (s)", ylabel=f"Velocity {name} (m/s)")
     return figure
-
-
-def _draw_component(axes: Axes, answered: Float[np.ndarray, "n 6"], component: int) -> None:
-    start, end = answered[:, 0], answered[:, 1]
-    centres, true = 0.5 * (start + end), answered[:, 4 + component]
-    axes.hlines(true, start, np.maximum(end, start), color=INK, linewidth=1.0)
-    axes.plot(centres, true, color=INK, linewidth=1.0, label="true")
-    style: dict[str, Any] = {"fmt": MARKERS[component], "color": SERIES[component], "ecolor": MUTED}
-    axes.errorbar(centres, answered[:, 2 + component], xerr=0.5 * (end - start), label="answered", **style)
-    if len(answered):
-        axes.legend()
 
 
 def _write_stream(directory: Path, products: Mapping[str, Any]) -> list[Path]:
     return save_figures(directory, {"stream": draw_stream_case(products)})
 
 
-STREAM_CASE = CaseKind(is_stream_case, view_stream, _write_stream, _STREAM_LEGEND)
-DIMES_CASE = CaseKind(figures.is_dimes_case, view, figures.write_dimes_figures, _LEGEND)
+STREAM_CASE = CaseKind(is_stream_case, view_stream, _write_stream, note_text("dimes.stream_legend"))
+DIMES_CASE = CaseKind(figures.is_dimes_case, view, figures.write_dimes_figures, note_text("dimes.legend"))
 DIMES = Presentation(cases=(STREAM_CASE, DIMES_CASE), sections=(FIRING, LANDING, sensitivity_section))
 FIELD_TEST = Presentation(first=(field_test_section,))

@@ -79,7 +79,12 @@ def draw_epipolar(products: Mapping[str, Any]) -> Figure:
     """Fig. 3: structure pixels in the first picture, their segments and matches in the second."""
     figure, left, right = _picture_pair(products)
     matches = _require(stages.epipolar_matches(products), "matches")
-    chosen = _thin_matches(matches)
+    # on a coarser grid, so that no more than `_MAX_MATCHES` are drawn
+    every, chosen = 1, np.arange(len(matches.grid))
+    v, u = (np.unique(matches.grid[:, k], return_inverse=True)[1] for k in (1, 0))
+    while len(chosen) > _MAX_MATCHES:
+        every += 1
+        chosen = np.flatnonzero((v % every == every // 2) & (u % every == every // 2))
     _draw_squares(left, matches.grid[chosen], "#ff4b3e")
     _draw_segments(right, matches.starts[chosen], matches.ends[chosen], "#35d46b")
     _draw_squares(right, matches.matched[chosen][matches.accepted[chosen]], BLUE)
@@ -127,23 +132,33 @@ def draw_maps(products: Mapping[str, Any]) -> Figure:
         bar.ax.tick_params(labelsize=7)
         above.set_title(f"Map: {name}", fontsize=9)
         below.set_title("Truth of footprints" if limit is not None else "Truth", fontsize=9)
-    upper[3].imshow(maps.safety, interpolation="nearest", vmin=0, vmax=2, cmap=SAFETY_COLOURS)
-    if (maps.safety > 1.5).any() and (maps.safety < 1.5).any():
-        upper[3].contourf(maps.safety, levels=[1.5, 2.5], colors="none", hatches=["////"])
-    true_safety = np.where(truth.covered, np.where(truth.safe, 0.0, 2.0), 1.0)
-    lower[3].pcolormesh(
-        at[..., 1], at[..., 0], true_safety, shading="nearest", rasterized=True, vmin=0, vmax=2, cmap=SAFETY_COLOURS
-    )
-    upper[3].set_title("Safe landing map", fontsize=9)
-    lower[3].set_title("Truth: a lander's middle", fontsize=9)
-    _safety_legend(lower[3])
+    _draw_safety(upper[3], lower[3], maps, truth)
+    rows, columns = maps.elevation_m.shape
     for axes in (*upper, *lower):
-        _mark_sites(axes, maps)
-        rows, columns = maps.elevation_m.shape
+        for name, (row, column) in (("apriori", maps.apriori), ("site", maps.site)):
+            if 0 <= row <= rows - 1 and 0 <= column <= columns - 1:
+                _mark(axes, np.array([column, row]), name)
         axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xticks=[], yticks=[], aspect="equal")
         axes.set_facecolor("#8a929b")
         axes.grid(visible=False)
     return figure
+
+
+def _draw_safety(above: Axes, below: Axes, maps: stages.LandingMaps, truth: stages.TrueGround) -> None:
+    """Draw the safe landing map, and below it the true one with a legend."""
+    scale: dict[str, Any] = {"vmin": 0, "vmax": 2, "cmap": SAFETY_COLOURS}
+    above.imshow(maps.safety, interpolation="nearest", **scale)
+    if (maps.safety > 1.5).any() and (maps.safety < 1.5).any():
+        above.contourf(maps.safety, levels=[1.5, 2.5], colors="none", hatches=["////"])
+    at, safety = maps.cells(truth.away_m), np.where(truth.covered, np.where(truth.safe, 0.0, 2.0), 1.0)
+    below.pcolormesh(at[..., 1], at[..., 0], safety, shading="nearest", rasterized=True, **scale)
+    above.set_title("Safe landing map", fontsize=9)
+    below.set_title("Truth: a lander's middle", fontsize=9)
+    for name, colour in (("safe", GREEN), ("unknown", YELLOW), ("hazard", RED)):
+        below.plot([], [], "s", color=colour, label=name)
+    for mark, label in zip(_SITE_MARKS.values(), ("a-priori site", "safe site"), strict=True):
+        below.plot([], [], **mark, label=label)
+    below.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, fontsize=7, columnspacing=1.0)
 
 
 @in_page_style
@@ -175,26 +190,22 @@ def draw_site(products: Mapping[str, Any]) -> Figure:
     return figure
 
 
-#: The figures by file name, in the paper's order.
-FIGURES: Mapping[str, Callable[[Mapping[str, Any]], Figure]] = {
-    "fig1-tracks": draw_tracks,
-    "fig2-motion": draw_motion,
-    "fig3-epipolar": draw_epipolar,
-    "fig4-elevation": draw_elevation,
-    "fig5-maps": draw_maps,
-    "fig7-site": draw_site,
+Products = Mapping[str, Any]
+#: The stage that each figure shows, and its drawing, by file name in the paper's order.
+_FIGURES: Mapping[str, tuple[Callable[[Products], object], Callable[[Products], Figure]]] = {
+    "fig1-tracks": (stages.tracked_features, draw_tracks),
+    "fig2-motion": (stages.solved_motion, draw_motion),
+    "fig3-epipolar": (stages.epipolar_matches, draw_epipolar),
+    "fig4-elevation": (stages.landing_maps, draw_elevation),
+    "fig5-maps": (stages.landing_maps, draw_maps),
+    "fig7-site": (stages.landing_maps, draw_site),
 }
-#: Stages that single figures show; the others show the maps.
-_STAGES = {
-    "fig1-tracks": stages.tracked_features,
-    "fig2-motion": stages.solved_motion,
-    "fig3-epipolar": stages.epipolar_matches,
-}
+FIGURES = {name: draw for name, (_, draw) in _FIGURES.items()}
 
 
-def figures_reached(products: Mapping[str, Any]) -> list[str]:
+def figures_reached(products: Products) -> list[str]:
     """Names of the figures whose stages a case reached."""
-    return [name for name in FIGURES if _STAGES.get(name, stages.landing_maps)(products) is not None]
+    return [name for name, (stage, _) in _FIGURES.items() if stage(products) is not None]
 
 
 def write_hda_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
@@ -267,17 +278,6 @@ def _draw_motion_view(
     axes.set_ylabel(f"{'xyz'[pair[1]]} (m)", fontsize=8)
 
 
-def _thin_matches(matches: stages.EpipolarMatches) -> np.ndarray:
-    """Indices of matches on a coarser grid, so that no more than `_MAX_MATCHES` are drawn."""
-    every = 1
-    ranks = [np.unique(matches.grid[:, k], return_inverse=True)[1] for k in (1, 0)]
-    chosen = np.arange(len(matches.grid))
-    while len(chosen) > _MAX_MATCHES:
-        every += 1
-        chosen = np.flatnonzero((ranks[0] % every == every // 2) & (ranks[1] % every == every // 2))
-    return chosen
-
-
 def _draw_terrain(
     axes: Any, maps: stages.LandingMaps, colours: Float[np.ndarray, "rows columns 3"], azimuth_deg: float
 ) -> None:
@@ -310,21 +310,11 @@ def _draw_terrain(
     axes.set(xlabel="x (m)", ylabel="y (m)")
     axes.set_title("Heights in m" if raised == 1.0 else f"Heights in m, drawn {raised:g} times as high", fontsize=9)
     axes.tick_params(labelsize=6, pad=-2, colors=MUTED)
-    axes.locator_params(axis="z", nbins=3)
-    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+    for name, axis, bins in (("x", axes.xaxis, 4), ("y", axes.yaxis, 4), ("z", axes.zaxis, 3)):
+        axes.locator_params(axis=name, nbins=bins)
         axis.label.set_size(7)
         axis.labelpad = -6
         axis.set_pane_color((0.0, 0.0, 0.0, 0.0))
-    axes.locator_params(axis="x", nbins=4)
-    axes.locator_params(axis="y", nbins=4)
-
-
-def _safety_legend(axes: Axes) -> None:
-    for name, colour in (("safe", GREEN), ("unknown", YELLOW), ("hazard", RED)):
-        axes.plot([], [], "s", color=colour, label=name)
-    for mark, label in zip(_SITE_MARKS.values(), ("a-priori site", "safe site"), strict=True):
-        axes.plot([], [], **mark, label=label)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, fontsize=7, columnspacing=1.0)
 
 
 _SITE_MARKS: Mapping[str, Mapping[str, Any]] = {
@@ -332,13 +322,6 @@ _SITE_MARKS: Mapping[str, Mapping[str, Any]] = {
     "site": {"marker": "+", "color": PURPLE, "markersize": 11, "markeredgewidth": 2.6, "linestyle": ""},
 }
 _RIM = [patheffects.Stroke(linewidth=3.6, foreground=WHITE), patheffects.Normal()]
-
-
-def _mark_sites(axes: Axes, maps: stages.LandingMaps) -> None:
-    rows, columns = maps.elevation_m.shape
-    for name, (row, column) in (("apriori", maps.apriori), ("site", maps.site)):
-        if 0 <= row <= rows - 1 and 0 <= column <= columns - 1:
-            _mark(axes, np.array([column, row]), name)
 
 
 def _mark(axes: Axes, place: Float[np.ndarray, "2"], name: str) -> None:

@@ -57,7 +57,6 @@ RATES: Mapping[str, tuple[str, str]] = {
     "such hazards, called safe": ("gross_hazards_called_safe", "gross_hazards"),
     "such hazards, with no hazard of the map under them": ("gross_hazards_unflagged", "gross_hazards"),
 }
-_CLASSES_NOTE = note_text("hda.classes", confidence=stated(CONFIDENCE))
 
 
 def hazard_classes(frame: Rows) -> list[HazardClass]:
@@ -95,10 +94,10 @@ def draw_classes(frame: Rows, subject: Subject, key: str) -> Drawn:
     counted = Grid(["Footprints", "Counted", f"Share ({stated(CONFIDENCE)} interval)"], rows)
     blocks = [
         Block(heading="Hazards missed, by height and slope", plates=[figure], grid=by_class),
-        Block(grid=counted, note=_CLASSES_NOTE),
+        Block(grid=counted, note=note_text("hda.classes", confidence=stated(CONFIDENCE))),
     ]
-    as_data = {name: asdict(one) for name, one in rates.items()}
-    return blocks, {"rates": as_data, "classes": [asdict(one) for one in classes]}
+    data = {"rates": {name: asdict(one) for name, one in rates.items()}, "classes": [asdict(one) for one in classes]}
+    return blocks, data
 
 
 @in_page_style

@@ -26,9 +26,6 @@ _CAPTIONS: Mapping[str, str] = {
 }
 #: Its pictures are those of Fig. 3: only `marsyard replay` draws it.
 _LEFT_OUT = "fig1-tracks"
-_LEGEND = note_text("hda.legend")
-
-_PLAIN_LEGEND = note_text("hda.plain_legend")
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
@@ -38,7 +35,7 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
     if not names and seen is not None:
         caption = "The two pictures that the algorithm was given."
         shown = plate(draw_pictures(seen), f"{key}pictures", caption, wide=True)
-        return CaseView([], [shown], *_stages(products), _PLAIN_LEGEND)
+        return CaseView([], [shown], *_stages(products), note_text("hda.plain_legend"))
     plates = [plate(FIGURES[name](products), f"{key}{name[:4]}", _CAPTIONS[name], wide=True) for name in names]
     facts = [("Figures", ", ".join(name.split("-")[0] for name in names) or "none")]
     return CaseView(facts, plates, *_stages(products))
@@ -87,6 +84,6 @@ SITES = SectionDeclaration(
 )
 _SECTIONS = (sections.THRESHOLD, sections.FAULTS, limits_section, sections.MAP_ERRORS, sections.TOUCHDOWN, SITES)
 HDA = Presentation(
-    cases=(CaseKind(stages.is_hda_case, view, write_hda_figures, _LEGEND),),
+    cases=(CaseKind(stages.is_hda_case, view, write_hda_figures, note_text("hda.legend")),),
     sections=(*_SECTIONS, sections.run_times_section),
 )

@@ -149,21 +149,16 @@ def landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
     pixels, cell_m = shaped(products.get("map_pixels"), *planes[0].shape, 2), _positive(products, "cell")
     if frames is None or pixels is None or cell_m is None or not np.all(frames[-1] > 0.0):
         return None
-    site = read_arrays(products, {"site": (2,)}, finite=True) or [np.full(2, np.nan)]
-    names = ("corner_m", "apriori", "surface_from_camera", "world_from_surface", "limits")
-    named: dict[str, Any] = dict(zip(("elevation_m", "roughness_m", "slope_rad", "safety"), planes, strict=True))
-    named |= dict(zip(names, frames, strict=True))
-    return LandingMaps(pixels=_extrapolate_pixels(pixels), cell_m=cell_m, site=site[0], **named)
-
-
-def _extrapolate_pixels(pixels: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 2"]:
-    """Pixels of all cells: unknown ones by an affine map of the known ones, as for level ground."""
     known = np.isfinite(pixels).all(axis=-1)
-    if known.all() or known.sum() < 3:
-        return pixels
-    cells = np.concatenate([np.moveaxis(np.indices(known.shape), 0, -1), np.ones((*known.shape, 1))], axis=-1)
-    level = np.linalg.lstsq(cells[known], pixels[known], rcond=None)[0]
-    return np.where(known[..., None], pixels, cells @ level)
+    if not known.all() and known.sum() >= 3:
+        # unknown pixels by an affine map of the known ones, as for level ground
+        cells = np.concatenate([np.moveaxis(np.indices(known.shape), 0, -1), np.ones((*known.shape, 1))], axis=-1)
+        level = np.linalg.lstsq(cells[known], pixels[known], rcond=None)[0]
+        pixels = np.where(known[..., None], pixels, cells @ level)
+    (site,) = read_arrays(products, {"site": (2,)}, finite=True) or [np.full(2, np.nan)]
+    names = ("elevation_m", "roughness_m", "slope_rad", "safety", "corner_m", "apriori", "surface_from_camera")
+    arrays = dict(zip((*names, "world_from_surface", "limits"), (*planes, *frames), strict=True))
+    return LandingMaps(pixels=pixels, cell_m=cell_m, site=site, **arrays)
 
 
 def true_ground(products: Mapping[str, Any]) -> TrueGround | None:

@@ -313,10 +313,9 @@ def draw_outcomes(frame: pd.DataFrame, subject: Subject, key: str) -> kinds.Draw
 
 def distances(frame: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
     """Distances of reported sites and of touchdowns to the nearest true hazard, metres."""
+    reported = frame[rates.flag(frame, "site_reported")]
     return {
-        "site, where one was reported": rates.known(
-            frame[rates.flag(frame, "site_reported")], "site_hazard_distance_m"
-        ),
+        "site, where one was reported": rates.known(reported, "site_hazard_distance_m"),
         "touchdown": rates.known(frame, "touchdown_hazard_distance_m"),
     }
 
@@ -348,10 +347,8 @@ def run_times_section(subject: Subject) -> Section | None:
     for stage, middle, slow in zip(stages, median.tolist(), late.tolist(), strict=True):
         sizes = [rates.quantile(rates.known(chosen, name), 0.5) for name in stage["ours"]]
         text = NOTHING if np.isnan(sizes).any() else stage["wording"].format(*sizes)
-        data.append(
-            {"name": stage["name"], "paper_s": stage["seconds"], "median_s": middle, "late_s": slow}
-            | {"scaled_s": factor * middle, "parameters": text}
-        )
+        seconds = {"paper_s": stage["seconds"], "median_s": middle, "late_s": slow, "scaled_s": factor * middle}
+        data.append({"name": stage["name"], **seconds, "parameters": text})
         times = [f"{stage['seconds']:.2f}", f"{1e3 * middle:.1f}", f"{1e3 * slow:.1f}", f"{factor * middle:.2f}"]
         rows.append([stage["name"], *times, stage["parameters"], text])
     rows.append(["Together", f"{paper:.2f}", f"{1e3 * ours:.1f}", NOTHING, f"{ours * factor:.2f}", NOTHING, NOTHING])

@@ -1,26 +1,98 @@
-"""Presentation of real cases: agreement, pictures with matches, and the figures of their task's system."""
+"""Presentation of real cases: their agreement with measurements, matches, and the figures of their system."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
+from marsyard.reports.columns import label, numbers
 from marsyard.reports.dimes.presentation import DIMES_CASE
 from marsyard.reports.hda.case_figures import FIGURES, figures_reached
-from marsyard.reports.measured.agreement import agreement_section
-from marsyard.reports.measured.case_figures import (
-    MatchedPair,
-    draw_pair,
-    is_measured_case,
-    matched_pairs,
-    write_measured_figures,
-)
+from marsyard.reports.measured.case_figures import draw_pair, matched_pairs
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow, save_figures
-from marsyard.reports.section import plate
-from marsyard.reports.wording import number
+from marsyard.reports.section import Block, Grid, Section, Subject, plate
+from marsyard.reports.svg import MARKERS, SERIES, in_page_style, new_axes
+from marsyard.reports.wording import NOTHING, number
+
+MEDIAN, MOST = "residual_median_px", "residual_90_percent_px"
+#: Maximum number of rows of the table; further cases are counted.
+_MAX_ROWS = 60
+#: Minimum number of cases for a figure.
+_MIN_DRAWN = 3
+#: Further columns of the table where the rows have them.
+_QUANTITIES = (
+    "matches", "matches_wrong_share", MEDIAN, MOST, "residual_worst_pair_px", "turned_most_deg", "moved_most_m",
+    "beside_inertial_m_s", "pair_discrepancy_m_s", "rotation_beside_poses_deg", "direction_beside_poses_deg",
+    "baseline_beside_poses_share",
+)  # fmt: skip
+_TEXT = (
+    "Whatever is known of the truth, pictures and poses must agree. Features are matched from each picture to the "
+    "next; by the poses a match lies on a curve of the later picture (at a point, if the camera only turned), and the "
+    "residual is how far off it is. It holds the errors of poses, lens and matching together: a few tenths of a pixel "
+    "are what matching alone leaves, more is the poses' or the camera's."
+)
+_INERTIAL = (
+    "Velocities compared with the inertial one contain its constant error; the discrepancy of pairs, the change of "
+    "velocity from the first pair of pictures to the second against the inertial one, does not. Without measured "
+    "positions the "
+    "residual is that of the answer: its velocity stands for the inertial one's constant part. "
+)
+_NO_DRAWS = "Cases that were measured are no random draws: nothing here is a probability."
+
+
+def agreement_section(subject: Subject) -> Section | None:
+    """Section on the agreement; None where cases are not real ones."""
+    frame = subject.frame
+    if "measured_case" not in frame or MEDIAN not in frame:
+        return None
+    # distances of further algorithms from the first come last
+    apart = [str(name) for name in frame if str(name).endswith((".apart_m_s", ".apart_m"))]
+    names = [one for one in (*_QUANTITIES, *apart) if one in frame and np.isfinite(numbers(frame, one)).any()]
+    medians = numbers(frame, MEDIAN)
+    head = ["Case", "Name", "Outcome", *(label(name) for name in names)]
+    rows = []
+    for place, row in enumerate(frame.head(_MAX_ROWS).to_dict("records")):
+        values = [float(numbers(frame, name)[place]) for name in names]
+        texts = [NOTHING if not isfinite(one) else f"{one:.0f}" if one.is_integer() else number(one) for one in values]
+        rows.append([str(row.get("case", place)), str(row["measured_case"]), str(row["outcome"]), *texts])
+    plates = []
+    if np.count_nonzero(np.isfinite(medians)) >= _MIN_DRAWN:
+        plates.append(plate(residual_figure(frame), "agreement", "Residuals of the cases, the smallest median first."))
+    note = (_INERTIAL if "beside_inertial_m_s" in names else "") + _NO_DRAWS
+    grid = Grid(head, rows, max(0, len(frame) - _MAX_ROWS))
+    data = {
+        "cases": len(frame),
+        "unmatched": int(np.count_nonzero(~np.isfinite(medians))),
+        "median_of_medians_px": float(np.nanmedian(medians)) if np.isfinite(medians).any() else None,
+        "apart": {name: float(np.nanmedian(numbers(frame, name))) for name in names if name in apart},
+    }
+    blocks = [Block(text=_TEXT, plates=plates, grid=grid, note=note)]
+    return Section("agreement", "Agreement", "Pictures against measured poses", blocks, data)
+
+
+@in_page_style
+def residual_figure(frame: pd.DataFrame) -> Figure:
+    """Median and 90 % residual of each case, ordered by the median."""
+    medians, most = numbers(frame, MEDIAN), numbers(frame, MOST)
+    known = np.flatnonzero(np.isfinite(medians))
+    order = known[np.argsort(medians[known], kind="stable")]
+    places = np.arange(1, order.size + 1)
+    figure, axes = new_axes(6.2, 3.2)
+    for values, name, place in ((most, "90 %", 1), (medians, "median", 0)):
+        axes.plot(places, values[order], MARKERS[place], color=SERIES[place], markersize=5.0, label=name)
+    axes.set(xlabel="case, in order of the median", ylabel="residual (px)", ylim=(0.0, None))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlim(0.5, order.size + 0.5)
+    axes.legend(loc="upper left")
+    return figure
+
 
 #: Maximum number of pairs in the page.
 _MAX_PAIRS = 4
@@ -36,26 +108,36 @@ _LEGEND = (
 def view(products: Mapping[str, Any], key: str) -> CaseView:
     """View of a real case."""
     pairs = matched_pairs(products)
-    plates = [plate(draw_pair(pair), f"{key}matches{pair.number}", f"{pair.caption}.", wide=True) for pair in pairs]
-    left_out = len(plates) - _MAX_PAIRS
+    plates = [
+        plate(draw_pair(pair), f"{key}matches{pair.number}", f"{pair.caption}.", wide=True)
+        for pair in pairs[:_MAX_PAIRS]
+    ]
+    left_out = len(pairs) - _MAX_PAIRS
     facts = [("Pairs not shown", str(left_out))] if left_out > 0 else []
-    plates = plates[:_MAX_PAIRS]
     if DIMES_CASE.is_case(products) and "tracks" in products:
         theirs = DIMES_CASE.view(products, key)
         return CaseView([*facts, *theirs.facts], [*plates, *theirs.plates], theirs.head, theirs.rows)
     plates += [plate(FIGURES[name](products), f"{key}{name[:4]}", f"{name}.", wide=True) for name in _landing(products)]
     head = ["Pictures", "Matches", "Wrong", "Median residual (px)", "90 % (px)"]
     head += ["Offset right (px)", "Offset down (px)"]
-    return CaseView(facts, plates, head, [_row(pair) for pair in pairs])
+    rows = []
+    for pair in pairs:
+        residuals, offsets = pair.residuals_px, pair.offsets[pair.right]
+        cells = [f"{pair.number} and {pair.number + 1}", f"{residuals.size:,}", f"{int((~pair.right).sum()):,}"]
+        texts = 4 * ["–"]
+        if residuals.size:
+            values = [
+                np.median(residuals),
+                np.quantile(residuals, 0.9, method="higher"),
+                *np.nanmedian(offsets, axis=0),
+            ]
+            texts = [number(float(value)) for value in values]
+        rows.append(TableRow([*cells, *texts], succeeded=residuals.size > 0))
+    return CaseView(facts, plates, head, rows)
 
 
-def _row(pair: MatchedPair) -> TableRow:
-    residuals, offsets = pair.residuals_px, pair.offsets[pair.right]
-    cells = [f"{pair.number} and {pair.number + 1}", f"{residuals.size:,}", f"{int((~pair.right).sum()):,}"]
-    if not residuals.size:
-        return TableRow([*cells, *4 * ["–"]], succeeded=False)
-    values = [np.median(residuals), np.quantile(residuals, 0.9, method="higher"), *np.nanmedian(offsets, axis=0)]
-    return TableRow([*cells, *(number(float(value)) for value in values)], succeeded=True)
+def _is_measured_case(products: Mapping[str, Any]) -> bool:
+    return bool(matched_pairs(products))
 
 
 def _landing(products: Mapping[str, Any]) -> list[str]:
@@ -63,10 +145,11 @@ def _landing(products: Mapping[str, Any]) -> list[str]:
 
 
 def _write(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    written = write_measured_figures(directory, products)
+    pairs = matched_pairs(products)
+    written = save_figures(directory, {f"matches-{pair.number}": draw_pair(pair) for pair in pairs})
     if DIMES_CASE.is_case(products) and "tracks" in products:
         return [*written, *DIMES_CASE.write(directory, products)]
     return [*written, *save_figures(directory, {name: FIGURES[name](products) for name in _landing(products)}, dpi=130)]
 
 
-MEASURED = Presentation(cases=(CaseKind(is_measured_case, view, _write, _LEGEND),), first=(agreement_section,))
+MEASURED = Presentation(cases=(CaseKind(_is_measured_case, view, _write, _LEGEND),), first=(agreement_section,))

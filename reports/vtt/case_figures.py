@@ -41,8 +41,6 @@ _APART = 0.07
 _CONTRAST = (0.005, 0.998)
 #: Minimum height of the path's axes over their width: paths are mostly straight.
 _FLATTEST = 0.5
-
-
 #: Valid numbers of stops.
 _STOPS = range(1, 1000)
 
@@ -123,17 +121,15 @@ def stops_of(products: Mapping[str, Any]) -> list[StopPictures]:
         if left is None:
             return found
         state = states[number - 1] if isinstance(states, list) and number <= len(states) else ""
+        shapes = {"corners": (2, 2), "window": (4,), "found": (2, 2), "point": (2,)}
         found.append(
             StopPictures(
                 number=number,
                 state=str(state).replace("_", " ").lower(),
                 left=left,
                 right=plane(products.get(f"stop_{number}_right")),
-                corners=_shaped_or_nan(products.get(f"stop_{number}_corners"), 2, 2),
-                window=_shaped_or_nan(products.get(f"stop_{number}_window"), 4),
-                found=_shaped_or_nan(products.get(f"stop_{number}_found"), 2, 2),
-                point=_shaped_or_nan(products.get(f"stop_{number}_point"), 2),
                 figures={name: float(a[number - 1]) for name, a in arrays.items() if number <= a.size},
+                **{part: _shaped_or_nan(products.get(f"stop_{number}_{part}"), *of) for part, of in shapes.items()},
             )
         )
     return found
@@ -211,14 +207,19 @@ def _draw_stop(figure: Figure, cell: SubplotSpec, stop: StopPictures, side: floa
     corner = stop.corners[0]
     if np.isfinite([*stop.window, *corner]).all():
         _draw_rectangle(left, stop.window[:2] - corner - 0.5, stop.window[2:], WINDOW, (0, (4, 2)))
-    if np.isfinite([*stop.point, *corner]).all():
-        _draw_cross(left, stop.point - corner)
+    point, limits = stop.point - corner, (left.get_xlim(), left.get_ylim()[::-1])
+    if all(low <= value <= high for value, (low, high) in zip(point, limits, strict=True)):
+        style: dict[str, Any] = {"color": TRUTH, "markersize": 5.5, "markeredgewidth": 0.9, "path_effects": _RIM}
+        left.plot(*point[:, None], "+", **style)
     if stop.is_found:
         _draw_target(left, stop.found[0] - corner, side)
     left.set_title("\n".join(_stop_lines(stop)), fontsize=7.5, fontweight="normal", loc="left", linespacing=1.25)
     enlarged = figure.add_subplot(parts[0, 1])
     if stop.is_found:
-        show_subframe(enlarged, _enlarge(stop.left, stop.found[0] - corner, side), _CONTRAST)
+        steps = (np.arange(_ENLARGED_PX) + 0.5) / _ENLARGED_PX * side - 0.5 * side
+        u, v = (stop.found[0] - corner)[:, None] + steps
+        pixels = np.meshgrid(v, u, indexing="ij")
+        show_subframe(enlarged, ndimage.map_coordinates(stop.left, pixels, order=0, mode="nearest"), _CONTRAST)
         enlarged.spines[:].set(visible=True, edgecolor=TARGET, linewidth=1.6)
     else:
         enlarged.set_axis_off()
@@ -251,13 +252,6 @@ def _stop_lines(stop: StopPictures) -> list[str]:
     return [f"{stop.number}{state}: {words[0]}", *(line or " " for line in words[1:])]
 
 
-def _enlarge(picture: Picture, middle: Float[np.ndarray, "2"], side: float) -> Float[np.ndarray, "n n"]:
-    """Nearest pixels of a square around a sub-pixel position."""
-    steps = (np.arange(_ENLARGED_PX) + 0.5) / _ENLARGED_PX * side - 0.5 * side
-    v, u = np.meshgrid(middle[1] + steps, middle[0] + steps, indexing="ij")
-    return np.asarray(ndimage.map_coordinates(picture, [v, u], order=0, mode="nearest"))
-
-
 def _draw_target(axes: Axes, centre: Float[np.ndarray, "2"], side: float) -> None:
     _draw_rectangle(axes, centre - 0.5 * side, np.full(2, side), TARGET, "-")
 
@@ -265,14 +259,6 @@ def _draw_target(axes: Axes, centre: Float[np.ndarray, "2"], side: float) -> Non
 def _draw_rectangle(axes: Axes, corner: Point, size: Point, colour: str, line: Any) -> None:
     (x, y), (width, height) = corner.tolist(), size.tolist()
     axes.add_patch(Rectangle((x, y), width, height, fill=False, edgecolor=colour, linewidth=1.3, linestyle=line))
-
-
-def _draw_cross(axes: Axes, position: Point) -> None:
-    """Draw a cross if it lies within the axes."""
-    limits = (axes.get_xlim(), axes.get_ylim()[::-1])
-    if all(low <= value <= high for value, (low, high) in zip(position, limits, strict=True)):
-        style: dict[str, Any] = {"color": TRUTH, "markersize": 5.5, "markeredgewidth": 0.9, "path_effects": _RIM}
-        axes.plot([position[0]], [position[1]], "+", **style)
 
 
 def _draw_above(axes: Axes, way: RoverPath) -> None:

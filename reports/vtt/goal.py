@@ -88,18 +88,12 @@ def _millimetres(name: str) -> Any:
 
 def _draw_cameras(runs: Rows, subject: Subject, key: str) -> Drawn:
     found = camera_runs(runs)
-    shares: list[tuple[str, str, rates.Share]] = [
-        (one["camera"], name, one[rate]) for one in found for name, rate in _RATES.items()
+    rows = [
+        [one["camera"], name, rates.share_text(one[rate]), rates.interval_text(one[rate])]
+        for one in found
+        for name, rate in _RATES.items()
     ]
-    of_runs = grid_of(
-        shares,
-        {
-            "Camera": lambda row: row[0],
-            "": lambda row: row[1],
-            "Runs": lambda row: rates.share_text(row[2]),
-            f"{stated(CONFIDENCE)} interval": lambda row: rates.interval_text(row[2]),
-        },
-    )
+    of_runs = Grid(["Camera", "", "Runs", f"{stated(CONFIDENCE)} interval"], rows)
     of_errors = grid_of(
         found,
         {

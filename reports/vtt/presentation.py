@@ -27,7 +27,6 @@ _QUANTITIES = (
     "range_m", "azimuth_deg", "elevation_deg", "magnification", "roll_change_deg", "azimuth_change_deg", "match_score",
     "stereo_score", "correction_px", "error_px", "position_error_m",
 )  # fmt: skip
-_LEGEND = note_text("vtt.legend")
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
@@ -39,16 +38,14 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
         text = "The path from above, and the target as estimated."
         plates.append(plate(draw_path(products), f"{key}way", text, wide=True))
     names = [name for name in _QUANTITIES if any(name in stop.figures for stop in stops)]
-    rows = [
-        TableRow(
-            [str(stop.number), stop.state or NOTHING, *(number(stop.figure(name)) for name in names)], stop.is_found
-        )
-        for stop in stops
-    ]
+    rows = []
+    for stop in stops:
+        texts = [str(stop.number), stop.state or NOTHING, *(number(stop.figure(name)) for name in names)]
+        rows.append(TableRow(texts, stop.is_found))
     return CaseView([("Stops", str(len(stops)))], plates, ["Stop", "State", *(label(name) for name in names)], rows)
 
 
 VTT = Presentation(
-    cases=(CaseKind(is_vtt_case, view, write_vtt_figures, _LEGEND),),
+    cases=(CaseKind(is_vtt_case, view, write_vtt_figures, note_text("vtt.legend")),),
     first=(table_1_section, SINGLE_RUNS, updates_section, steps_section, terrains_section, regression_section, GOAL),
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
@@ -163,40 +163,30 @@ def updates_section(subject: Subject) -> Section | None:
     if not is_tracking(frame) or not updates:
         return None
     values = {n: {ending: rates.known(frame, f"update_{n}_{ending}") for _, ending, _ in QUANTITIES} for n in updates}
-    grid = grid_of(
-        [n for n in updates if values[n]["range_m"].size],
-        {
-            "Update": str,
-            "Cases": lambda n: f"{values[n]['range_m'].size:,}",
-            **{one[0]: _update_text(values, *one[1:]) for one in QUANTITIES},
-        },
-    )
+    rows = [
+        [str(n), f"{of_n['range_m'].size:,}", *(rates.spread_text(of_n[ending], d) for _, ending, d in QUANTITIES)]
+        for n, of_n in values.items()
+        if of_n["range_m"].size
+    ]
+    grid = Grid(["Update", "Cases", *(heading for heading, _, _ in QUANTITIES)], rows)
     note = note_text("vtt.updates")
     blocks, title = [Block(grid=grid, note=note)], "Updates one by one"
     if subject.run.name == CHECKOUT_1:
         title = "Table III: the first checkout's updates"
+        compared = []
+        for heading, ending, digits in QUANTITIES:
+            printed = PAPER["table_3"].get(ending)
+            if printed is not None:
+                paper = [f"{printed[str(n)]:.{digits}f}" if str(n) in printed else NOTHING for n in values]
+                ours = [rates.spread_text(np.abs(of_n[ending]), digits) for of_n in values.values()]
+                compared += [[heading, "paper", *paper], ["", "ours", *ours]]
+        table_3 = Grid(["Parameter", "Rover position", *(str(n) for n in values)], compared)
         blocks = [
-            Block(heading="Comparison with the paper", grid=_table_3(values), note=note_text("vtt.table_3")),
+            Block(heading="Comparison with the paper", grid=table_3, note=note_text("vtt.table_3")),
             Block(heading="All our updates", grid=grid, note=note),
         ]
     lists = {str(n): {ending: one.tolist() for ending, one in of_n.items()} for n, of_n in values.items()}
     return Section("updates", "Updates", title, blocks, {"updates": lists})
-
-
-def _update_text(values: Mapping[int, Mapping[str, np.ndarray]], ending: str, digits: int) -> Callable[[int], str]:
-    return lambda n: rates.spread_text(values[n][ending], digits)
-
-
-def _table_3(values: Mapping[int, Mapping[str, np.ndarray]]) -> Grid:
-    """Table III: rows of paper and ours for each quantity, a column for each rover position."""
-    rows = []
-    for heading, ending, digits in QUANTITIES:
-        printed = PAPER["table_3"].get(ending)
-        if printed is not None:
-            paper = [f"{printed[str(n)]:.{digits}f}" if str(n) in printed else NOTHING for n in values]
-            ours = [rates.spread_text(np.abs(of_n[ending]), digits) for of_n in values.values()]
-            rows += [[heading, "paper", *paper], ["", "ours", *ours]]
-    return Grid(["Parameter", "Rover position", *(str(n) for n in values)], rows)
 
 
 #: Columns that distinguish the lines of a figure of steps, if they vary.
@@ -321,19 +311,15 @@ def terrains_section(subject: Subject) -> Section | None:
     for name in ordered:
         runs = frame[frame["incline"].eq(name)]
         good, slips = selectable(runs), rates.known(runs, "slip_max")
-        counted = dict(
-            Counter(failure_cause(row) for _, row in good[~rates.flag(good, "tracked")].iterrows()).most_common()
-        )
+        lost = good[~rates.flag(good, "tracked")]
+        counted = dict(Counter(failure_cause(row) for _, row in lost.iterrows()).most_common())
         failed, failed_all = (rates.flag_share(one, "tracked", wanted=False) for one in (good, runs))
         slip = float(slips.max()) if slips.size else float("nan")
         row = printed.get(name)
         paper = [NOTHING] * 2 if row is None else [f"{row['failures']} of {row['trials']}", row["reason"]]
-        ours = [
-            rates.share_text(failed),
-            rates.interval_text(failed),
-            "; ".join(f"{c}: {n}" for c, n in counted.items()) or "none",
-        ]
-        rows.append([name, *paper, *ours, rates.share_text(failed_all), percent(slip)])
+        causes = "; ".join(f"{cause}: {n}" for cause, n in counted.items()) or "none"
+        ours = [rates.share_text(failed), rates.interval_text(failed), causes, rates.share_text(failed_all)]
+        rows.append([name, *paper, *ours, percent(slip)])
         shares = {"failed": asdict(failed), "failed_all": asdict(failed_all)}
         data.append({"name": name, **shares, "causes": counted, "slip_max": slip})
     head = ["Terrain", "Failures, paper", "Reason, paper", "Failures, ours", f"{stated(CONFIDENCE)} interval"]

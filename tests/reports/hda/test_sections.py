@@ -109,13 +109,9 @@ def test_crashed_flights_are_counted_as_not_finished() -> None:
 
 def test_classes_of_hazards() -> None:
     classes = hazard_classes(landing_frame(10))
-    assert [(one.kind, one.low, one.high) for one in classes[:5]] == [
-        ("roughness", 0.0, 1.0),
-        ("roughness", 1.0, 1.5),
-        ("roughness", 1.5, 2.0),
-        ("roughness", 2.0, 3.0),
-        ("roughness", 3.0, float("inf")),
-    ]
+    assert {one.kind for one in classes[:5]} == {"roughness"}
+    assert [one.low for one in classes[:5]] == [0.0, 1.0, 1.5, 2.0, 3.0]
+    assert [one.high for one in classes[:5]] == [1.0, 1.5, 2.0, 3.0, float("inf")]
     assert classes[1].called_safe.share == pytest.approx(0.03)
     assert classes[4].unflagged.share == 0.0
 
@@ -197,9 +193,8 @@ def test_map_errors_follow_their_drivers() -> None:
     np.testing.assert_allclose(scale.centres, scale.medians)
 
 
-@pytest.mark.parametrize("cases", [40])
-def test_page_has_the_sections(make_run: Callable[..., Path], cases: int) -> None:
-    directory = make_run(frame=landing_frame(cases), requirements=[])
+def test_page_has_the_sections(make_run: Callable[..., Path]) -> None:
+    directory = make_run(frame=landing_frame(40), requirements=[])
     page = write_report(directory)
     twin = json.loads((directory / "report.json").read_text(encoding="utf-8"))
     assert {"touchdown", "sites", "run-times"} <= set(twin["sections"])

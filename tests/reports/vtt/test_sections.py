@@ -154,13 +154,9 @@ def test_facts_of_single_runs() -> None:
 
 
 def test_table_iv_by_mode() -> None:
-    driven: list[dict[str, object]] = [
-        {"motion": "stay"},
-        {"motion": "turn"},
-        {"motion": "back-off"},
-        {"motion": "back-off", "autonav": True},
-    ]
-    driven += [{"visual_odometry": True}, {"motion": "approach", "autonav": True}]
+    driven: list[dict[str, object]] = [{"motion": motion} for motion in ("stay", "turn", "back-off")]
+    driven += [{"motion": "back-off", "autonav": True}, {"visual_odometry": True}]
+    driven += [{"motion": "approach", "autonav": True}]
     frame = rows(2)
     legs = [-1, 0, *[1] * 7, *[2] * 9, 3, *[4] * 4, *[5] * 4]
     for n, leg in enumerate(legs, start=1):
