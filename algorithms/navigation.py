@@ -83,11 +83,8 @@ class TerrainMap:
 
         The latest sighting of a rock replaces earlier ones.
         """
-        seen = {
-            rock.name: rock
-            for rock in rocks
-            if bool(wedge.covers(rock.place_m + rock.radius_m * _FOOTPRINT_POINTS).any())
-        }
+        rims = ((rock, rock.place_m + rock.radius_m * _FOOTPRINT_POINTS) for rock in rocks)
+        seen = {rock.name: rock for rock, rim in rims if wedge.covers(rim).any()}
         kept = tuple(rock for rock in self.obstacles if rock.name not in seen)
         return TerrainMap((*self.wedges, wedge), kept + tuple(seen.values()))
 
@@ -121,12 +118,11 @@ class NavigationOptions:
     bend_cost_m2: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("half_width_m", "lookahead_m", "curvature_m"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")
-        for name in ("margin_m", "climb_m", "turn_cost_m", "bend_cost_m2"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must not be negative")
+        for name, value in vars(self).items():
+            if name in ("half_width_m", "lookahead_m", "curvature_m") and not 0.0 < value < np.inf:
+                raise ValueError(f"{name} is {value}; it must be positive")
+            if not 0.0 <= value < np.inf:
+                raise ValueError(f"{name} is {value}; it must not be negative")
 
 
 class NavigationOutcome(Enum):
@@ -177,7 +173,8 @@ def navigate(
     avoided = [rock for rock in terrain.obstacles if rock.name != target and rock.height_m > options.climb_m]
     for path in _candidates(goal, options):
         lookahead = pose.world(path.points(np.arange(0.0, min(path.length_m, options.lookahead_m), 0.1)))
-        if _is_clear(lookahead, avoided, options) and _is_mapped(lookahead, terrain, options):
+        disc = lookahead[:, None] + options.half_width_m * _FOOTPRINT_POINTS
+        if _is_clear(lookahead, avoided, options) and bool(terrain.mapped(disc).all()):
             whole = pose.world(path.points(np.linspace(0.0, path.length_m, 60)))
             return NavigationPlan(NavigationOutcome.PATH, path.commands(step_m, backwards), whole)
     return NavigationPlan(NavigationOutcome.NO_PATH, (), none)
@@ -280,8 +277,3 @@ def _is_clear(positions_m: Float[np.ndarray, "n 2"], rocks: Iterable[Obstacle], 
         if float(distances.min()) < min(clearance, float(distances[0])):
             return False
     return True
-
-
-def _is_mapped(positions_m: Float[np.ndarray, "n 2"], terrain: TerrainMap, options: NavigationOptions) -> bool:
-    """Whether the disc stays on mapped ground."""
-    return bool(terrain.mapped(positions_m[:, None] + options.half_width_m * _FOOTPRINT_POINTS).all())
