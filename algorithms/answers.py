@@ -34,9 +34,9 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
     _check_type("the answer", answer, VelocityEstimate)
     _check_type("outcome", answer.outcome, VelocityOutcome)
     if (answer.outcome is VelocityOutcome.VALID) != (answer.velocity_m_s is not None):
-        given = "none" if answer.velocity_m_s is None else "one"
+        count = "none" if answer.velocity_m_s is None else "one"
         raise _bad_answer(
-            f"outcome is {answer.outcome.name}, but of velocity_m_s {given} is given; allowed: one with VALID alone"
+            f"outcome is {answer.outcome.name}, but of velocity_m_s {count} is given; allowed: one with VALID alone"
         )
     velocity = _check_numbers("velocity_m_s", answer.velocity_m_s, (2,))
     if answer.covariance_m2_s2 is not None and velocity is None:
@@ -48,8 +48,16 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
             raise _bad_answer(f"covariance_m2_s2 is not symmetric: {covariance.tolist()}")
         if scale == 0.0 or float(np.linalg.eigvalsh(covariance)[0]) <= 0.0:
             raise _bad_answer(f"covariance_m2_s2 is not positive definite: {covariance.tolist()}")
-    span = None if answer.span_s is None else _check_span(answer.span_s, tags_s)
-    if span is None and tags_s is not None and len(tags_s) < 2 and velocity is not None:
+    span, given = None, answer.span_s
+    if given is not None:
+        if not isinstance(given, tuple) or len(given) != 2 or not all(isinstance(n, float | int) for n in given):
+            raise _bad_answer(f"span_s is {given!r}; allowed: a tuple of two time tags, or None")
+        span = (float(given[0]), float(given[1]))
+        if not (np.all(np.isfinite(span)) and span[0] <= span[1]):
+            raise _bad_answer(f"span_s is {span}; allowed: two finite time tags, the first not after the second")
+        if tags_s and not tags_s[0] <= span[0] <= span[1] <= tags_s[-1]:
+            raise _bad_answer(f"span_s is {span}; allowed: within the pictures' tags, {tags_s[0]} to {tags_s[-1]} s")
+    elif tags_s is not None and len(tags_s) < 2 and velocity is not None:
         raise _bad_answer("of one picture there is no last interval; allowed: a velocity with a span_s, or a failure")
     return VelocityEstimate(answer.outcome, velocity, answer.details, covariance, span, answer.after_pictures)
 
@@ -111,17 +119,6 @@ def _check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> Float64[np.
     if not np.all(np.isfinite(plain)):
         raise _bad_answer(f"{name} is not finite: {plain.tolist()}")
     return plain
-
-
-def _check_span(given: Any, tags_s: Sequence[float] | None) -> tuple[float, float]:
-    if not isinstance(given, tuple) or len(given) != 2 or not all(isinstance(n, float | int) for n in given):
-        raise _bad_answer(f"span_s is {given!r}; allowed: a tuple of two time tags, or None")
-    span = (float(given[0]), float(given[1]))
-    if not (np.all(np.isfinite(span)) and span[0] <= span[1]):
-        raise _bad_answer(f"span_s is {span}; allowed: two finite time tags, the first not after the second")
-    if tags_s and not tags_s[0] <= span[0] <= span[1] <= tags_s[-1]:
-        raise _bad_answer(f"span_s is {span}; allowed: within the pictures' tags, {tags_s[0]} to {tags_s[-1]} s")
-    return span
 
 
 def _check_type(name: str, value: Any, kind: type) -> None:

@@ -1,6 +1,6 @@
 """Image pairs rectified to a common camera that looks straight down, and the phase correlation of such pairs.
 
-The baselines see the same corrected images as DIMES, in the same geometry (`marsyard.algorithms.dimes.rectify_views`),
+The baselines see the same corrected images as DIMES, in the same geometry (`dimes.rectification.rectify_patch`),
 but the whole overlap of two images rather than templates. The IMU checks the change between their two velocities as in
 DIMES, with the same threshold. Only the measurement of the shift differs.
 """

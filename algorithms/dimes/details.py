@@ -155,8 +155,6 @@ def dimes_products(details: DimesDetails) -> dict[str, Any]:
         for side, pixels in enumerate(lattices):
             products[f"rectified_{number}_{side}"] = pixels
     for track in details.tracks:
-        name = f"{track.pair}_{track.index}"
-        products[f"template_{name}"] = track.template
-        products[f"window_{name}"] = track.window
-        products[f"match_{name}"] = track.match
+        for kind in ("template", "window", "match"):
+            products[f"{kind}_{track.pair}_{track.index}"] = getattr(track, kind)
     return products

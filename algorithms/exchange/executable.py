@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from scipy.spatial.transform import RigidTransform
@@ -68,22 +67,19 @@ class ExecutableVelocityStream:
     def start(self) -> None:
         """Start a new descent."""
         self._details = ProgramDetails("", 0.0)
-        if self._ask("start", {}) is not None:
+        if self._session.ask("start", {}, self._read_answer) is not None:
             raise bad_answer("start is answered with an outcome; allowed: null, before the first picture")
 
     def picture(self, frame: DescentFrame) -> VelocityEstimate | None:
         """The program's answer to one more image."""
-        return self._ask("picture", {"frame": lambda folder: write_frame(folder, frame)})
+        return self._session.ask("picture", {}, self._read_answer, {"frame": lambda folder: write_frame(folder, frame)})
 
     def finish(self) -> VelocityEstimate:
         """The program's final answer; its details sum its output and time over the descent."""
-        answer = self._ask("finish", {})
+        answer = self._session.ask("finish", {}, self._read_answer)
         if answer is None:
             raise bad_answer("finish is answered with the outcome null; allowed: one of the outcomes")
         return answer
-
-    def _ask(self, do: str, files: Mapping[str, Callable[[Path], None]]) -> VelocityEstimate | None:
-        return self._session.ask(do, {}, self._read_answer, files)
 
     def _read_answer(self, answer: Mapping[str, Any], details: ProgramDetails) -> VelocityEstimate | None:
         self._details = ProgramDetails(
@@ -128,9 +124,8 @@ class ExecutableTargetTracker:
 
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
         """Send the target and the rover's pose."""
-        self._ask_state(
-            "designate", {"target": encode_target(target), "world_from_rover": encode_pose(world_from_rover)}
-        )
+        values = {"target": encode_target(target), "world_from_rover": encode_pose(world_from_rover)}
+        self._state = self._session.ask("designate", values, _read_state)
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
         """The requested mast angles and image parts."""
@@ -147,10 +142,7 @@ class ExecutableTargetTracker:
 
     def clear(self) -> None:
         """Clear the target."""
-        self._ask_state("clear", {})
-
-    def _ask_state(self, do: str, values: Mapping[str, Any]) -> None:
-        self._state = self._session.ask(do, values, _read_state)
+        self._state = self._session.ask("clear", {}, _read_state)
 
     def _write_mast(self, mast: MastCalibration) -> str:
         """The folder of the mast's files; written again for a new mast only."""

@@ -148,7 +148,14 @@ class RunningProgram:
             if unasked := _read_pending(self._process.stdout):
                 message = f"before it was asked it wrote {shorten(unasked)}; expected one line for each request"
                 raise self._end_with_fault(Fault.BAD_ANSWER, message)
-            self._write_line(asked)
+            try:
+                if self._process.stdin is None or self._process.stdin.closed:
+                    raise BrokenPipeError
+                self._process.stdin.write(f"{asked}\n".encode())
+                self._process.stdin.flush()
+            except BrokenPipeError:
+                self._wait()
+                raise self._end_with_fault(Fault.CRASHED, "it reads no more cases") from None
         self._read(lambda: b"\n" in self._output)
         if b"\n" not in self._output:
             self._wait()
@@ -165,17 +172,6 @@ class RunningProgram:
             self._process.wait(_EXIT_GRACE_S)
         self._kill()
 
-    def _write_line(self, line: str) -> None:
-        stdin = self._process.stdin
-        try:
-            if stdin is None or stdin.closed:
-                raise BrokenPipeError
-            stdin.write(f"{line}\n".encode())
-            stdin.flush()
-        except BrokenPipeError:
-            self._wait()
-            raise self._end_with_fault(Fault.CRASHED, "it reads no more cases") from None
-
     def _close_input(self) -> None:
         if self._process.stdin is not None:
             with suppress(BrokenPipeError):
@@ -183,16 +179,14 @@ class RunningProgram:
 
     def _read(self, enough: Callable[[], bool]) -> None:
         """Read both streams until they end or `enough` holds, under the limits on time, memory and size."""
-        streams = {self._process.stdout: self._output, self._process.stderr: self._stderr}
         with selectors.DefaultSelector() as selector:
-            for stream, kept in streams.items():
+            for stream, kept in ((self._process.stdout, self._output), (self._process.stderr, self._stderr)):
                 if stream is not None:
                     selector.register(stream, selectors.EVENT_READ, kept)
             while selector.get_map() and not enough():
                 self._check()
                 for key, _ in selector.select(_POLL_S):
-                    read = os.read(key.fd, 1 << 16)
-                    if read:
+                    if read := os.read(key.fd, 1 << 16):
                         key.data.extend(read)
                     else:
                         selector.unregister(key.fileobj)

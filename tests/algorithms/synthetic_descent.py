@@ -161,6 +161,15 @@ def flight(rng: np.random.Generator, max_tilt_deg: float = 25.0, max_wind: float
     return Flight(first + INTERVAL_S * steps, (attitudes[0], attitudes[1], attitudes[2]))
 
 
+LEVEL_FLIGHT = (Rotation.identity(), Rotation.identity(), Rotation.identity())
+
+
+def flown(velocity: tuple[float, float], attitudes: tuple[Rotation, Rotation, Rotation] = LEVEL_FLIGHT) -> Flight:
+    """A descent at 75 m/s with a steady horizontal velocity (east, north)."""
+    step = INTERVAL_S * np.array([*velocity, -75.0])
+    return Flight(np.array([900.0, 1400.0, 2000.0]) + np.outer(np.arange(3), step), attitudes)
+
+
 def _unit(rng: np.random.Generator) -> np.ndarray:
     angle = rng.uniform(0.0, 2.0 * np.pi)
     return np.array([np.cos(angle), np.sin(angle)])

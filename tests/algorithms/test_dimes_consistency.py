@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -149,22 +150,14 @@ def test_propagation_drops_the_inertial_bias() -> None:
     ],
 )
 def test_each_metric_has_its_check(change: dict[str, Any], check: ValidityCheck) -> None:
-    from dataclasses import replace
-
     assert failed_checks(METRICS, DimesOptions()) == ()
     assert failed_checks(replace(METRICS, **change), DimesOptions()) == (check,)
 
 
 def test_a_track_exactly_at_every_limit_is_valid() -> None:
-    options = DimesOptions()
-    limit = TrackMetrics(
-        contrast=options.min_contrast,
-        peak=options.min_peak,
-        peak_width_px=options.max_peak_width_px,
-        second_peak_ratio=options.max_second_peak_ratio,
-        on_border=False,
-    )
-    assert failed_checks(limit, options) == ()
+    o = DimesOptions()
+    limit = TrackMetrics(o.min_contrast, o.min_peak, o.max_peak_width_px, o.max_second_peak_ratio, on_border=False)
+    assert failed_checks(limit, o) == ()
 
 
 @pytest.mark.parametrize(
