@@ -189,6 +189,5 @@ def square(half_m: float, per_side: int) -> Float[np.ndarray, "n 2"]:
 
 def square_outline(half_m: float, per_side: int) -> Float[np.ndarray, "n 2"]:
     """The points of `square` on its outline."""
-    on_edge = np.ones((per_side, per_side), dtype=bool)
-    on_edge[1:-1, 1:-1] = False
-    return np.asarray(square(half_m, per_side)[on_edge.ravel()])
+    points = square(half_m, per_side)
+    return np.asarray(points[np.abs(points).max(axis=1) == half_m])

@@ -179,13 +179,10 @@ def measurements_of(flown: Flight, counts: list[np.ndarray], known: DetectorCali
     """Exact measurements of a flight with these pictures; the inertial velocities carry a common error of (40, -25)."""
     camera = CAMERA.binned(1, known.rows_summed)
     times = [100.0 + INTERVAL_S * i for i in range(3)]
-    images = [DetectorImage(c, t, camera, known) for c, t in zip(counts, times, strict=True)]
-    attitudes = [AttitudeMeasurement(a, t) for a, t in zip(flown.attitudes, times, strict=True)]
-    altitudes = [AltitudeMeasurement(float(p[2]), t) for p, t in zip(flown.positions, times, strict=True)]
     return DescentMeasurements(
-        images=(images[0], images[1], images[2]),
-        attitudes=(attitudes[0], attitudes[1], attitudes[2]),
-        altitudes=(altitudes[0], altitudes[1], altitudes[2]),
+        images=tuple(DetectorImage(c, t, camera, known) for c, t in zip(counts, times, strict=True)),
+        attitudes=tuple(AttitudeMeasurement(a, t) for a, t in zip(flown.attitudes, times, strict=True)),
+        altitudes=tuple(AltitudeMeasurement(float(p[2]), t) for p, t in zip(flown.positions, times, strict=True)),
         interval_velocities_m_s=flown.velocities + np.array([40.0, -25.0, 0.0]),
         sun_direction=flown.sun,
     )

@@ -49,9 +49,8 @@ def concluded(first: list[np.ndarray], second: list[np.ndarray], interval_veloci
 
 def test_all_combinations_best_first() -> None:
     velocities = np.array([[40.0, 0.0, -75.0], [41.0, 2.0, -75.0]])
-    found = combinations(
-        [(0, np.array([5.0, 5.0])), (1, np.array([9.0, 5.0]))], [(1, np.array([6.0, 7.0]))], velocities
-    )
+    first = [(0, np.array([5.0, 5.0])), (1, np.array([9.0, 5.0]))]
+    found = combinations(first, [(1, np.array([6.0, 7.0]))], velocities)
     assert [(c.first, c.second) for c in found] == [(0, 1), (1, 1)]
     assert [c.discrepancy_m_s for c in found] == pytest.approx([0.0, 4.0])
 
