@@ -34,19 +34,30 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
     _check_type("the answer", answer, VelocityEstimate)
     _check_type("outcome", answer.outcome, VelocityOutcome)
     if (answer.outcome is VelocityOutcome.VALID) != (answer.velocity_m_s is not None):
-        given = "none is given" if answer.velocity_m_s is None else "one is given"
+        count = "none" if answer.velocity_m_s is None else "one"
         raise _bad_answer(
-            f"outcome is {answer.outcome.name}, but of velocity_m_s {given}; allowed: one with VALID alone"
+            f"outcome is {answer.outcome.name}, but of velocity_m_s {count} is given; allowed: one with VALID alone"
         )
-    velocity = None if answer.velocity_m_s is None else _check_numbers("velocity_m_s", answer.velocity_m_s, (2,))
-    covariance = None
-    if answer.covariance_m2_s2 is not None:
-        if velocity is None:
-            raise _bad_answer("covariance_m2_s2 is given without a velocity")
-        covariance = _check_numbers("covariance_m2_s2", answer.covariance_m2_s2, (2, 2))
-        _check_covariance(covariance)
-    span = None if answer.span_s is None else _check_span(answer.span_s, tags_s)
-    if span is None and tags_s is not None and len(tags_s) < 2 and velocity is not None:
+    velocity = _check_numbers("velocity_m_s", answer.velocity_m_s, (2,))
+    if answer.covariance_m2_s2 is not None and velocity is None:
+        raise _bad_answer("covariance_m2_s2 is given without a velocity")
+    covariance = _check_numbers("covariance_m2_s2", answer.covariance_m2_s2, (2, 2))
+    if covariance is not None:
+        scale = float(np.abs(covariance).max())
+        if not np.allclose(covariance, covariance.T, rtol=0.0, atol=_ROUNDING * scale):
+            raise _bad_answer(f"covariance_m2_s2 is not symmetric: {covariance.tolist()}")
+        if scale == 0.0 or float(np.linalg.eigvalsh(covariance)[0]) <= 0.0:
+            raise _bad_answer(f"covariance_m2_s2 is not positive definite: {covariance.tolist()}")
+    span, given = None, answer.span_s
+    if given is not None:
+        if not isinstance(given, tuple) or len(given) != 2 or not all(isinstance(n, float | int) for n in given):
+            raise _bad_answer(f"span_s is {given!r}; allowed: a tuple of two time tags, or None")
+        span = (float(given[0]), float(given[1]))
+        if not (np.all(np.isfinite(span)) and span[0] <= span[1]):
+            raise _bad_answer(f"span_s is {span}; allowed: two finite time tags, the first not after the second")
+        if tags_s and not tags_s[0] <= span[0] <= span[1] <= tags_s[-1]:
+            raise _bad_answer(f"span_s is {span}; allowed: within the pictures' tags, {tags_s[0]} to {tags_s[-1]} s")
+    elif tags_s is not None and len(tags_s) < 2 and velocity is not None:
         raise _bad_answer("of one picture there is no last interval; allowed: a velocity with a span_s, or a failure")
     return VelocityEstimate(answer.outcome, velocity, answer.details, covariance, span, answer.after_pictures)
 
@@ -56,19 +67,18 @@ def check_site(answer: Any) -> SiteEstimate:
     _check_type("the answer", answer, SiteEstimate)
     _check_type("outcome", answer.outcome, SiteOutcome)
     if (answer.outcome is SiteOutcome.NO_SAFE_SITE) != (answer.site_world is None):
-        given = "none is given" if answer.site_world is None else "one is given"
+        given = "none" if answer.site_world is None else "one"
         raise _bad_answer(
-            f"outcome is {answer.outcome.name}, but site_world: {given}; allowed: none with NO_SAFE_SITE only"
+            f"outcome is {answer.outcome.name}, but site_world: {given} is given; allowed: none with NO_SAFE_SITE only"
         )
-    site = None if answer.site_world is None else _check_numbers("site_world", answer.site_world, (3,))
-    return SiteEstimate(answer.outcome, site, answer.details)
+    return SiteEstimate(answer.outcome, _check_numbers("site_world", answer.site_world, (3,)), answer.details)
 
 
 def check_update(answer: Any) -> TargetUpdate:
     """A copy of a valid `TargetUpdate` in plain arrays; raises as `check_velocity`."""
     _check_type("the answer", answer, TargetUpdate)
     _check_type("state", answer.state, TrackingState)
-    position = None if answer.position_rover is None else _check_numbers("position_rover", answer.position_rover, (3,))
+    position = _check_numbers("position_rover", answer.position_rover, (3,))
     if answer.state is TrackingState.NORMAL and position is None:
         raise _bad_answer("state is NORMAL, but position_rover is None")
     return TargetUpdate(answer.state, answer.losses, position, answer.details)
@@ -85,21 +95,21 @@ def check_aim(answer: Any, mast: MastCalibration) -> MastAim | None:
         if not isinstance(angle, float | int) or not low <= angle <= high:
             raise _bad_answer(f"{name}_rad is {angle!r}; allowed: {low:g} to {high:g}")
     for name, camera in (("left", mast.left), ("right", mast.right)):
-        _check_box(name, getattr(answer, name), camera.size)
+        box = getattr(answer, name)
+        if not isinstance(box, PixelBox):
+            raise _bad_answer(f"{name} is a {_type_name(box)}; allowed: a PixelBox")
+        for corner, extent, whole in zip(box.corner, box.size, camera.size, strict=True):
+            whole_numbers = all(isinstance(n, int | np.integer) for n in (corner, extent))
+            if not whole_numbers or corner < 0 or extent < 1 or corner + extent > whole:
+                allowed = f"a part of the frame of {camera.size} pixels"
+                raise _bad_answer(f"{name} is {box.corner} and {box.size}; allowed: {allowed}")
     return MastAim(float(answer.azimuth_rad), float(answer.elevation_rad), answer.left, answer.right)
 
 
-def _check_box(name: str, box: Any, size: tuple[int, int]) -> None:
-    if not isinstance(box, PixelBox):
-        raise _bad_answer(f"{name} is a {_type_name(box)}; allowed: a PixelBox")
-    for corner, extent, whole in zip(box.corner, box.size, size, strict=True):
-        whole_numbers = all(isinstance(n, int | np.integer) for n in (corner, extent))
-        if not whole_numbers or corner < 0 or extent < 1 or corner + extent > whole:
-            raise _bad_answer(f"{name} is {box.corner} and {box.size}; allowed: a part of the frame of {size} pixels")
-
-
-def _check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."]:
-    """A plain copy of an array of finite floats of this shape, never a subclass of ndarray."""
+def _check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."] | None:
+    """A plain copy of an array of finite floats of this shape, never a subclass of ndarray; None stays None."""
+    if value is None:
+        return None
     if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
         kind = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a {_type_name(value)}"
         raise _bad_answer(f"{name} is {kind}; allowed: a NumPy array of floats, shape {shape}")
@@ -109,25 +119,6 @@ def _check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> Float64[np.
     if not np.all(np.isfinite(plain)):
         raise _bad_answer(f"{name} is not finite: {plain.tolist()}")
     return plain
-
-
-def _check_span(given: Any, tags_s: Sequence[float] | None) -> tuple[float, float]:
-    if not isinstance(given, tuple) or len(given) != 2 or not all(isinstance(n, float | int) for n in given):
-        raise _bad_answer(f"span_s is {given!r}; allowed: a tuple of two time tags, or None")
-    span = (float(given[0]), float(given[1]))
-    if not (np.all(np.isfinite(span)) and span[0] <= span[1]):
-        raise _bad_answer(f"span_s is {span}; allowed: two finite time tags, the first not after the second")
-    if tags_s and not tags_s[0] <= span[0] <= span[1] <= tags_s[-1]:
-        raise _bad_answer(f"span_s is {span}; allowed: within the pictures' tags, {tags_s[0]} to {tags_s[-1]} s")
-    return span
-
-
-def _check_covariance(matrix: np.ndarray) -> None:
-    scale = float(np.abs(matrix).max())
-    if not np.allclose(matrix, matrix.T, rtol=0.0, atol=_ROUNDING * scale):
-        raise _bad_answer(f"covariance_m2_s2 is not symmetric: {matrix.tolist()}")
-    if scale == 0.0 or float(np.linalg.eigvalsh(matrix)[0]) <= 0.0:
-        raise _bad_answer(f"covariance_m2_s2 is not positive definite: {matrix.tolist()}")
 
 
 def _check_type(name: str, value: Any, kind: type) -> None:

@@ -57,7 +57,6 @@ class VelocityEstimator(Protocol):
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """The estimate; never raises for a picture, attitude or altitude that an instrument can deliver."""
-        ...
 
 
 @runtime_checkable
@@ -69,15 +68,12 @@ class VelocityStream(Protocol):
 
     def start(self) -> None:
         """Reset the state for a new descent."""
-        ...
 
     def picture(self, frame: DescentFrame) -> VelocityEstimate | None:
         """Process the next image; return an estimate or None. Never raises, as `VelocityEstimator.estimate`."""
-        ...
 
     def finish(self) -> VelocityEstimate:
         """The final answer for the descent; a failure outcome if there were too few images."""
-        ...
 
 
 class TrackingState(Enum):
@@ -153,26 +149,21 @@ class TargetTracker(Protocol):
     @property
     def state(self) -> TrackingState:
         """State of the tracker."""
-        ...
 
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
         """Set the target, with the rover's estimated pose; replaces any other."""
-        ...
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
         """Mast aim from this pose; None if the mast cannot show the target.
 
         An update with images taken at other angles then loses the target.
         """
-        ...
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """Match the target; never raises for images, angles or poses that the rover can deliver."""
-        ...
 
     def clear(self) -> None:
         """Clear the target."""
-        ...
 
 
 class SiteOutcome(Enum):
@@ -217,4 +208,3 @@ class SiteEstimator(Protocol):
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
         """The estimate; never raises for pictures, poses or a range that instruments can deliver."""
-        ...

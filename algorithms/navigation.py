@@ -83,11 +83,8 @@ class TerrainMap:
 
         The latest sighting of a rock replaces earlier ones.
         """
-        seen = {
-            rock.name: rock
-            for rock in rocks
-            if bool(wedge.covers(rock.place_m + rock.radius_m * _FOOTPRINT_POINTS).any())
-        }
+        rims = ((rock, rock.place_m + rock.radius_m * _FOOTPRINT_POINTS) for rock in rocks)
+        seen = {rock.name: rock for rock, rim in rims if wedge.covers(rim).any()}
         kept = tuple(rock for rock in self.obstacles if rock.name not in seen)
         return TerrainMap((*self.wedges, wedge), kept + tuple(seen.values()))
 
@@ -121,12 +118,11 @@ class NavigationOptions:
     bend_cost_m2: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("half_width_m", "lookahead_m", "curvature_m"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")
-        for name in ("margin_m", "climb_m", "turn_cost_m", "bend_cost_m2"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must not be negative")
+        for name, value in vars(self).items():
+            if name in ("half_width_m", "lookahead_m", "curvature_m") and not 0.0 < value < np.inf:
+                raise ValueError(f"{name} is {value}; it must be positive")
+            if not 0.0 <= value < np.inf:
+                raise ValueError(f"{name} is {value}; it must not be negative")
 
 
 class NavigationOutcome(Enum):
@@ -167,39 +163,22 @@ def navigate(
     - target: Name of a rock that is not avoided; None avoids all
     - backwards: Whether to drive with the rear ahead
     """
-    pose = _Planar.of(world_from_rover, backwards)
-    goal = pose.local(goal_m)
+    forward = world_from_rover.rotation.as_matrix()[:2, 0] * (-1.0 if backwards else 1.0)
+    position, heading = world_from_rover.translation[:2], _rotation_matrix(np.arctan2(forward[1], forward[0]))
+    goal = np.asarray((goal_m - position) @ heading)
     none = np.empty((0, 2))
     if float(np.hypot(*goal)) < AT_GOAL_M:
         return NavigationPlan(NavigationOutcome.AT_GOAL, (), none)
-    if not bool(terrain.mapped(pose.place_m + options.half_width_m * _FOOTPRINT_POINTS).all()):
+    if not bool(terrain.mapped(position + options.half_width_m * _FOOTPRINT_POINTS).all()):
         return NavigationPlan(NavigationOutcome.NOT_MAPPED, (), none)
     avoided = [rock for rock in terrain.obstacles if rock.name != target and rock.height_m > options.climb_m]
     for path in _candidates(goal, options):
-        lookahead = pose.world(path.points(np.arange(0.0, min(path.length_m, options.lookahead_m), 0.1)))
-        if _is_clear(lookahead, avoided, options) and _is_mapped(lookahead, terrain, options):
-            whole = pose.world(path.points(np.linspace(0.0, path.length_m, 60)))
+        lookahead = position + path.points(np.arange(0.0, min(path.length_m, options.lookahead_m), 0.1)) @ heading.T
+        disc = lookahead[:, None] + options.half_width_m * _FOOTPRINT_POINTS
+        if _is_clear(lookahead, avoided, options) and bool(terrain.mapped(disc).all()):
+            whole = np.asarray(position + path.points(np.linspace(0.0, path.length_m, 60)) @ heading.T)
             return NavigationPlan(NavigationOutcome.PATH, path.commands(step_m, backwards), whole)
     return NavigationPlan(NavigationOutcome.NO_PATH, (), none)
-
-
-@dataclass(frozen=True)
-class _Planar:
-    """Position and heading of the motion from above; counterclockwise from east."""
-
-    place_m: Float[np.ndarray, "2"]
-    yaw_rad: float
-
-    @classmethod
-    def of(cls, world_from_rover: RigidTransform, backwards: bool) -> _Planar:
-        forward = world_from_rover.rotation.as_matrix()[:2, 0] * (-1.0 if backwards else 1.0)
-        return cls(np.asarray(world_from_rover.translation[:2]), float(np.arctan2(forward[1], forward[0])))
-
-    def world(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        return np.asarray(self.place_m + points @ _rotation_matrix(self.yaw_rad).T)
-
-    def local(self, place_m: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-        return np.asarray((place_m - self.place_m) @ _rotation_matrix(self.yaw_rad))
 
 
 @dataclass(frozen=True)
@@ -280,8 +259,3 @@ def _is_clear(positions_m: Float[np.ndarray, "n 2"], rocks: Iterable[Obstacle], 
         if float(distances.min()) < min(clearance, float(distances[0])):
             return False
     return True
-
-
-def _is_mapped(positions_m: Float[np.ndarray, "n 2"], terrain: TerrainMap, options: NavigationOptions) -> bool:
-    """Whether the disc stays on mapped ground."""
-    return bool(terrain.mapped(positions_m[:, None] + options.half_width_m * _FOOTPRINT_POINTS).all())

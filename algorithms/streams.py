@@ -27,8 +27,8 @@ class StreamedEstimator:
         earlier: list[VelocityEstimate | None] = []
         for number, frame in enumerate(measurements.frames(), start=1):
             answer = self.stream.picture(frame)
-            earlier.append(None if answer is None else set_span(_check_no_history(answer), tags[:number]))
-        final = set_span(_check_no_history(self.stream.finish()), tags)
+            earlier.append(None if answer is None else _check_answer(answer, tags[:number]))
+        final = _check_answer(self.stream.finish(), tags)
         return replace(final, after_pictures=tuple(earlier))
 
 
@@ -40,7 +40,7 @@ def set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
     return replace(estimate, span_s=(tags_s[-2], tags_s[-1]))
 
 
-def _check_no_history(answer: object) -> object:
+def _check_answer(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
     if isinstance(answer, VelocityEstimate) and answer.after_pictures:
         raise AlgorithmError(Fault.BAD_ANSWER, "after_pictures is given; allowed: nothing there, it is filled in")
-    return answer
+    return set_span(answer, tags_s)

@@ -63,25 +63,21 @@ class HomographyEstimator:
         return estimate_by_pairs(measurements, self._match, self.options.common)
 
     def _match(self, patches: PairPatches) -> PairMatch | None:
-        points = match_features(patches, self.options)
+        o, points = self.options, match_features(patches, self.options)
         if points is None:
             return None
-        first, second = points
-        o = self.options
         homography, inliers = cv2.findHomography(
-            first, second, cv2.USAC_MAGSAC, o.reprojection_px, maxIters=o.iterations, confidence=o.confidence
+            *points, cv2.USAC_MAGSAC, o.reprojection_px, maxIters=o.iterations, confidence=o.confidence
         )
-        if homography is None:
+        if homography is None or not inliers.any():
             return None
         kept = inliers.ravel().astype(bool)
-        count = int(kept.sum())
-        if count == 0:
-            return None
-        middle = first[kept].mean(axis=0).astype(np.float64)
+        middle = points[0][kept].mean(axis=0).astype(np.float64)
         moved = homography @ np.array([*middle, 1.0])
         if abs(moved[2]) < 1e-9:
             return None
         found = moved[:2] / moved[2]
+        count = int(kept.sum())
         valid = count >= o.min_inliers and distortion(homography, moved[2], found) <= o.max_distortion
         return PairMatch(np.asarray(found - middle), float(count), valid)
 

@@ -1,6 +1,6 @@
 """Image pairs rectified to a common camera that looks straight down, and the phase correlation of such pairs.
 
-The baselines see the same corrected images as DIMES, in the same geometry (`marsyard.algorithms.dimes.rectify_views`),
+The baselines see the same corrected images as DIMES, in the same geometry (`dimes.rectification.rectify_patch`),
 but the whole overlap of two images rather than templates. The IMU checks the change between their two velocities as in
 DIMES, with the same threshold. Only the measurement of the shift differs.
 """
@@ -109,15 +109,7 @@ def find_common_square(
 def rectify_pair(first: View, second: View, options: CommonOptions) -> PairPatches | None:
     """Both images of a pair over their common ground; None if it is too small."""
     found = find_common_square(first, second, options)
-    if found is None:
-        return None
-    middle, side, gsd = found
-    return PairPatches(rectify_patch(first, middle, side, gsd), rectify_patch(second, middle, side, gsd), gsd)
-
-
-def pair_velocity(patches: PairPatches, match: PairMatch, interval_s: float) -> Float[np.ndarray, "2"]:
-    """Mean velocity of the camera (east, north), m/s: opposite to the shift of the ground; rows run south."""
-    return np.asarray(patches.gsd_m * np.array([-match.shift_px[0], match.shift_px[1]]) / interval_s)
+    return found and PairPatches(rectify_patch(first, *found), rectify_patch(second, *found), found[2])
 
 
 def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, options: CommonOptions) -> VelocityEstimate:
@@ -135,7 +127,9 @@ def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, optio
     for (first, second), of_pair, match in zip(views, patches, matches, strict=True):
         if of_pair is None or match is None or not match.valid:
             return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None, details)
-        velocities.append(pair_velocity(of_pair, match, second.time_s - first.time_s))
+        # east and north, m/s: the camera moves opposite to the ground; rows run south
+        shift_m = of_pair.gsd_m * np.array([-match.shift_px[0], match.shift_px[1]])
+        velocities.append(shift_m / (second.time_s - first.time_s))
     if max(np.hypot(*velocity) for velocity in velocities) > options.max_speed_m_s + options.imu_threshold_m_s:
         return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None, details)
     (agreement,) = combinations([(0, velocities[0])], [(0, velocities[1])], measurements.interval_velocities_m_s)

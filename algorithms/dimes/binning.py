@@ -91,10 +91,10 @@ def build_view(
     columns, rows = bin_factors(image.counts.shape, binned_size)
     known = image.calibration
     camera, centre = place_camera(image.camera.binned(columns, rows), world_from_body, altitude_m)
-    shared = before if before is not None and before.calibration is known else None
+    shared = before.flat_field if before is not None and before.calibration is known else None
     return View(
         signal=bin_mean(image.counts.astype(np.float32), columns, rows) - np.float32(known.offset_dn),
-        flat_field=bin_mean(known.flat_field, columns, rows) if shared is None else shared.flat_field,
+        flat_field=bin_mean(known.flat_field, columns, rows) if shared is None else shared,
         camera=camera,
         centre=centre,
         time_s=image.time_s,
@@ -131,10 +131,8 @@ def usable_views(measurements: DescentMeasurements, binned_size: tuple[int, int]
     for image, attitude, altitude in zip(measurements.images, measurements.attitudes, altitudes, strict=True):
         before = views[-1] if views else None
         views.append(build_view(image, attitude.world_from_body, float(altitude), binned_size, before))
-    first, second, third = views
-    lowest, highest = HEIGHTS_M
-    in_range = all(lowest <= one.centre[2] <= highest for one in views)
-    return (first, second, third) if in_range else None
+    in_range = all(HEIGHTS_M[0] <= one.centre[2] <= HEIGHTS_M[1] for one in views)
+    return (views[0], views[1], views[2]) if in_range else None
 
 
 def ground_from_pixels(
@@ -170,22 +168,16 @@ def inside_frame(
 ) -> Bool[np.ndarray, "*shape"]:
     """Whether ground points lie at least `border_px` inside the image and within the off-nadir limit; False for NaN."""
     pixels, visible = pixels_from_ground(view, ground)
-    columns, rows = view.size
-    u, v = pixels[..., 0], pixels[..., 1]
-    in_u = (u >= border_px) & (u <= columns - 1 - border_px)
-    in_v = (v >= border_px) & (v <= rows - 1 - border_px)
+    in_frame = ((pixels >= border_px) & (pixels <= np.array(view.size) - 1 - border_px)).all(axis=-1)
     off_nadir = np.hypot(ground[..., 0], ground[..., 1]) / view.centre[2]
-    return np.asarray(visible & in_u & in_v & (off_nadir <= np.tan(max_off_nadir_rad)))
+    return np.asarray(visible & in_frame & (off_nadir <= np.tan(max_off_nadir_rad)))
 
 
 def pixel_angle_rad(view: View) -> float:
     """Mean angle of one pixel along columns and rows in the middle of the image."""
-    columns, rows = view.size
-    middle = np.array([(columns - 1) / 2.0, (rows - 1) / 2.0])
-    around = middle + np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
-    _, directions = view.camera.rays(around)
-    across = np.linalg.norm(directions[[1, 3]] - directions[[0, 2]], axis=1)
-    return float(across.mean())
+    middle = (np.array(view.size) - 1) / 2.0
+    _, directions = view.camera.rays(middle + np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]]))
+    return float(np.linalg.norm(directions[[1, 3]] - directions[[0, 2]], axis=1).mean())
 
 
 def square(half_m: float, per_side: int) -> Float[np.ndarray, "n 2"]:
@@ -197,6 +189,5 @@ def square(half_m: float, per_side: int) -> Float[np.ndarray, "n 2"]:
 
 def square_outline(half_m: float, per_side: int) -> Float[np.ndarray, "n 2"]:
     """The points of `square` on its outline."""
-    on_edge = np.ones((per_side, per_side), dtype=bool)
-    on_edge[1:-1, 1:-1] = False
-    return np.asarray(square(half_m, per_side)[on_edge.ravel()])
+    points = square(half_m, per_side)
+    return np.asarray(points[np.abs(points).max(axis=1) == half_m])

@@ -85,45 +85,14 @@ class DimesDetails:
 
 
 TRACK_COLUMNS = (
-    "pair",
-    "template",
-    "template_u",
-    "template_v",
-    "match_u",
-    "match_v",
-    "contrast",
-    "peak",
-    "peak_width",
-    "second_peak_ratio",
-    "valid",
-    "velocity_east_m_s",
-    "velocity_north_m_s",
-    "ground_east_m",
-    "ground_north_m",
+    "pair", "template", "template_u", "template_v", "match_u", "match_v", "contrast", "peak", "peak_width",
+    "second_peak_ratio", "valid", "velocity_east_m_s", "velocity_north_m_s", "ground_east_m", "ground_north_m",
     *(f"failed_{check.name.lower()}" for check in ValidityCheck),
-)
+)  # fmt: skip
 #: Points along a side of the lattice for rectified figures: enough for a horizon's perspective.
 LATTICE_POINTS = 49
 #: Off-nadir limit of figures: slightly more than DIMES uses.
 FIGURE_OFF_NADIR_RAD = float(np.deg2rad(60.0))
-
-
-def _track_row(track: Track) -> list[float]:
-    m = track.metrics
-    return [
-        float(track.pair),
-        float(track.index),
-        *map(float, track.template_pixel),
-        *map(float, track.match_pixel),
-        m.contrast,
-        m.peak,
-        m.peak_width_px,
-        m.second_peak_ratio,
-        float(track.valid),
-        *map(float, track.velocity_m_s),
-        *map(float, track.ground_m),
-        *(float(check in track.failed) for check in ValidityCheck),
-    ]
 
 
 def rectified_lattice(
@@ -134,8 +103,12 @@ def rectified_lattice(
     Returns (east and north of the first, upper left point from the nadir point, step), metres, with rows running south;
     and the pixels (u, v) of the earlier and the later image at the lattice points, NaN if invisible.
     """
-    spans = np.stack([_footprint(view) for view in pair.views])
-    low, high = spans[:, 0].min(axis=0), spans[:, 1].max(axis=0)
+    footprints = []
+    for view in pair.views:
+        u, v = np.meshgrid(*(np.linspace(0.0, 1.0, 17) * (size - 1.0) for size in view.size))
+        ground, _ = ground_from_pixels(view, np.column_stack([u.ravel(), v.ravel()]), FIGURE_OFF_NADIR_RAD)
+        footprints.append(ground)
+    low, high = np.min(footprints, axis=(0, 1)), np.max(footprints, axis=(0, 1))
     step = float((high - low).max()) / (LATTICE_POINTS - 1)
     middle = 0.5 * (low + high)
     along = (np.arange(LATTICE_POINTS) - 0.5 * (LATTICE_POINTS - 1)) * step
@@ -145,15 +118,6 @@ def rectified_lattice(
         seen, visible = pixels_from_ground(view, ground)
         pixels.append(np.where(visible[..., None], seen, np.nan))
     return np.array([ground[0, 0, 0], ground[0, 0, 1], step]), (pixels[0], pixels[1])
-
-
-def _footprint(view: View) -> Float[np.ndarray, "2 2"]:
-    """Bounds (east, north) of the ground that a view sees, out to `FIGURE_OFF_NADIR_RAD`."""
-    columns, rows = view.size
-    steps = np.linspace(0.0, 1.0, 17)
-    u, v = np.meshgrid(steps * (columns - 1.0), steps * (rows - 1.0))
-    ground, _ = ground_from_pixels(view, np.column_stack([u.ravel(), v.ravel()]), FIGURE_OFF_NADIR_RAD)
-    return np.stack([ground.min(axis=0), ground.max(axis=0)])
 
 
 def dimes_products(details: DimesDetails) -> dict[str, Any]:
@@ -167,7 +131,13 @@ def dimes_products(details: DimesDetails) -> dict[str, Any]:
     pixels, contrasts per binned pixel, pixels (u, v) binned, ground in metres (see `Track`); `failed_...` are 0 or 1.
     """
     chosen = () if details.chosen is None else (details.chosen.first, details.chosen.second)
-    rows = [_track_row(track) for track in details.tracks]
+    rows = []
+    for track in details.tracks:
+        m, motion = track.metrics, (*track.velocity_m_s, *track.ground_m)
+        metrics = (m.contrast, m.peak, m.peak_width_px, m.second_peak_ratio)
+        failed = (check in track.failed for check in ValidityCheck)
+        matched = (*track.template_pixel, *track.match_pixel)
+        rows.append([track.pair, track.index, *matched, *metrics, track.valid, *motion, *failed])
     found = [[c.first, c.second, c.discrepancy_m_s] for c in details.combinations]
     products: dict[str, Any] = {
         "tracks": np.array(rows, dtype=np.float64).reshape(-1, len(TRACK_COLUMNS)),
@@ -185,8 +155,6 @@ def dimes_products(details: DimesDetails) -> dict[str, Any]:
         for side, pixels in enumerate(lattices):
             products[f"rectified_{number}_{side}"] = pixels
     for track in details.tracks:
-        name = f"{track.pair}_{track.index}"
-        products[f"template_{name}"] = track.template
-        products[f"window_{name}"] = track.window
-        products[f"match_{name}"] = track.match
+        for kind in ("template", "window", "match"):
+            products[f"{kind}_{track.pair}_{track.index}"] = getattr(track, kind)
     return products

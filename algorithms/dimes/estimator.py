@@ -53,41 +53,6 @@ def camera_displacement(corner: Float[np.ndarray, "2"], geometry: SearchGeometry
     return np.asarray(geometry.gsd_m * np.array([-shift[1], shift[0]]))
 
 
-def track_template(
-    first: View,
-    second: View,
-    geometry: SearchGeometry,
-    place: tuple[int, int],
-    pixel: Float[np.ndarray, "2"],
-    ground: Float[np.ndarray, "2"],
-    contrast: float,
-    options: DimesOptions,
-) -> Track:
-    """Track the template at `pixel` of the first view, over the ground point `ground`; `place` is (pair, index)."""
-    template = rectify_patch(first, ground, geometry.template_px, geometry.gsd_m)
-    window = rectify_patch(second, ground, geometry.window_px, geometry.gsd_m)
-    surface = pseudo_normalized_correlation(template, window)
-    peak = highest_peak(surface)
-    corner = match_corner(template, window, surface, peak, options)
-    metrics = track_metrics(contrast, surface, peak, options)
-    displacement = camera_displacement(corner, geometry)
-    match_pixel, _ = pixels_from_ground(second, ground - displacement)
-    return Track(
-        pair=place[0],
-        index=place[1],
-        template_pixel=pixel,
-        match_pixel=match_pixel,
-        ground_m=ground,
-        template=template,
-        window=window,
-        match=corner + 0.5 * (geometry.template_px - 1),
-        surface=surface,
-        metrics=metrics,
-        failed=failed_checks(metrics, options),
-        velocity_m_s=displacement / (second.time_s - first.time_s),
-    )
-
-
 def track_pair(
     pair: int, first: View, second: View, sun_direction: Float[np.ndarray, "3"], options: DimesOptions
 ) -> PairDetails:
@@ -95,24 +60,38 @@ def track_pair(
     geometry = search_geometry(first, second, options)
     candidates = template_candidates(first, second, geometry, sun_direction, options)
     chosen, contrasts = select_templates(first, candidates, options)
+    tracks = []
+    for index, (candidate, contrast) in enumerate(zip(chosen, contrasts, strict=True)):
+        ground = candidates.ground[candidate]
+        template = rectify_patch(first, ground, geometry.template_px, geometry.gsd_m)
+        window = rectify_patch(second, ground, geometry.window_px, geometry.gsd_m)
+        surface = pseudo_normalized_correlation(template, window)
+        peak = highest_peak(surface)
+        corner = match_corner(template, window, surface, peak, options)
+        metrics = track_metrics(float(contrast), surface, peak, options)
+        displacement = camera_displacement(corner, geometry)
+        match_pixel, _ = pixels_from_ground(second, ground - displacement)
+        track = Track(
+            pair=pair,
+            index=index,
+            template_pixel=candidates.pixels[candidate],
+            match_pixel=match_pixel,
+            ground_m=ground,
+            template=template,
+            window=window,
+            match=corner + 0.5 * (geometry.template_px - 1),
+            surface=surface,
+            metrics=metrics,
+            failed=failed_checks(metrics, options),
+            velocity_m_s=displacement / (second.time_s - first.time_s),
+        )
+        tracks.append(track)
     return PairDetails(
         overlap_polygon=overlap_polygon(first, second, options),
         zero_phase_pixels=np.stack([zero_phase_pixel(view, sun_direction) for view in (first, second)]),
         gsd_m=geometry.gsd_m,
         candidates=len(candidates.pixels),
-        tracks=tuple(
-            track_template(
-                first,
-                second,
-                geometry,
-                (pair, index),
-                candidates.pixels[candidate],
-                candidates.ground[candidate],
-                float(contrast),
-                options,
-            )
-            for index, (candidate, contrast) in enumerate(zip(chosen, contrasts, strict=True))
-        ),
+        tracks=tuple(tracks),
         views=(first, second),
     )
 
@@ -149,14 +128,12 @@ def conclude(
     pairs: tuple[PairDetails, PairDetails], interval_velocities_m_s: Float[np.ndarray, "2 3"], imu_threshold_m_s: float
 ) -> VelocityEstimate:
     """Combine the tracks of both pairs with the IMU."""
+    first, second = ([(one.index, one.velocity_m_s) for one in pair.tracks if one.valid] for pair in pairs)
+    found = combinations(first, second, interval_velocities_m_s)
+    if found and found[0].discrepancy_m_s < imu_threshold_m_s:
+        velocity = pairs[1].tracks[found[0].second].velocity_m_s
+        return VelocityEstimate(VelocityOutcome.VALID, velocity, DimesDetails(pairs, found, found[0]))
+    outcome = VelocityOutcome.IMU_MISMATCH if found else VelocityOutcome.NO_VALID_TRACK
     if not all(pair.tracks for pair in pairs):
-        return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, DimesDetails(pairs, (), None))
-    valid = [[(track.index, track.velocity_m_s) for track in pair.tracks if track.valid] for pair in pairs]
-    found = combinations(valid[0], valid[1], interval_velocities_m_s)
-    if not found:
-        return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None, DimesDetails(pairs, (), None))
-    if not found[0].discrepancy_m_s < imu_threshold_m_s:
-        return VelocityEstimate(VelocityOutcome.IMU_MISMATCH, None, DimesDetails(pairs, found, None))
-    best = found[0]
-    velocity = pairs[1].tracks[best.second].velocity_m_s
-    return VelocityEstimate(VelocityOutcome.VALID, velocity, DimesDetails(pairs, found, best))
+        outcome = VelocityOutcome.NO_TEMPLATE_AREA
+    return VelocityEstimate(outcome, None, DimesDetails(pairs, found, None))

@@ -58,14 +58,10 @@ def search_geometry(first: View, second: View, options: DimesOptions) -> SearchG
 
 def border_pixels(size: tuple[int, int], per_side: int = 8) -> Float[np.ndarray, "n 2"]:
     """Pixels along the border of an image of `size` (columns, rows), in order."""
-    columns, rows = size
-    steps = np.arange(per_side) / per_side
-    u, v = columns - 1.0, rows - 1.0
-    top = np.column_stack([steps * u, np.zeros(per_side)])
-    right = np.column_stack([np.full(per_side, u), steps * v])
-    bottom = np.column_stack([(1.0 - steps) * u, np.full(per_side, v)])
-    left = np.column_stack([np.zeros(per_side), (1.0 - steps) * v])
-    return np.concatenate([top, right, bottom, left])
+    steps, zeros, ones = np.arange(per_side) / per_side, np.zeros(per_side), np.ones(per_side)
+    along = np.concatenate([steps, ones, 1.0 - steps, zeros])
+    down = np.concatenate([zeros, steps, ones, 1.0 - steps])
+    return np.column_stack([along * (size[0] - 1.0), down * (size[1] - 1.0)])
 
 
 def overlap_polygon(first: View, second: View, options: DimesOptions) -> Float[np.ndarray, "n 2"]:
@@ -91,8 +87,7 @@ def anti_solar_direction(sun_direction: Float[np.ndarray, "3"]) -> Float[np.ndar
 
 def zero_phase_pixel(view: View, sun_direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2"]:
     """Pixel (u, v) of the middle of the zero-phase spot, in or out of frame; NaN if the camera cannot image it."""
-    away = 1e7 * anti_solar_direction(sun_direction)
-    pixels, visible = view.camera.project((view.centre + away)[None, :])
+    pixels, visible = view.camera.project((view.centre + 1e7 * anti_solar_direction(sun_direction))[None, :])
     return np.asarray(pixels[0]) if visible[0] else np.full(2, np.nan)
 
 
@@ -101,9 +96,9 @@ def outside_zero_phase(
 ) -> Bool[np.ndarray, "*shape"]:
     """Whether ground points (east, north) are further than `radius_rad` from the anti-solar direction."""
     spot = anti_solar_direction(sun_direction)
-    height = view.centre[2]
-    ranges = np.sqrt(ground[..., 0] ** 2 + ground[..., 1] ** 2 + height**2)
-    along = ground[..., 0] * spot[0] + ground[..., 1] * spot[1] - height * spot[2]
+    east, north, height = ground[..., 0], ground[..., 1], view.centre[2]
+    ranges = np.sqrt(east**2 + north**2 + height**2)
+    along = east * spot[0] + north * spot[1] - height * spot[2]
     return np.asarray(along < np.cos(radius_rad) * ranges)
 
 
@@ -183,8 +178,6 @@ def select_templates(
     view: View, candidates: Candidates, options: DimesOptions
 ) -> tuple[list[int], Float[np.ndarray, "k"]]:
     """Indices of the selected candidates, best first, and their contrasts."""
-    found = contrasts(view, candidates.pixels, options.template_px)
-    chosen = best_candidates(
-        found, candidates.pixels, candidates.preferred, options.templates_per_pair, options.exclusion_px
-    )
+    found, pixels = contrasts(view, candidates.pixels, options.template_px), candidates.pixels
+    chosen = best_candidates(found, pixels, candidates.preferred, options.templates_per_pair, options.exclusion_px)
     return chosen, found[chosen]

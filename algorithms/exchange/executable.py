@@ -2,32 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.answers import check_aim, check_site, check_update, check_velocity
-from marsyard.algorithms.exchange.files import (
-    encode_pose,
-    encode_target,
-    write_case,
-    write_frame,
-    write_mast,
-    write_stop,
-)
+from marsyard.algorithms.exchange.files import encode_pose, encode_target, write_frame, write_mast, write_stop
 from marsyard.algorithms.exchange.process import MAX_STDERR_CHARACTERS, Command, ExecutableLimits
 from marsyard.algorithms.exchange.serving import (
     ProgramDetails,
     Session,
     ask_case,
-    attach_stderr,
     bad_answer,
     check_keys,
-    parse_member,
     read_member,
     read_numbers,
 )
@@ -61,8 +50,7 @@ class ExecutableVelocityEstimator:
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """The program's answer."""
-        answer, details = ask_case(self.command, self.limits, lambda folder: write_case(folder, measurements))
-        return attach_stderr(details.stderr, lambda: check_velocity(_read_velocity(answer, details)))
+        return ask_case(self.command, self.limits, measurements, _read_velocity)
 
 
 class ExecutableVelocityStream:
@@ -79,26 +67,28 @@ class ExecutableVelocityStream:
     def start(self) -> None:
         """Start a new descent."""
         self._details = ProgramDetails("", 0.0)
-        if self._ask("start", {}) is not None:
+        if self._session.ask("start", {}, self._read_answer) is not None:
             raise bad_answer("start is answered with an outcome; allowed: null, before the first picture")
 
     def picture(self, frame: DescentFrame) -> VelocityEstimate | None:
         """The program's answer to one more image."""
-        return self._ask("picture", {"frame": lambda folder: write_frame(folder, frame)})
+        return self._session.ask("picture", {}, self._read_answer, {"frame": lambda folder: write_frame(folder, frame)})
 
     def finish(self) -> VelocityEstimate:
         """The program's final answer; its details sum its output and time over the descent."""
-        answer = self._ask("finish", {})
+        answer = self._session.ask("finish", {}, self._read_answer)
         if answer is None:
             raise bad_answer("finish is answered with the outcome null; allowed: one of the outcomes")
         return answer
 
-    def _ask(self, do: str, files: Mapping[str, Callable[[Path], None]]) -> VelocityEstimate | None:
-        answer, details = self._session.ask(do, {}, files)
+    def _read_answer(self, answer: Mapping[str, Any], details: ProgramDetails) -> VelocityEstimate | None:
         self._details = ProgramDetails(
             (self._details.stderr + details.stderr)[-MAX_STDERR_CHARACTERS:], self._details.time_s + details.time_s
         )
-        return attach_stderr(details.stderr, lambda: _read_stream_answer(answer, self._details))
+        if answer.get("outcome", "") is None:
+            check_keys(answer, {"outcome"})
+            return None
+        return _read_velocity(answer, self._details)
 
 
 @dataclass(frozen=True)
@@ -110,8 +100,7 @@ class ExecutableSiteEstimator:
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
         """The program's answer."""
-        answer, details = ask_case(self.command, self.limits, lambda folder: write_case(folder, measurements))
-        return attach_stderr(details.stderr, lambda: check_site(_read_site(answer, details)))
+        return ask_case(self.command, self.limits, measurements, _read_site)
 
 
 class ExecutableTargetTracker:
@@ -126,6 +115,7 @@ class ExecutableTargetTracker:
         self._session = Session(command, limits)
         self._mast: MastCalibration | None = None
         self._masts = 0
+        self._folder = self._session.folder
 
     @property
     def state(self) -> TrackingState:
@@ -134,76 +124,58 @@ class ExecutableTargetTracker:
 
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
         """Send the target and the rover's pose."""
-        self._ask_state(
-            "designate", {"target": encode_target(target), "world_from_rover": encode_pose(world_from_rover)}
-        )
+        values = {"target": encode_target(target), "world_from_rover": encode_pose(world_from_rover)}
+        self._state = self._session.ask("designate", values, _read_state)
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
         """The requested mast angles and image parts."""
         values = {"world_from_rover": encode_pose(world_from_rover), "mast": self._write_mast(mast)}
-        answer, details = self._session.ask("aim", values)
-        return attach_stderr(details.stderr, lambda: check_aim(_read_aim(answer), mast))
+        return self._session.ask("aim", values, lambda answer, _: check_aim(_read_aim(answer), mast))
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """The program's answer to the images of a stop."""
         values = {"mast": self._write_mast(measurements.mast)}
-        answer, details = self._session.ask("update", values, {"stop": lambda folder: write_stop(folder, measurements)})
-        update = attach_stderr(details.stderr, lambda: check_update(_read_update(answer, details)))
+        files = {"stop": lambda folder: write_stop(folder, measurements)}
+        update = self._session.ask("update", values, _read_update, files)
         self._state = update.state
         return update
 
     def clear(self) -> None:
         """Clear the target."""
-        self._ask_state("clear", {})
-
-    def _ask_state(self, do: str, values: Mapping[str, Any]) -> None:
-        answer, details = self._session.ask(do, values)
-        self._state = attach_stderr(details.stderr, lambda: _read_state(answer))
+        self._state = self._session.ask("clear", {}, _read_state)
 
     def _write_mast(self, mast: MastCalibration) -> str:
         """The folder of the mast's files; written again for a new mast only."""
         if mast is not self._mast:
             self._mast, self._masts = mast, self._masts + 1
-            self._mast_folder().mkdir()
-            write_mast(self._mast_folder(), mast)
-        return str(self._mast_folder())
-
-    def _mast_folder(self) -> Path:
-        return self._session.folder / f"mast_{self._masts}"
-
-
-def _read_stream_answer(answer: Mapping[str, Any], details: ProgramDetails) -> VelocityEstimate | None:
-    """A stream's answer; None if its outcome is null."""
-    if answer.get("outcome", "") is None:
-        check_keys(answer, {"outcome"})
-        return None
-    return check_velocity(_read_velocity(answer, details))
+            self._folder = self._session.folder / f"mast_{self._masts}"
+            self._folder.mkdir()
+            write_mast(self._folder, mast)
+        return str(self._folder)
 
 
 def _read_velocity(answer: Mapping[str, Any], details: ProgramDetails) -> VelocityEstimate:
     check_keys(answer, {"outcome", "velocity_m_s", "covariance_m2_s2", "span_s"})
     span = read_numbers(answer, "span_s", (2,))
-    return VelocityEstimate(
-        outcome=read_member(answer, "outcome", VelocityOutcome),
+    estimate = VelocityEstimate(
+        outcome=read_member("outcome", answer.get("outcome"), VelocityOutcome),
         velocity_m_s=read_numbers(answer, "velocity_m_s", (2,)),
         details=details,
         covariance_m2_s2=read_numbers(answer, "covariance_m2_s2", (2, 2)),
         span_s=None if span is None else (float(span[0]), float(span[1])),
     )
+    return check_velocity(estimate)
 
 
 def _read_site(answer: Mapping[str, Any], details: ProgramDetails) -> SiteEstimate:
     check_keys(answer, {"outcome", "site_world"})
-    return SiteEstimate(
-        outcome=read_member(answer, "outcome", SiteOutcome),
-        site_world=read_numbers(answer, "site_world", (3,)),
-        details=details,
-    )
+    outcome = read_member("outcome", answer.get("outcome"), SiteOutcome)
+    return check_site(SiteEstimate(outcome, read_numbers(answer, "site_world", (3,)), details))
 
 
-def _read_state(answer: Mapping[str, Any]) -> TrackingState:
+def _read_state(answer: Mapping[str, Any], _details: ProgramDetails) -> TrackingState:
     check_keys(answer, {"state"})
-    return read_member(answer, "state", TrackingState)
+    return read_member("state", answer.get("state"), TrackingState)
 
 
 def _read_aim(answer: Mapping[str, Any]) -> MastAim | None:
@@ -233,9 +205,7 @@ def _read_update(answer: Mapping[str, Any], details: ProgramDetails) -> TargetUp
     if not isinstance(losses, list):
         raise bad_answer(f"losses is {losses!r}; allowed: a list of {', '.join(TargetLoss.__members__)}")
     position = read_numbers(answer, "position_rover", (3,))
-    return TargetUpdate(
-        state=read_member(answer, "state", TrackingState),
-        losses=tuple(parse_member("a loss", one, TargetLoss) for one in losses),
-        position_rover=None if position is None else np.asarray(position),
-        details=details,
+    state = read_member("state", answer.get("state"), TrackingState)
+    return check_update(
+        TargetUpdate(state, tuple(read_member("a loss", one, TargetLoss) for one in losses), position, details)
     )

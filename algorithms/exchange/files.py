@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float64, UInt16
+from jaxtyping import Float, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.camera import BODY_FRAME, HEAD_FRAME, read_cahvor, write_cahvor
@@ -58,11 +58,24 @@ def write_case(
     folder: Path, measurements: DescentMeasurements | LandingMeasurements, pictures: Pictures = "pgm"
 ) -> None:
     """Write the measurements of a case into an existing folder. Raises OSError if that fails."""
-    content = (
-        _encode_descent(measurements)
-        if isinstance(measurements, DescentMeasurements)
-        else _encode_landing(measurements)
-    )
+    content: dict[str, Any]
+    if isinstance(measurements, DescentMeasurements):
+        content = {
+            "task": "velocity",
+            "attitudes": [_encode_attitude(one) for one in measurements.attitudes],
+            "altitudes": [_encode_altitude(one) for one in measurements.altitudes],
+            "interval_velocities_m_s": measurements.interval_velocities_m_s.tolist(),
+            "inertial_velocities_m_s": _encode_vector(measurements.inertial_velocities_m_s),
+            "sun_direction": measurements.sun_direction.tolist(),
+        }
+    else:
+        content = {
+            "task": "landing",
+            "poses": [{**encode_pose(one.world_from_body, "body"), "time_s": one.time_s} for one in measurements.poses],
+            "slant_range_m": _encode_length(measurements.slant_range_m),
+            "up_body": measurements.up_body.tolist(),
+            "apriori_site_world": measurements.apriori_site_world.tolist(),
+        }
     images = _write_images(folder, measurements.images, pictures)
     write_json(folder / CASE_FILE, {"exchange": EXCHANGE, **content, "images": images})
 
@@ -91,8 +104,8 @@ def read_frame(folder: Path) -> DescentFrame:
             attitude=_read_attitude(content["attitude"]),
             altitude=_read_altitude(content["altitude"]),
             sun_direction=_vector(content["sun_direction"]),
-            inertial_velocity_m_s=_optional_vector(content["inertial_velocity_m_s"]),
-            interval_velocity_m_s=_optional_vector(content["interval_velocity_m_s"]),
+            inertial_velocity_m_s=_vector(content["inertial_velocity_m_s"]),
+            interval_velocity_m_s=_vector(content["interval_velocity_m_s"]),
         )
 
 
@@ -101,7 +114,23 @@ def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
     with open_json(folder / CASE_FILE, "case") as content:
         _check_version(content)
         images = [_read_image(folder, one) for one in content["images"]]
-        return _read_descent(content, images) if content["task"] == "velocity" else _read_landing(content, images)
+        if content["task"] == "velocity":
+            return DescentMeasurements(
+                images=tuple(images),
+                attitudes=tuple(_read_attitude(one) for one in content["attitudes"]),
+                altitudes=tuple(_read_altitude(one) for one in content["altitudes"]),
+                interval_velocities_m_s=_vector(content["interval_velocities_m_s"]).reshape(-1, 3),
+                sun_direction=_vector(content["sun_direction"]),
+                inertial_velocities_m_s=_vector(content.get("inertial_velocities_m_s")),
+            )
+        poses = [PoseMeasurement(read_pose(one, "body"), one["time_s"]) for one in content["poses"]]
+        return LandingMeasurements(
+            images=(images[0], images[1]),
+            poses=(poses[0], poses[1]),
+            slant_range_m=_read_length(content["slant_range_m"]),
+            up_body=_vector(content["up_body"]),
+            apriori_site_world=_vector(content["apriori_site_world"]),
+        )
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
@@ -123,29 +152,6 @@ def _check_version(content: Mapping[str, Any]) -> None:
         raise ValueError(f"it has version {content['exchange']} of the exchange; this program reads {EXCHANGE}")
 
 
-def _encode_descent(measurements: DescentMeasurements) -> dict[str, Any]:
-    at = measurements.inertial_velocities_m_s
-    return {
-        "task": "velocity",
-        "attitudes": [_encode_attitude(one) for one in measurements.attitudes],
-        "altitudes": [_encode_altitude(one) for one in measurements.altitudes],
-        "interval_velocities_m_s": measurements.interval_velocities_m_s.tolist(),
-        "inertial_velocities_m_s": _encode_vector(at),
-        "sun_direction": measurements.sun_direction.tolist(),
-    }
-
-
-def _read_descent(content: Mapping[str, Any], images: Sequence[DetectorImage]) -> DescentMeasurements:
-    return DescentMeasurements(
-        images=tuple(images),
-        attitudes=tuple(_read_attitude(one) for one in content["attitudes"]),
-        altitudes=tuple(_read_altitude(one) for one in content["altitudes"]),
-        interval_velocities_m_s=_vector(content["interval_velocities_m_s"]).reshape(-1, 3),
-        sun_direction=_vector(content["sun_direction"]),
-        inertial_velocities_m_s=_optional_vector(content.get("inertial_velocities_m_s")),
-    )
-
-
 def _encode_attitude(measured: AttitudeMeasurement) -> dict[str, Any]:
     return {"world_from_body_xyzw": measured.world_from_body.as_quat().tolist(), "time_s": measured.time_s}
 
@@ -155,74 +161,41 @@ def _read_attitude(content: Mapping[str, Any]) -> AttitudeMeasurement:
 
 
 def _encode_altitude(measured: AltitudeMeasurement) -> dict[str, Any]:
-    known = math.isfinite(measured.altitude_m)
-    return {"altitude_m": measured.altitude_m if known else None, "time_s": measured.time_s}
+    return {"altitude_m": _encode_length(measured.altitude_m), "time_s": measured.time_s}
 
 
 def _read_altitude(content: Mapping[str, Any]) -> AltitudeMeasurement:
-    altitude_m = content["altitude_m"]
-    return AltitudeMeasurement(math.nan if altitude_m is None else altitude_m, content["time_s"])
+    return AltitudeMeasurement(_read_length(content["altitude_m"]), content["time_s"])
+
+
+def _encode_length(length_m: float) -> float | None:
+    return length_m if math.isfinite(length_m) else None
+
+
+def _read_length(length_m: float | None) -> float:
+    return math.nan if length_m is None else length_m
 
 
 def _encode_vector(value: Float[np.ndarray, "..."] | None) -> list[Any] | None:
     return None if value is None else value.tolist()
 
 
-def _vector(content: Any) -> Float64[np.ndarray, "..."]:
-    return np.array(content, dtype=np.float64)
-
-
-def _optional_vector(content: Any) -> Float64[np.ndarray, "..."] | None:
-    return None if content is None else _vector(content)
-
-
-def _encode_landing(measurements: LandingMeasurements) -> dict[str, Any]:
-    known = math.isfinite(measurements.slant_range_m)
-    return {
-        "task": "landing",
-        "poses": [
-            {
-                "position_world_m": np.asarray(one.world_from_body.translation).tolist(),
-                "world_from_body_xyzw": one.world_from_body.rotation.as_quat().tolist(),
-                "time_s": one.time_s,
-            }
-            for one in measurements.poses
-        ],
-        "slant_range_m": measurements.slant_range_m if known else None,
-        "up_body": measurements.up_body.tolist(),
-        "apriori_site_world": measurements.apriori_site_world.tolist(),
-    }
-
-
-def _read_landing(content: Mapping[str, Any], images: Sequence[DetectorImage]) -> LandingMeasurements:
-    poses = [
-        PoseMeasurement(
-            rigid(Rotation.from_quat(one["world_from_body_xyzw"]), np.array(one["position_world_m"])), one["time_s"]
-        )
-        for one in content["poses"]
-    ]
-    range_m = content["slant_range_m"]
-    return LandingMeasurements(
-        images=(images[0], images[1]),
-        poses=(poses[0], poses[1]),
-        slant_range_m=math.nan if range_m is None else range_m,
-        up_body=np.array(content["up_body"], dtype=np.float64),
-        apriori_site_world=np.array(content["apriori_site_world"], dtype=np.float64),
-    )
+def _vector(content: Any) -> Any:
+    return None if content is None else np.array(content, dtype=np.float64)
 
 
 def _write_images(folder: Path, images: Sequence[DetectorImage], pictures: Pictures) -> list[dict[str, Any]]:
     """Write images, cameras and flat fields; a shared flat field is written once."""
     written: list[dict[str, Any]] = []
-    fields: list[tuple[str, Float[np.ndarray, "rows columns"]]] = []
+    fields: dict[str, Float[np.ndarray, "rows columns"]] = {}
     for number, image in enumerate(images, start=1):
         name, camera, known = f"image_{number}.{pictures}", f"camera_{number}.cahvor", image.calibration
         write_picture(folder / name, image.counts)
         write_cahvor(image.camera, folder / camera, frame=BODY_FRAME)
-        flat = next((path for path, one in fields if np.array_equal(one, known.flat_field)), None)
+        flat = next((path for path, one in fields.items() if np.array_equal(one, known.flat_field)), None)
         if flat is None:
             flat = f"flat_field_{len(fields) + 1}.f64"
-            fields.append((flat, known.flat_field))
+            fields[flat] = known.flat_field
             known.flat_field.astype("<f8").tofile(folder / flat)
         rows, columns = image.counts.shape
         calibration = {"flat_field": flat, **{one: getattr(known, one) for one in _CALIBRATION}}
@@ -265,15 +238,10 @@ _OFFSETS, _LIMITS = ("base_m", "elbow_m", "head_m"), ("azimuth_limits_rad", "ele
 
 def write_mast(folder: Path, mast: MastCalibration) -> None:
     """Write a mast and its two cameras into an existing folder."""
+    content: dict[str, Any] = {name: np.asarray(getattr(mast.geometry, name)).tolist() for name in _OFFSETS + _LIMITS}
     for name, camera in (("left", mast.left), ("right", mast.right)):
         write_cahvor(camera, folder / f"{name}.cahvor", frame=HEAD_FRAME)
-    geometry = mast.geometry
-    content = {
-        **{name: getattr(geometry, name).tolist() for name in _OFFSETS},
-        **{name: list(getattr(geometry, name)) for name in _LIMITS},
-        "left": {"camera": "left.cahvor", "columns": mast.left.size[0], "rows": mast.left.size[1]},
-        "right": {"camera": "right.cahvor", "columns": mast.right.size[0], "rows": mast.right.size[1]},
-    }
+        content[name] = {"camera": f"{name}.cahvor", "columns": camera.size[0], "rows": camera.size[1]}
     write_json(folder / MAST_FILE, content)
 
 
@@ -281,7 +249,7 @@ def read_mast(folder: Path) -> MastCalibration:
     """Read a mast of `write_mast`. Raises ValueError for a folder without one."""
     with open_json(folder / MAST_FILE, "mast") as content:
         left, right = (read_cahvor(folder / content[name]["camera"]) for name in ("left", "right"))
-        base, elbow, head = (np.array(content[name], dtype=np.float64) for name in _OFFSETS)
+        base, elbow, head = (_vector(content[name]) for name in _OFFSETS)
         azimuths, elevations = ((content[name][0], content[name][1]) for name in _LIMITS)
         return MastCalibration(MastGeometry(base, elbow, head, azimuths, elevations), left, right)
 
@@ -304,49 +272,35 @@ def read_stop(folder: Path, mast: MastCalibration) -> RoverMeasurements:
     """Read a stop of `write_stop`. Raises ValueError for a folder without one."""
     with open_json(folder / STOP_FILE, "stop") as content:
         left, right = (
-            MastImage(
-                read_picture(folder / content[name]["file"]),
-                (int(content[name]["corner"][0]), int(content[name]["corner"][1])),
-            )
-            for name in ("left", "right")
+            MastImage(read_picture(folder / one["file"]), (int(one["corner"][0]), int(one["corner"][1])))
+            for one in (content["left"], content["right"])
         )
         azimuth, elevation = float(content["azimuth_rad"]), float(content["elevation_rad"])
         return RoverMeasurements(left, right, mast, azimuth, elevation, read_pose(content["world_from_rover"]))
 
 
-def encode_pose(pose: RigidTransform) -> dict[str, list[float]]:
-    """A rover's pose: position in the world and unit quaternion, scalar last."""
+def encode_pose(pose: RigidTransform, body: str = "rover") -> dict[str, Any]:
+    """The pose of a rover or a body: position in the world and unit quaternion, scalar last."""
     return {
         "position_world_m": np.asarray(pose.translation).tolist(),
-        "world_from_rover_xyzw": pose.rotation.as_quat().tolist(),
+        f"world_from_{body}_xyzw": pose.rotation.as_quat().tolist(),
     }
 
 
-def read_pose(content: Mapping[str, Any]) -> RigidTransform:
+def read_pose(content: Mapping[str, Any], body: str = "rover") -> RigidTransform:
     """Read a pose of `encode_pose`."""
-    return rigid(
-        Rotation.from_quat(content["world_from_rover_xyzw"]), np.array(content["position_world_m"], dtype=np.float64)
-    )
+    return rigid(Rotation.from_quat(content[f"world_from_{body}_xyzw"]), _vector(content["position_world_m"]))
 
 
 def encode_target(target: TargetDesignation) -> dict[str, Any]:
     """A target designation in one of its three forms."""
-    match target:
-        case PixelTarget():
-            angles = {"azimuth_rad": target.azimuth_rad, "elevation_rad": target.elevation_rad}
-            return {"pixel": target.pixel.tolist(), **angles}
-        case RoverTarget():
-            return {"position_rover": target.position_rover.tolist()}
-        case SiteTarget():
-            return {"position_site": target.position_site.tolist()}
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(target).items()}
 
 
 def read_target(content: Mapping[str, Any]) -> TargetDesignation:
     """Read a designation of `encode_target`."""
     if "pixel" in content:
-        return PixelTarget(
-            np.array(content["pixel"], dtype=np.float64), content["azimuth_rad"], content["elevation_rad"]
-        )
+        return PixelTarget(_vector(content["pixel"]), content["azimuth_rad"], content["elevation_rad"])
     if "position_rover" in content:
-        return RoverTarget(np.array(content["position_rover"], dtype=np.float64))
-    return SiteTarget(np.array(content["position_site"], dtype=np.float64))
+        return RoverTarget(_vector(content["position_rover"]))
+    return SiteTarget(_vector(content["position_site"]))

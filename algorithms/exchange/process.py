@@ -16,8 +16,8 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass
+from typing import IO, Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -97,24 +97,18 @@ class Output:
     time_s: float
 
 
-@dataclass
 class RunningProgram:
     """A running program under test.
 
     Every method raises AlgorithmError, after ending the program, if it breaks a limit, ends early or cannot be started.
     """
 
-    words: tuple[str, ...]
-    limits: ExecutableLimits
-    _process: subprocess.Popen[bytes] = field(init=False)
-    _output: bytearray = field(init=False, default_factory=bytearray)
-    _stderr: bytearray = field(init=False, default_factory=bytearray)
-    _deadline_s: float = field(init=False, default=0.0)
-
-    def __post_init__(self) -> None:
+    def __init__(self, words: tuple[str, ...], limits: ExecutableLimits) -> None:
+        self.limits = limits
+        self._output, self._stderr = bytearray(), bytearray()
         try:
             self._process = subprocess.Popen(  # noqa: S603 (running the user's program is the purpose)
-                self.words,
+                words,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
@@ -122,9 +116,9 @@ class RunningProgram:
                 preexec_fn=_end_with_parent if sys.platform == "linux" else None,
             )
         except OSError as error:
-            message = f"{self.words[0]} cannot be started: {error.strerror or error}"
+            message = f"{words[0]} cannot be started: {error.strerror or error}"
             raise AlgorithmError(Fault.CRASHED, message) from error
-        self._reset()
+        self._deadline_s = time.monotonic() + limits.time_s
 
     @property
     def process(self) -> int:
@@ -147,10 +141,21 @@ class RunningProgram:
         Output before the request is a fault (BAD_ANSWER): a late second line would answer the next case.
         """
         started = time.perf_counter()
-        self._reset()
+        self._output.clear()
+        self._stderr.clear()
+        self._deadline_s = time.monotonic() + self.limits.time_s
         if asked is not None:
-            self._refuse_unasked_output()
-            self._write_line(asked)
+            if unasked := _read_pending(self._process.stdout):
+                message = f"before it was asked it wrote {shorten(unasked)}; expected one line for each request"
+                raise self._end_with_fault(Fault.BAD_ANSWER, message)
+            try:
+                if self._process.stdin is None or self._process.stdin.closed:
+                    raise BrokenPipeError
+                self._process.stdin.write(f"{asked}\n".encode())
+                self._process.stdin.flush()
+            except BrokenPipeError:
+                self._wait()
+                raise self._end_with_fault(Fault.CRASHED, "it reads no more cases") from None
         self._read(lambda: b"\n" in self._output)
         if b"\n" not in self._output:
             self._wait()
@@ -167,33 +172,6 @@ class RunningProgram:
             self._process.wait(_EXIT_GRACE_S)
         self._kill()
 
-    def _reset(self) -> None:
-        self._output.clear()
-        self._stderr.clear()
-        self._deadline_s = time.monotonic() + self.limits.time_s
-
-    def _write_line(self, line: str) -> None:
-        stdin = self._process.stdin
-        try:
-            if stdin is None or stdin.closed:
-                raise BrokenPipeError
-            stdin.write(f"{line}\n".encode())
-            stdin.flush()
-        except BrokenPipeError:
-            self._wait()
-            raise self._end_with_fault(Fault.CRASHED, "it reads no more cases") from None
-
-    def _refuse_unasked_output(self) -> None:
-        stdout = self._process.stdout
-        if stdout is None or stdout.closed:
-            return
-        with selectors.DefaultSelector() as selector:
-            selector.register(stdout, selectors.EVENT_READ)
-            # an empty read is the end of its output, which is reported when it is asked
-            if selector.select(0.0) and (unasked := os.read(stdout.fileno(), 1 << 16)):
-                message = f"before it was asked it wrote {shorten(unasked)}; expected one line for each request"
-                raise self._end_with_fault(Fault.BAD_ANSWER, message)
-
     def _close_input(self) -> None:
         if self._process.stdin is not None:
             with suppress(BrokenPipeError):
@@ -201,16 +179,14 @@ class RunningProgram:
 
     def _read(self, enough: Callable[[], bool]) -> None:
         """Read both streams until they end or `enough` holds, under the limits on time, memory and size."""
-        streams = {self._process.stdout: self._output, self._process.stderr: self._stderr}
         with selectors.DefaultSelector() as selector:
-            for stream, kept in streams.items():
+            for stream, kept in ((self._process.stdout, self._output), (self._process.stderr, self._stderr)):
                 if stream is not None:
                     selector.register(stream, selectors.EVENT_READ, kept)
             while selector.get_map() and not enough():
                 self._check()
                 for key, _ in selector.select(_POLL_S):
-                    read = os.read(key.fd, 1 << 16)
-                    if read:
+                    if read := os.read(key.fd, 1 << 16):
                         key.data.extend(read)
                     else:
                         selector.unregister(key.fileobj)
@@ -231,7 +207,8 @@ class RunningProgram:
                 status = self._process.wait(_POLL_S)
                 break
         if status < 0:
-            raise self._end_with_fault(Fault.CRASHED, f"it was ended by {_signal_name(-status)}")
+            name = next((one.name for one in signal.Signals if one == -status), f"signal {-status}")
+            raise self._end_with_fault(Fault.CRASHED, f"it was ended by {name}")
         if status > 0:
             raise self._end_with_fault(Fault.CRASHED, f"it ended with status {status}")
 
@@ -251,12 +228,8 @@ class RunningProgram:
 
     def _collect_output(self, output: bytes, started: float) -> Output:
         """The answer, with the pending content of standard error."""
-        stream = self._process.stderr
-        if stream is not None and not stream.closed:
-            with selectors.DefaultSelector() as selector:
-                selector.register(stream, selectors.EVENT_READ)
-                while selector.select(0.0) and (read := os.read(stream.fileno(), 1 << 16)):
-                    self._stderr.extend(read)
+        while pending := _read_pending(self._process.stderr):
+            self._stderr.extend(pending)
         return Output(output, _decode_tail(self._stderr), time.perf_counter() - started)
 
 
@@ -265,11 +238,13 @@ def _end_with_parent() -> None:
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
+def _read_pending(stream: IO[bytes] | None) -> bytes:
+    """Bytes that a stream holds now; none at its end."""
+    if stream is None or stream.closed:
+        return b""
+    with selectors.DefaultSelector() as selector:
+        selector.register(stream, selectors.EVENT_READ)
+        return os.read(stream.fileno(), 1 << 16) if selector.select(0.0) else b""
 
 
 def shorten(raw: bytes) -> str:

@@ -20,9 +20,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from marsyard.algorithms.exchange.files import ANSWER_VERSIONS
+from marsyard.algorithms.exchange.files import ANSWER_VERSIONS, write_case
 from marsyard.algorithms.exchange.process import Command, ExecutableLimits, Output, RunningProgram, shorten
 from marsyard.algorithms.faults import AlgorithmError, Fault
+from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements
 
 Member = TypeVar("Member", bound=Enum)
 Answer = TypeVar("Answer")
@@ -36,39 +37,33 @@ class ProgramDetails:
     time_s: float
 
 
+#: A function that reads an answer of the program: its table, and the details to attach.
+AnswerReader = Callable[[Mapping[str, Any], ProgramDetails], Answer]
+
+
 def parse_table(output: Output) -> Mapping[str, Any]:
     """Parse the JSON object of an output, keys unchecked; raises AlgorithmError (BAD_ANSWER)."""
+    message = f"its output is not one JSON object: {shorten(output.stdout)}"
     try:
         answer = json.loads(output.stdout.decode("utf-8"), parse_constant=float)
     except (ValueError, RecursionError) as error:
-        message = f"its output is not one JSON object: {shorten(output.stdout)} ({error})"
-        raise AlgorithmError(Fault.BAD_ANSWER, message, output.stderr) from error
+        raise AlgorithmError(Fault.BAD_ANSWER, f"{message} ({error})", output.stderr) from error
     if not isinstance(answer, dict):
-        raise AlgorithmError(
-            Fault.BAD_ANSWER, f"its output is not one JSON object: {shorten(output.stdout)}", output.stderr
-        )
+        raise AlgorithmError(Fault.BAD_ANSWER, message, output.stderr)
     return answer
 
 
 def check_keys(answer: Mapping[str, Any], allowed: set[str]) -> None:
     """Raise AlgorithmError (BAD_ANSWER) for another version of the exchange or an unknown key."""
     if type(answer.get("exchange")) is not int or answer["exchange"] not in ANSWER_VERSIONS:
-        raise bad_answer(
-            f"the answer's exchange is {answer.get('exchange')!r}; allowed: {', '.join(map(str, ANSWER_VERSIONS))}"
-        )
-    unknown = sorted(set(answer) - allowed - {"exchange"})
-    if unknown:
-        raise bad_answer(
-            f"the answer has an unknown key '{unknown[0]}'; allowed: {', '.join(sorted(allowed | {'exchange'}))}"
-        )
+        versions = ", ".join(map(str, ANSWER_VERSIONS))
+        raise bad_answer(f"the answer's exchange is {answer.get('exchange')!r}; allowed: {versions}")
+    keys = allowed | {"exchange"}
+    if unknown := sorted(set(answer) - keys):
+        raise bad_answer(f"the answer has an unknown key '{unknown[0]}'; allowed: {', '.join(sorted(keys))}")
 
 
-def read_member(answer: Mapping[str, Any], name: str, kinds: type[Member]) -> Member:
-    """The member of an enumeration under a key of the answer."""
-    return parse_member(name, answer.get(name), kinds)
-
-
-def parse_member(label: str, name: object, kinds: type[Member]) -> Member:
+def read_member(label: str, name: object, kinds: type[Member]) -> Member:
     """The member of an enumeration by name."""
     if not isinstance(name, str) or name not in kinds.__members__:
         raise bad_answer(f"{label} is {name!r}; allowed: {', '.join(kinds.__members__)}")
@@ -81,8 +76,9 @@ def read_numbers(answer: Mapping[str, Any], name: str, shape: tuple[int, ...]) -
     if value is None:
         return None
     if not _is_nested(value, shape):
-        shown = shorten(json.dumps(value).encode())
-        raise bad_answer(f"{name} is {shown}; allowed: numbers in the shape {list(shape)}")
+        raise bad_answer(
+            f"{name} is {shorten(json.dumps(value).encode())}; allowed: numbers in the shape {list(shape)}"
+        )
     return np.array(value, dtype=np.float64)
 
 
@@ -93,12 +89,12 @@ def _is_nested(value: Any, shape: tuple[int, ...]) -> bool:
     return isinstance(value, list) and len(value) == shape[0] and all(_is_nested(one, shape[1:]) for one in value)
 
 
-def attach_stderr(stderr: str, make: Callable[[], Answer]) -> Answer:
-    """Call `make`; an AlgorithmError gets the program's standard error attached."""
+def read_answer(answer: Mapping[str, Any], output: Output, read: AnswerReader[Answer]) -> Answer:
+    """Read an answer of a program; an AlgorithmError gets the program's standard error attached."""
     try:
-        return make()
+        return read(answer, ProgramDetails(output.stderr, output.time_s))
     except AlgorithmError as error:
-        raise AlgorithmError(error.fault, str(error), stderr) from error
+        raise AlgorithmError(error.fault, str(error), output.stderr) from error
 
 
 def bad_answer(message: str) -> AlgorithmError:
@@ -144,9 +140,23 @@ _waiting: dict[tuple[Command, ExecutableLimits], Server] = {}
 
 
 def acquire(command: Command, limits: ExecutableLimits) -> Server:
-    """A waiting persistent program, or a new one; the caller owns it."""
-    waiting = _waiting.pop((command, limits), None) if command.persistent else None
-    return waiting or _start(command, limits)
+    """A waiting persistent program, or a new one whose greeting is checked; the caller owns it."""
+    if command.persistent and (command, limits) in _waiting:
+        return _waiting.pop((command, limits))
+    child = RunningProgram(command.words, limits)
+    output = child.line()
+    try:
+        greeting = dict(parse_table(output))
+        version = greeting.get("exchange")
+        ready = greeting == {"exchange": version, "ready": True}
+        if type(version) is not int or version not in ANSWER_VERSIONS or not ready:
+            expected = f'{{"exchange": {ANSWER_VERSIONS[-1]}, "ready": true}}'
+            message = f"its first line is {shorten(output.stdout)}; expected {expected}"
+            raise AlgorithmError(Fault.BAD_ANSWER, message, output.stderr)
+    except AlgorithmError:
+        child.leave()
+        raise
+    return Server(child, version)
 
 
 def release(command: Command, limits: ExecutableLimits, server: Server) -> None:
@@ -169,27 +179,6 @@ def end_persistent() -> None:
         _waiting.popitem()[1].child.leave()
 
 
-def _start(command: Command, limits: ExecutableLimits) -> Server:
-    """Start a program and check its greeting."""
-    child = RunningProgram(command.words, limits)
-    output = child.line()
-    try:
-        greeting = dict(parse_table(output))
-        version = greeting.get("exchange")
-        if (
-            type(version) is not int
-            or version not in ANSWER_VERSIONS
-            or greeting != {"exchange": version, "ready": True}
-        ):
-            expected = f'{{"exchange": {ANSWER_VERSIONS[-1]}, "ready": true}}'
-            message = f"its first line is {shorten(output.stdout)}; expected {expected}"
-            raise AlgorithmError(Fault.BAD_ANSWER, message, output.stderr)
-    except AlgorithmError:
-        child.leave()
-        raise
-    return Server(child, version)
-
-
 class Session:
     """A dialogue of one algorithm with a program, one JSON line per request; the first request starts the program.
 
@@ -204,9 +193,13 @@ class Session:
         weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
 
     def ask(
-        self, do: str, values: Mapping[str, Any], files: Mapping[str, Callable[[Path], None]] | None = None
-    ) -> tuple[Mapping[str, Any], ProgramDetails]:
-        """The program's answer to the request `do` with `values`, keys unchecked.
+        self,
+        do: str,
+        values: Mapping[str, Any],
+        read: AnswerReader[Answer],
+        files: Mapping[str, Callable[[Path], None]] | None = None,
+    ) -> Answer:
+        """The program's answer to the request `do` with `values`.
 
         `files` maps keys of the request to writers of the folders named there; the folders exist until the answer.
         """
@@ -227,18 +220,21 @@ class Session:
                 if self._release is not None:
                     self._release.detach()
                 raise
-        return answer, ProgramDetails(output.stderr, output.time_s)
+        return read_answer(answer, output, read)
 
 
 def ask_case(
-    command: Command, limits: ExecutableLimits, write: Callable[[Path], None]
-) -> tuple[Mapping[str, Any], ProgramDetails]:
-    """A program's answer to one case, keys unchecked; `write` writes the case into a folder.
+    command: Command,
+    limits: ExecutableLimits,
+    measurements: DescentMeasurements | LandingMeasurements,
+    read: AnswerReader[Answer],
+) -> Answer:
+    """A program's answer to one case.
 
     A persistent program that fails is ended; the next case starts it again.
     """
     with tempfile.TemporaryDirectory(prefix="marsyard-case-") as folder:
-        write(Path(folder))
+        write_case(Path(folder), measurements)
         if command.persistent:
             server = acquire(command, limits)
             answer, output = server.ask({"case": folder})
@@ -246,4 +242,4 @@ def ask_case(
         else:
             output = RunningProgram((*command.words, folder), limits).answer()
             answer = parse_table(output)
-    return answer, ProgramDetails(output.stderr, output.time_s)
+    return read_answer(answer, output, read)

@@ -161,6 +161,15 @@ def flight(rng: np.random.Generator, max_tilt_deg: float = 25.0, max_wind: float
     return Flight(first + INTERVAL_S * steps, (attitudes[0], attitudes[1], attitudes[2]))
 
 
+LEVEL_FLIGHT = (Rotation.identity(), Rotation.identity(), Rotation.identity())
+
+
+def flown(velocity: tuple[float, float], attitudes: tuple[Rotation, Rotation, Rotation] = LEVEL_FLIGHT) -> Flight:
+    """A descent at 75 m/s with a steady horizontal velocity (east, north)."""
+    step = INTERVAL_S * np.array([*velocity, -75.0])
+    return Flight(np.array([900.0, 1400.0, 2000.0]) + np.outer(np.arange(3), step), attitudes)
+
+
 def _unit(rng: np.random.Generator) -> np.ndarray:
     angle = rng.uniform(0.0, 2.0 * np.pi)
     return np.array([np.cos(angle), np.sin(angle)])
@@ -170,13 +179,10 @@ def measurements_of(flown: Flight, counts: list[np.ndarray], known: DetectorCali
     """Exact measurements of a flight with these pictures; the inertial velocities carry a common error of (40, -25)."""
     camera = CAMERA.binned(1, known.rows_summed)
     times = [100.0 + INTERVAL_S * i for i in range(3)]
-    images = [DetectorImage(c, t, camera, known) for c, t in zip(counts, times, strict=True)]
-    attitudes = [AttitudeMeasurement(a, t) for a, t in zip(flown.attitudes, times, strict=True)]
-    altitudes = [AltitudeMeasurement(float(p[2]), t) for p, t in zip(flown.positions, times, strict=True)]
     return DescentMeasurements(
-        images=(images[0], images[1], images[2]),
-        attitudes=(attitudes[0], attitudes[1], attitudes[2]),
-        altitudes=(altitudes[0], altitudes[1], altitudes[2]),
+        images=tuple(DetectorImage(c, t, camera, known) for c, t in zip(counts, times, strict=True)),
+        attitudes=tuple(AttitudeMeasurement(a, t) for a, t in zip(flown.attitudes, times, strict=True)),
+        altitudes=tuple(AltitudeMeasurement(float(p[2]), t) for p, t in zip(flown.positions, times, strict=True)),
         interval_velocities_m_s=flown.velocities + np.array([40.0, -25.0, 0.0]),
         sun_direction=flown.sun,
     )

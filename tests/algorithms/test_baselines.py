@@ -11,31 +11,29 @@ import pytest
 from marsyard.algorithms.baselines import BaselineDetails, HomographyEstimator, PairPatches, PhaseCorrelationEstimator
 from marsyard.algorithms.baselines.homography import distortion
 from marsyard.algorithms.baselines.pairs import DEFAULT_COMMON_OPTIONS, find_common_square, rectify_pair
-from marsyard.algorithms.dimes import DimesOptions
+from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
 from marsyard.algorithms.dimes.binning import inside_frame, square, usable_views
 from marsyard.algorithms.interface import VelocityEstimator, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
-from tests.algorithms.synthetic_descent import INTERVAL_S, Flight, flight, render, terrain, tilted, velocity_of, waves
+from tests.algorithms.synthetic_descent import flight, flown, render, terrain, tilted, velocity_of, waves
 
 ESTIMATORS: dict[str, VelocityEstimator] = {"phase": PhaseCorrelationEstimator(), "homography": HomographyEstimator()}
 both = pytest.mark.parametrize("name", ESTIMATORS)
+and_dimes = pytest.mark.parametrize("estimator", [*ESTIMATORS.values(), DimesEstimator()], ids=[*ESTIMATORS, "dimes"])
 
 
-def flown(velocity: tuple[float, float]) -> Flight:
-    step = INTERVAL_S * np.array([*velocity, -75.0])
-    attitudes = (tilted(3.0, 0.0, 0.0), tilted(5.0, 90.0, 120.0), tilted(4.0, 200.0, 250.0))
-    return Flight(np.array([900.0, 1400.0, 2000.0]) + np.outer(np.arange(3), step), attitudes)
+ATTITUDES = (tilted(3.0, 0.0, 0.0), tilted(5.0, 90.0, 120.0), tilted(4.0, 200.0, 250.0))
 
 
 @pytest.fixture(scope="module")
 def ordinary() -> DescentMeasurements:
-    return render(flown((10.0, 5.0)), noise=np.random.default_rng(1))
+    return render(flown((10.0, 5.0), ATTITUDES), noise=np.random.default_rng(1))
 
 
 @both
 @pytest.mark.parametrize("velocity", [(12.0, 0.0), (0.0, 12.0), (-8.0, 9.0)])
 def test_east_is_east_and_north_is_north(name: str, velocity: tuple[float, float]) -> None:
-    answer = ESTIMATORS[name].estimate(render(flown(velocity)))
+    answer = ESTIMATORS[name].estimate(render(flown(velocity, ATTITUDES)))
     assert answer.outcome is VelocityOutcome.VALID
     # Half a rectified pixel is 0.6 m/s.
     np.testing.assert_allclose(velocity_of(answer), velocity, atol=0.3)
@@ -55,14 +53,14 @@ def test_descents_with_exact_measurements(name: str) -> None:
     assert max(errors) < 0.5
 
 
-@both
-def test_pictures_of_different_ground_give_no_velocity(name: str) -> None:
+@and_dimes
+def test_pictures_of_different_ground_give_no_velocity(estimator: VelocityEstimator) -> None:
     rng = np.random.default_rng(10)
     for _ in range(3):
         truth = flight(rng, max_tilt_deg=10.0)
         first, other = render(truth, terrain(1), rng), render(truth, terrain(2), rng)
         mixed = replace(first, images=(first.images[0], other.images[1], first.images[2]))
-        answer = ESTIMATORS[name].estimate(mixed)
+        answer = estimator.estimate(mixed)
         assert answer.outcome in (VelocityOutcome.NO_VALID_TRACK, VelocityOutcome.IMU_MISMATCH)
 
 
@@ -74,9 +72,9 @@ def test_imu_that_disagrees_is_believed(name: str, ordinary: DescentMeasurements
     assert answer.velocity_m_s is None
 
 
-@both
-def test_motion_beyond_the_largest_speed_is_not_reported(name: str) -> None:
-    assert ESTIMATORS[name].estimate(render(flown((45.0, 0.0)))).outcome is not VelocityOutcome.VALID
+@and_dimes
+def test_motion_beyond_the_largest_speed_is_not_reported(estimator: VelocityEstimator) -> None:
+    assert estimator.estimate(render(flown((45.0, 0.0), ATTITUDES))).outcome is not VelocityOutcome.VALID
 
 
 @both
@@ -125,7 +123,7 @@ def test_distortion_is_the_largest_change_of_length() -> None:
 
 @both
 def test_featureless_and_sky(name: str, ordinary: DescentMeasurements) -> None:
-    flat = render(flown((10.0, 0.0)), terrain(3, 0.0), np.random.default_rng(4))
+    flat = render(flown((10.0, 0.0), ATTITUDES), terrain(3, 0.0), np.random.default_rng(4))
     assert ESTIMATORS[name].estimate(flat).outcome is not VelocityOutcome.VALID
     up = tuple(replace(one, world_from_body=tilted(180.0, 0.0, 0.0)) for one in ordinary.attitudes)
     assert ESTIMATORS[name].estimate(replace(ordinary, attitudes=up)).outcome is VelocityOutcome.NO_TEMPLATE_AREA
@@ -141,14 +139,11 @@ def test_answers_repeat_and_tell_their_matches(name: str, ordinary: DescentMeasu
 
 
 def test_common_square_is_seen_by_both_and_as_large_as_can_be() -> None:
-    triple = usable_views(render(flown((0.0, 0.0))), DimesOptions().binned_size)
+    triple = usable_views(render(flown((0.0, 0.0), ATTITUDES)), DimesOptions().binned_size)
     assert triple is not None
-    middle, side, gsd = find_common_square(triple[0], triple[1], replace(DEFAULT_COMMON_OPTIONS, max_side_px=1000)) or (
-        None,
-        0,
-        0.0,
-    )
-    assert middle is not None
+    found = find_common_square(triple[0], triple[1], replace(DEFAULT_COMMON_OPTIONS, max_side_px=1000))
+    assert found is not None
+    middle, side, gsd = found
     ground = middle + square(0.5 * side * gsd, 9)
     for view in triple[:2]:
         assert inside_frame(view, ground, 0.0, DEFAULT_COMMON_OPTIONS.max_off_nadir_rad).all()
@@ -164,6 +159,6 @@ def test_common_square_is_seen_by_both_and_as_large_as_can_be() -> None:
 @pytest.mark.parametrize("velocity", [(10.0, 5.0), (0.0, 0.0), (-20.0, 12.0)])
 def test_repetitive_terrain_is_refused(velocity: tuple[float, float]) -> None:
     """Waves of 80 m repeat within the search range: a shift by whole waves cannot be distinguished from none."""
-    measured = render(flown(velocity), waves(80.0), np.random.default_rng(4))
+    measured = render(flown(velocity, ATTITUDES), waves(80.0), np.random.default_rng(4))
     for estimator in ESTIMATORS.values():
         assert estimator.estimate(measured).outcome is VelocityOutcome.NO_VALID_TRACK

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -56,9 +57,8 @@ def concluded(first: list[np.ndarray], second: list[np.ndarray], interval_veloci
 
 def test_all_combinations_best_first() -> None:
     velocities = np.array([[40.0, 0.0, -75.0], [41.0, 2.0, -75.0]])
-    found = combinations(
-        [(0, np.array([5.0, 5.0])), (1, np.array([9.0, 5.0]))], [(1, np.array([6.0, 7.0]))], velocities
-    )
+    first = [(0, np.array([5.0, 5.0])), (1, np.array([9.0, 5.0]))]
+    found = combinations(first, [(1, np.array([6.0, 7.0]))], velocities)
     assert [(c.first, c.second) for c in found] == [(0, 1), (1, 1)]
     assert [c.discrepancy_m_s for c in found] == pytest.approx([0.0, 4.0])
 
@@ -157,22 +157,14 @@ def test_propagation_drops_the_inertial_bias() -> None:
     ],
 )
 def test_each_metric_has_its_check(change: dict[str, Any], check: ValidityCheck) -> None:
-    from dataclasses import replace
-
     assert failed_checks(METRICS, DimesOptions()) == ()
     assert failed_checks(replace(METRICS, **change), DimesOptions()) == (check,)
 
 
 def test_a_track_exactly_at_every_limit_is_valid() -> None:
-    options = DimesOptions()
-    limit = TrackMetrics(
-        contrast=options.min_contrast,
-        peak=options.min_peak,
-        peak_width_px=options.max_peak_width_px,
-        second_peak_ratio=options.max_second_peak_ratio,
-        on_border=False,
-    )
-    assert failed_checks(limit, options) == ()
+    o = DimesOptions()
+    limit = TrackMetrics(o.min_contrast, o.min_peak, o.max_peak_width_px, o.max_second_peak_ratio, on_border=False)
+    assert failed_checks(limit, o) == ()
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.dimes.binning import (
     View,
@@ -88,16 +88,10 @@ def test_rays_beyond_the_limit_end_at_the_limit_in_their_own_azimuth() -> None:
 
 
 def test_camera_stands_above_the_origin_whatever_its_place_in_the_body() -> None:
-    from scipy.spatial.transform import RigidTransform
-
     attitude = tilted(30.0, 45.0, 10.0)
     lever = np.array([0.5, -1.0, -2.0])
-    image = DetectorImage(
-        np.zeros((256, 1024), dtype=np.uint16),
-        0.0,
-        CAMERA.binned(1, ROWS_SUMMED).moved(RigidTransform.from_translation(lever)),
-        calibration(),
-    )
+    camera = CAMERA.binned(1, ROWS_SUMMED).moved(RigidTransform.from_translation(lever))
+    image = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, camera, calibration())
     seen = build_view(image, attitude, 1400.0, (256, 256))
     np.testing.assert_allclose(seen.camera.c, seen.centre, atol=1e-9)
     np.testing.assert_allclose(seen.centre, [0.0, 0.0, 1400.0 + attitude.apply(lever)[2]], atol=1e-9)
@@ -142,10 +136,8 @@ def test_candidates_lie_within_the_overlap_polygon() -> None:
 def test_every_candidate_has_room_for_template_and_window() -> None:
     rng = np.random.default_rng(8)
     for _ in range(6):
-        first, second = pair(
-            tilted(*rng.uniform([0.0, 0.0, 0.0], [25.0, 360.0, 360.0])),
-            tilted(*rng.uniform([0.0, 0.0, 0.0], [25.0, 360.0, 360.0])),
-        )
+        attitudes = [tilted(*rng.uniform([0.0, 0.0, 0.0], [25.0, 360.0, 360.0])) for _ in range(2)]
+        first, second = pair(attitudes[0], attitudes[1])
         geometry = search_geometry(first, second, OPTIONS)
         found = candidates(first, second).ground
         assert len(found) > 0
@@ -231,11 +223,8 @@ def test_selection_finds_the_only_textured_place() -> None:
 
 def chart() -> Texture:
     """A smooth picture of which every point can be told analytically: waves of 60 to 200 m, and a ramp of none."""
-    size, step = 2048, 1.5
-    north = -np.arange(size)[:, None] * 2.0 * np.pi / size
-    east = np.arange(size)[None, :] * 2.0 * np.pi / size
-    values = 1.0 + 0.2 * np.sin(30 * east + 0.4) * np.cos(17 * north) + 0.2 * np.cos(41 * north - 12 * east)
-    return Texture(values.astype(np.float32), step)
+    along_m = 1.5 * np.arange(2048)
+    return Texture(chart_at(along_m[None, :], -along_m[:, None]).astype(np.float32), 1.5)
 
 
 def chart_at(east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
@@ -259,18 +248,17 @@ def test_rectified_patch_shows_the_ground_that_it_names(attitude: Rotation) -> N
     patch = rectify_patch(seen, centre[0], 61, 5.5)
     lattice = ground_lattice(centre[0], 61, 5.5) + position[:2]
     expected = chart_at(lattice[..., 0], lattice[..., 1])
-    shift = _shift(patch / 1600.0, expected, chart_at, lattice)
+    shift = _shift(patch / 1600.0, expected, lattice)
     # 0.01 px of a binned pixel: 0.06 m, or 0.015 m/s over 3.75 s.
     assert np.abs(shift).max() < 0.06
     np.testing.assert_allclose(patch / 1600.0, expected, atol=0.02)
 
 
-def _shift(patch: np.ndarray, expected: np.ndarray, truth: object, lattice: np.ndarray) -> np.ndarray:
-    """Mean displacement (east, north) of the patch against the truth, metres, by one least-squares step."""
-    assert callable(truth)
+def _shift(patch: np.ndarray, expected: np.ndarray, lattice: np.ndarray) -> np.ndarray:
+    """Mean displacement (east, north) of the patch against the chart, metres, by one least-squares step."""
+    east, north = lattice[..., 0], lattice[..., 1]
     slopes = [
-        (truth(lattice[..., 0] + dx, lattice[..., 1] + dy) - truth(lattice[..., 0] - dx, lattice[..., 1] - dy)) / 0.2
-        for dx, dy in ((0.1, 0.0), (0.0, 0.1))
+        (chart_at(east + dx, north + dy) - chart_at(east - dx, north - dy)) / 0.2 for dx, dy in ((0.1, 0.0), (0.0, 0.1))
     ]
     design = np.column_stack([slopes[0].ravel(), slopes[1].ravel(), np.ones(patch.size)])
     solution, *_ = np.linalg.lstsq(design, (patch - expected).ravel())

@@ -331,8 +331,8 @@ def test_the_example_in_c(measured: DescentMeasurements, tmp_path: Path) -> None
         assert isinstance(found.details, ProgramDetails)
         assert "templates found" in found.details.stderr
     end_persistent()
-    flat = [dataclasses.replace(one, counts=np.full_like(one.counts, 4095)) for one in measured.images]
-    blank = dataclasses.replace(measured, images=(flat[0], flat[1], flat[2]))
+    flat = tuple(dataclasses.replace(one, counts=np.full_like(one.counts, 4095)) for one in measured.images)
+    blank = dataclasses.replace(measured, images=flat)
     assert ask(f"exec:{built}", blank).outcome is VelocityOutcome.NO_VALID_TRACK
 
 

@@ -138,21 +138,16 @@ def test_a_frame_comes_back_as_it_was(tmp_path: Path, altitude_m: float) -> None
     given = inputs.descent()
     frame = replace(given.frames()[1], altitude=replace(given.altitudes[1], altitude_m=altitude_m))
     write_frame(tmp_path, frame)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [
-        "camera_1.cahvor",
-        "flat_field_1.f64",
-        "frame.json",
-        "image_1.pgm",
-    ]
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["camera_1.cahvor", "flat_field_1.f64", "frame.json", "image_1.pgm"]
     back = read_frame(tmp_path)
     np.testing.assert_array_equal(back.image.counts, frame.image.counts)
     for name in ("sun_direction", "inertial_velocity_m_s", "interval_velocity_m_s"):
         np.testing.assert_array_equal(getattr(back, name), getattr(frame, name))
     assert repr(back.altitude) == repr(frame.altitude)
     assert (back.attitude.world_from_body.inv() * frame.attitude.world_from_body).magnitude() < 1e-14
-    (tmp_path / "frame.json").write_text(
-        (tmp_path / "frame.json").read_text().replace('"exchange": 1', '"exchange": 2')
-    )
+    path = tmp_path / "frame.json"
+    path.write_text(path.read_text().replace('"exchange": 1', '"exchange": 2'))
     with pytest.raises(ValueError, match="is no picture of a descent: it has version 2 of the exchange"):
         read_frame(tmp_path)
 
@@ -209,28 +204,25 @@ NONE_YET = '{"exchange": 1, "outcome": null}'
 
 
 @pytest.mark.parametrize(
-    ("answers", "fault", "message"),
+    ("answers", "message"),
     [
-        (['{"exchange": 1, "outcome": "NO_VALID_TRACK"}'], Fault.BAD_ANSWER, "start is answered with an outcome"),
-        ([NONE_YET, "3"], Fault.BAD_ANSWER, "not one JSON object"),
-        ([NONE_YET, '{"exchange": 1}'], Fault.BAD_ANSWER, "outcome is None; allowed: VALID"),
-        ([NONE_YET, '{"exchange": 1, "outcome": null, "span_s": [1, 2]}'], Fault.BAD_ANSWER, "unknown key 'span_s'"),
+        (['{"exchange": 1, "outcome": "NO_VALID_TRACK"}'], "start is answered with an outcome"),
+        ([NONE_YET, "3"], "not one JSON object"),
+        ([NONE_YET, '{"exchange": 1}'], "outcome is None; allowed: VALID"),
+        ([NONE_YET, '{"exchange": 1, "outcome": null, "span_s": [1, 2]}'], "unknown key 'span_s'"),
         (
             [NONE_YET, NONE_YET, '{"exchange": 1, "outcome": "VALID", "velocity_m_s": [1, 2], "span_s": [0, 1]}'],
-            Fault.BAD_ANSWER,
             r"span_s is \(0.0, 1.0\); allowed: within",
         ),
-        ([NONE_YET] * 5, Fault.BAD_ANSWER, "finish is answered with the outcome null"),
-        ([NONE_YET] * 2, Fault.CRASHED, "its output ended before it had answered|it reads no more cases"),
+        ([NONE_YET] * 5, "finish is answered with the outcome null"),
+        ([NONE_YET] * 2, "its output ended before it had answered|it reads no more cases"),
     ],
 )
-def test_whatever_a_program_answers_wrong_is_a_fault(
-    tmp_path: Path, answers: list[str], fault: Fault, message: str
-) -> None:
+def test_whatever_a_program_answers_wrong_is_a_fault(tmp_path: Path, answers: list[str], message: str) -> None:
     (tmp_path / "stream.py").write_text(answering(answers))
     with pytest.raises(AlgorithmError, match=message) as caught:
         program(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}").estimate(inputs.descent())
-    assert caught.value.fault is fault
+    assert caught.value.fault is (Fault.CRASHED if answers == [NONE_YET] * 2 else Fault.BAD_ANSWER)
 
 
 def test_a_program_that_hangs_at_a_picture_is_ended(tmp_path: Path) -> None:
