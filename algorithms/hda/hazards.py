@@ -221,11 +221,8 @@ def check_footprints(
     lattice[::step, ::step] = True
     # a safe cell off the lattice needs its nearest lattice cell tested, safe or not
     wanted = np.zeros_like(lattice)
-    safe_rows, safe_columns = np.nonzero(safety == Safety.SAFE)
-    nearest = tuple(
-        _nearest_lattice_cell(cells, step, extent)
-        for cells, extent in zip((safe_rows, safe_columns), safety.shape, strict=True)
-    )
+    safe = np.argwhere(safety == Safety.SAFE)
+    nearest = tuple(np.minimum((safe + step // 2) // step * step, (np.array(safety.shape) - 1) // step * step).T)
     wanted[nearest] = True
     rows, columns = np.nonzero(wanted & lattice)
     offsets = disc_cells(0.5 * cells_across)
@@ -237,16 +234,12 @@ def check_footprints(
     max_slope_rad = options.max_slope_rad - options.margin_deviations * options.level_error_rad
     max_roughness_m = roughness_limit_m(resolution, ground.cell_m, options)
     with np.errstate(invalid="ignore"):
-        good = (
-            (np.arctan(slopes / ground.cell_m) <= max_slope_rad)
-            & (roughness <= max_roughness_m)
-            & (max_roughness_m > 0.0)
-        )
+        good = (np.arctan(slopes / ground.cell_m) <= max_slope_rad) & (roughness <= max_roughness_m)
+    good &= max_roughness_m > 0.0
     fails = np.zeros_like(lattice)
     fails[rows[~good], columns[~good]] = True
     result = safety.copy()
-    failed = fails[nearest]
-    result[safe_rows[failed], safe_columns[failed]] = Safety.HAZARD
+    result[tuple(safe[fails[nearest]].T)] = Safety.HAZARD
     return result
 
 
@@ -256,8 +249,3 @@ def disc_cells(radius_cells: float) -> Int[np.ndarray, "n 2"]:
     across = np.arange(-reach, reach + 1)
     cells = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1).reshape(-1, 2)
     return np.asarray(cells[np.hypot(*cells.T) <= radius_cells])
-
-
-def _nearest_lattice_cell(cells: Int[np.ndarray, "n"], step: int, extent: int) -> Int[np.ndarray, "n"]:
-    """Nearest lattice cell along an axis."""
-    return np.asarray(np.minimum((cells + step // 2) // step * step, (extent - 1) // step * step))

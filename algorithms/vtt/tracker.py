@@ -27,7 +27,7 @@ from marsyard.algorithms.vtt.matching import (
 )
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position
-from marsyard.algorithms.vtt.stereo import StereoMatch, nearest_point, pixels_along, point_stereo, search_ranges
+from marsyard.algorithms.vtt.stereo import StereoMatch, epipolar_pixels, nearest_point, point_stereo, search_ranges
 from marsyard.algorithms.vtt.target import (
     designated_position_world,
     lever_pixels,
@@ -240,8 +240,7 @@ def follow_track(
     if seen is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(False, None))
     predicted = seen[0]
-    scale = magnification(last.position_head, last.camera.c, expected, stop.left.c)
-    change = Change(scale, roll_angle(seen))
+    change = Change(magnification(last.position_head, last.camera.c, expected, stop.left.c), roll_angle(seen))
     window, window_corner = search_window(measurements.left, predicted, options.search_px)
     details = VttDetails(False, predicted, window, window_corner, change)
     applied = Change(change.magnification if options.scale else 1.0, change.roll_rad if options.roll else 0.0)
@@ -267,7 +266,7 @@ def triangulate_target(
 ) -> Finding:
     """Triangulate the target from its left pixel by point stereo over these ranges."""
     sight = stop.left.rays(pixel)
-    curve = pixels_along(sight, stop.left, stop.right, ranges_m)
+    curve = epipolar_pixels(sight, stop.left, stop.right, ranges_m)
     stereo = point_stereo(template, stop.measurements.right, curve, options)
     if stereo is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), details)
@@ -299,6 +298,9 @@ def check_losses(
 ) -> Finding:
     """Apply the four loss criteria to a match."""
     details = located.details
+    match, stereo, position = details.match, details.stereo, details.position_world
+    if match is None or stereo is None or position is None or track.seed_world is None:
+        raise ValueError("only a target that was matched, ranged and seeded can be judged")
     moved = sighting.world_from_rover.translation - last.world_from_rover.translation
     since_update = sighting.world_from_rover.translation - track.world_from_rover.translation
     journey = Journey(
@@ -308,35 +310,23 @@ def check_losses(
         step_m=float(np.linalg.norm(moved)),
         driven_m=track.driven_m + float(np.linalg.norm(since_update)),
     )
-    evidence = _evidence(track, details, expected_m)
-    allowed: Tolerances = tolerances(journey, stop.left, stop.right, options)
-    details = replace(
-        details,
-        step_m=journey.step_m,
-        azimuth_change_rad=_azimuth_change_rad(last, sighting),
-        evidence=evidence,
-        allowed=allowed,
-    )
-    failed = find_losses(evidence, allowed, options)
-    return Finding(failed, details) if failed else replace(located, details=details)
-
-
-def _evidence(track: Track, details: VttDetails, expected_m: float) -> Evidence:
-    match, stereo, position = details.match, details.stereo, details.position_world
-    if match is None or stereo is None or position is None or track.seed_world is None:
-        raise ValueError("only a target that was matched, ranged and seeded can be judged")
-    return Evidence(
+    evidence = Evidence(
         match_score=match.score,
         stereo_score=stereo.score,
         distance_correction_m=details.distance_m - expected_m,
         position_correction_m=float(np.linalg.norm(position - track.seed_world)),
     )
-
-
-def _azimuth_change_rad(last: Sighting, now: Sighting) -> float:
-    """Change of the line of sight's azimuth in the world, clockwise from above."""
-    turned = now.azimuth_world_rad - last.azimuth_world_rad
-    return float(np.arctan2(np.sin(turned), np.cos(turned)))
+    allowed: Tolerances = tolerances(journey, stop.left, stop.right, options)
+    turned = sighting.azimuth_world_rad - last.azimuth_world_rad
+    details = replace(
+        details,
+        step_m=journey.step_m,
+        azimuth_change_rad=float(np.arctan2(np.sin(turned), np.cos(turned))),
+        evidence=evidence,
+        allowed=allowed,
+    )
+    failed = find_losses(evidence, allowed, options)
+    return Finding(failed, details) if failed else replace(located, details=details)
 
 
 def advance_track(track: Track, finding: Finding, measurements: RoverMeasurements, options: VttOptions) -> Track:
