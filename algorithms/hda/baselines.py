@@ -10,7 +10,7 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.hda.estimator import find_site, matched_structure
@@ -149,29 +149,21 @@ def rectify_views(views: tuple[View, View], second_from_first: RigidTransform) -
     return Rectification(turn, baseline, camera)
 
 
-def rectify_image(
-    one: View, camera_from_rectified: Rotation, camera: Cahv, full_scale: float
-) -> UInt8[np.ndarray, "rows columns"]:
-    """The image of the rectified camera in 8 bits; black outside the field of view."""
-    rays = camera_from_rectified.apply(camera.rays(camera.pixel_grid())[1].reshape(-1, 3))
-    pixels, _ = one.camera.project(rays)
-    pixels = np.nan_to_num(pixels, nan=-10.0).astype(np.float32).reshape(camera.size[1], camera.size[0], 2)
-    grey = np.clip(one.counts * (255.0 / full_scale), 0.0, 255.0).astype(np.float32)
-    return np.asarray(np.rint(cv2.remap(grey, pixels, None, cv2.INTER_LINEAR)).astype(np.uint8))
-
-
 def match_disparities(
     views: tuple[View, View], pair: Rectification, second_from_first: RigidTransform, bounds_m: tuple[float, float]
 ) -> Float[np.ndarray, "rows columns"]:
     """Disparities of the first rectified image by semi-global matching, pixels; NaN without a match."""
     first_from_rectified = pair.rectified_from_first.inv()
     full_scale = max(float(np.quantile(views[0].counts, 0.995)), 1.0)
-    pictures = [
-        rectify_image(one, turn, pair.camera, full_scale)
-        for one, turn in zip(
-            views, (first_from_rectified, second_from_first.rotation * first_from_rectified), strict=True
-        )
-    ]
+    turns = (first_from_rectified, second_from_first.rotation * first_from_rectified)
+    rays = pair.camera.rays(pair.camera.pixel_grid())[1].reshape(-1, 3)
+    pictures = []
+    for one, turn in zip(views, turns, strict=True):
+        # in 8 bits; black outside the field of view
+        pixels = np.nan_to_num(one.camera.project(turn.apply(rays))[0], nan=-10.0).astype(np.float32)
+        grey = np.clip(one.counts * (255.0 / full_scale), 0.0, 255.0).astype(np.float32)
+        grid = pixels.reshape(pair.camera.size[1], pair.camera.size[0], 2)
+        pictures.append(np.rint(cv2.remap(grey, grid, None, cv2.INTER_LINEAR)).astype(np.uint8))
     disparity_px_m = pair.focal_px * pair.baseline_m
     min_disparity = int(disparity_px_m / bounds_m[1])
     count = DISPARITY_STEP * (int(disparity_px_m / bounds_m[0] - min_disparity) // DISPARITY_STEP + 1)

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.hda.elevation import ElevationMap
-from marsyard.algorithms.hda.hazards import HazardMaps
+from marsyard.algorithms.hda.hazards import ElevationMap, HazardMaps
 from marsyard.algorithms.hda.motion import Motion
 from marsyard.algorithms.hda.structure import Matches
 from marsyard.algorithms.hda.tracking import Tracks

@@ -222,9 +222,8 @@ def seed_track(track: Track, measurements: RoverMeasurements, options: VttOption
     window, window_corner = search_window(measurements.left, pixel, options.search_px)
     details = VttDetails(True, pixel, window, window_corner, match=Match(pixel, 1.0, template), template=template)
     located = triangulate_target(stop, pixel, template, ranges, details, options)
-    if located.sighting is None or located.details.stereo is None:
-        return located
-    if located.details.stereo.score < options.min_stereo_score:
+    stereo = located.details.stereo
+    if located.sighting is not None and stereo is not None and stereo.score < options.min_stereo_score:
         return Finding((TargetLoss.LOW_STEREO_SCORE,), located.details)
     return located
 
@@ -333,14 +332,10 @@ def advance_track(track: Track, finding: Finding, measurements: RoverMeasurement
     """The track after an update; a new match replaces the template."""
     pose, sighting = measurements.world_from_rover, finding.sighting
     state, lost_updates = next_state(track.state, track.lost_updates, sighting is not None, options.max_lost_updates)
-    moved = float(np.linalg.norm(pose.translation - track.world_from_rover.translation))
-    after = replace(
-        track,
-        state=state,
-        lost_updates=lost_updates,
-        world_from_rover=pose,
-        driven_m=track.driven_m + moved if track.sighting is not None else 0.0,
-    )
+    after = replace(track, state=state, lost_updates=lost_updates, world_from_rover=pose)
+    if track.sighting is not None:
+        moved = float(np.linalg.norm(pose.translation - track.world_from_rover.translation))
+        after = replace(after, driven_m=track.driven_m + moved)
     if sighting is None:
         return after
     if track.sighting is None:
