@@ -252,7 +252,7 @@ def follow_track(
     located = triangulate_target(stop, match.pixel, template, ranges, details, options)
     if located.sighting is None:
         return located
-    return check_losses(track, last, located, located.sighting, stop, stop.distance_m(expected), options)
+    return check_losses(track, last, located, stop, stop.distance_m(expected), options)
 
 
 def triangulate_target(
@@ -287,18 +287,12 @@ def triangulate_target(
 
 
 def check_losses(
-    track: Track,
-    last: Sighting,
-    located: Finding,
-    sighting: Sighting,
-    stop: Stop,
-    expected_m: float,
-    options: VttOptions,
+    track: Track, last: Sighting, located: Finding, stop: Stop, expected_m: float, options: VttOptions
 ) -> Finding:
     """Apply the four loss criteria to a match."""
-    details = located.details
+    details, sighting = located.details, located.sighting
     match, stereo, position = details.match, details.stereo, details.position_world
-    if match is None or stereo is None or position is None or track.seed_world is None:
+    if sighting is None or match is None or stereo is None or position is None or track.seed_world is None:
         raise ValueError("only a target that was matched, ranged and seeded can be judged")
     moved = sighting.world_from_rover.translation - last.world_from_rover.translation
     since_update = sighting.world_from_rover.translation - track.world_from_rover.translation
