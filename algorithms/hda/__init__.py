@@ -1,9 +1,8 @@
 """Hazard detection and avoidance from one moving camera (Johnson, Montgomery & Matthies, sections II and III)."""
 
 from marsyard.algorithms.hda.details import STAGES, Ground, HdaDetails, hda_products
-from marsyard.algorithms.hda.elevation import ElevationMap
 from marsyard.algorithms.hda.estimator import HdaEstimator
-from marsyard.algorithms.hda.hazards import HazardMaps, Safety, hazard_maps, safe_site
+from marsyard.algorithms.hda.hazards import ElevationMap, HazardMaps, Safety, hazard_maps, safe_site
 from marsyard.algorithms.hda.motion import Motion
 from marsyard.algorithms.hda.options import HdaOptions, SurfaceFrame, TrackSeed
 from marsyard.algorithms.hda.structure import Fate, Matches

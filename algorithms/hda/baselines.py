@@ -10,7 +10,7 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.hda.estimator import find_site, matched_structure
@@ -76,12 +76,17 @@ def essential_motion(scene: LandingScene, tracks: Tracks, options: HdaOptions) -
         undistort(one.camera, pixels[tracks.accepted])
         for one, pixels in zip(scene.views, (tracks.first, tracks.second), strict=True)
     )
-    found = [_essential_pose(focal * first, focal * second, focal, *attempt) for attempt in ATTEMPTS]
-    poses = [pose for pose in found if pose is not None]
+    intrinsics = np.diag([focal, focal, 1.0])
+    poses = []
+    for method, inlier_px in ATTEMPTS:
+        pixels = focal * first, focal * second
+        matrix, agreeing = cv2.findEssentialMat(*pixels, intrinsics, method, CONFIDENCE, inlier_px)
+        if matrix is not None and matrix.shape == (3, 3) and np.all(np.isfinite(matrix)):
+            poses.append(cv2.recoverPose(matrix, *pixels, intrinsics, mask=agreeing)[:3])
     if not poses:
         return None
     _, rotation, translation = max(poses, key=lambda pose: pose[0])
-    moved = rigid(Rotation.from_matrix(rotation), translation)
+    moved = rigid(Rotation.from_matrix(rotation), translation.ravel())
     depths = triangulate(first, second, moved)
     depths[~(np.abs(depths) > 0.0)] = np.inf
     ahead = depths[np.isfinite(depths) & (depths > 0.0)]
@@ -89,18 +94,6 @@ def essential_motion(scene: LandingScene, tracks: Tracks, options: HdaOptions) -
         return None
     motion = assess_motion(first, second, focal, moved, depths, True, options)
     return motion.scaled(scene.range_m / float(np.median(ahead)))
-
-
-def _essential_pose(
-    first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"], focal_px: float, method: int, inlier_px: float
-) -> tuple[int, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]] | None:
-    """Number of tracks in front of both cameras, rotation and translation direction; None without a matrix."""
-    intrinsics = np.diag([focal_px, focal_px, 1.0])
-    matrix, agreeing = cv2.findEssentialMat(first, second, intrinsics, method, CONFIDENCE, inlier_px)
-    if matrix is None or matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
-        return None
-    count, rotation, translation, _ = cv2.recoverPose(matrix, first, second, intrinsics, mask=agreeing)
-    return count, rotation, translation.ravel()
 
 
 @dataclass(frozen=True)
@@ -156,29 +149,21 @@ def rectify_views(views: tuple[View, View], second_from_first: RigidTransform) -
     return Rectification(turn, baseline, camera)
 
 
-def rectify_image(
-    one: View, camera_from_rectified: Rotation, camera: Cahv, full_scale: float
-) -> UInt8[np.ndarray, "rows columns"]:
-    """The image of the rectified camera in 8 bits; black outside the field of view."""
-    rays = camera_from_rectified.apply(camera.rays(camera.pixel_grid())[1].reshape(-1, 3))
-    pixels, _ = one.camera.project(rays)
-    pixels = np.nan_to_num(pixels, nan=-10.0).astype(np.float32).reshape(camera.size[1], camera.size[0], 2)
-    grey = np.clip(one.counts * (255.0 / full_scale), 0.0, 255.0).astype(np.float32)
-    return np.asarray(np.rint(cv2.remap(grey, pixels, None, cv2.INTER_LINEAR)).astype(np.uint8))
-
-
 def match_disparities(
     views: tuple[View, View], pair: Rectification, second_from_first: RigidTransform, bounds_m: tuple[float, float]
 ) -> Float[np.ndarray, "rows columns"]:
     """Disparities of the first rectified image by semi-global matching, pixels; NaN without a match."""
     first_from_rectified = pair.rectified_from_first.inv()
     full_scale = max(float(np.quantile(views[0].counts, 0.995)), 1.0)
-    pictures = [
-        rectify_image(one, turn, pair.camera, full_scale)
-        for one, turn in zip(
-            views, (first_from_rectified, second_from_first.rotation * first_from_rectified), strict=True
-        )
-    ]
+    turns = (first_from_rectified, second_from_first.rotation * first_from_rectified)
+    rays = pair.camera.rays(pair.camera.pixel_grid())[1].reshape(-1, 3)
+    pictures = []
+    for one, turn in zip(views, turns, strict=True):
+        # in 8 bits; black outside the field of view
+        pixels = np.nan_to_num(one.camera.project(turn.apply(rays))[0], nan=-10.0).astype(np.float32)
+        grey = np.clip(one.counts * (255.0 / full_scale), 0.0, 255.0).astype(np.float32)
+        grid = pixels.reshape(pair.camera.size[1], pair.camera.size[0], 2)
+        pictures.append(np.rint(cv2.remap(grey, grid, None, cv2.INTER_LINEAR)).astype(np.uint8))
     disparity_px_m = pair.focal_px * pair.baseline_m
     min_disparity = int(disparity_px_m / bounds_m[1])
     count = DISPARITY_STEP * (int(disparity_px_m / bounds_m[0] - min_disparity) // DISPARITY_STEP + 1)
@@ -211,19 +196,11 @@ def semi_global_structure(scene: LandingScene, motion: Motion, options: HdaOptio
     pair = rectify_views(scene.views, motion.second_from_first)
     if pair is not None:
         found = match_disparities(scene.views, pair, motion.second_from_first, bounds)
-        depths = _depths_from_disparities(pair, found, places)
+        rays = pair.rectified_from_first.apply(np.column_stack([places, np.ones(len(places))]))
+        column, row = np.rint(pair.camera.project(rays)[0]).astype(np.int64).T
+        depths = pair.focal_px * pair.baseline_m / found[row, column] / rays[:, 2]
     accepted = (depths > bounds[0]) & (depths < bounds[1])
     fates = np.where(accepted, Fate.ACCEPTED, Fate.OUT_OF_BOUNDS).astype(np.uint8)
     points = points_at_depth(places, depths)
     matched, _ = project_points(second.camera, motion.second_from_first.apply(points))
     return Matches(pixels, starts, ends, matched, np.full(len(pixels), np.nan), depths, fates, points[accepted])
-
-
-def _depths_from_disparities(
-    pair: Rectification, found: Float[np.ndarray, "rows columns"], places: Float[np.ndarray, "n 2"]
-) -> Float[np.ndarray, "n"]:
-    """Depths in the first camera's frame from the disparity of the nearest pixel."""
-    rays = pair.rectified_from_first.apply(np.column_stack([places, np.ones(len(places))]))
-    pixels, _ = pair.camera.project(rays)
-    column, row = np.rint(pixels).astype(np.int64).T
-    return np.asarray(pair.focal_px * pair.baseline_m / found[row, column] / rays[:, 2])

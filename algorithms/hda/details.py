@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.hda.elevation import ElevationMap
-from marsyard.algorithms.hda.hazards import HazardMaps
+from marsyard.algorithms.hda.hazards import ElevationMap, HazardMaps
 from marsyard.algorithms.hda.motion import Motion
 from marsyard.algorithms.hda.structure import Matches
 from marsyard.algorithms.hda.tracking import Tracks
@@ -90,28 +89,21 @@ def hda_products(details: HdaDetails) -> dict[str, Any]:
         products |= {"features": tracks.first, "tracked": tracks.second, "correlations": tracks.correlations}
         products["tracks_accepted"] = tracks.accepted
     if details.tracks is not None and details.motion is not None:
-        products |= _motion_products(details.views, details.tracks, details.motion)
+        motion = details.motion
+        places = undistort(details.views[0].camera, details.tracks.first[details.tracks.accepted])
+        products["rotation"] = motion.second_from_first.rotation.as_matrix()
+        products["translation"] = motion.second_from_first.translation
+        products["sparse_points"] = points_at_depth(places, motion.depths)
+        products |= {"residuals_px": motion.residuals_px, "inliers": motion.inliers}
+        for number, one in enumerate(details.views):
+            rays = one.camera.corner_rays()[1]
+            products[f"frustum_{number}"] = rays / rays[:, 2:]
     if details.matches is not None:
         matches = details.matches
         products |= {"grid": matches.first, "segment_starts": matches.starts, "segment_ends": matches.ends}
         products |= {"matched": matches.second, "matches_accepted": matches.accepted}
     if details.ground is not None:
         products |= _ground_products(details.views[0], details.ground)
-    return products
-
-
-def _motion_products(views: tuple[View, View], tracks: Tracks, motion: Motion) -> dict[str, Any]:
-    places = undistort(views[0].camera, tracks.first[tracks.accepted])
-    products: dict[str, Any] = {
-        "rotation": motion.second_from_first.rotation.as_matrix(),
-        "translation": motion.second_from_first.translation,
-        "sparse_points": points_at_depth(places, motion.depths),
-        "residuals_px": motion.residuals_px,
-        "inliers": motion.inliers,
-    }
-    for number, one in enumerate(views):
-        rays = one.camera.corner_rays()[1]
-        products[f"frustum_{number}"] = rays / rays[:, 2:]
     return products
 
 

@@ -1,4 +1,4 @@
-"""Slope and roughness of an elevation map, the safe landing map and the landing site (section III)."""
+"""The elevation map (section II.D), its slope and roughness, the safe landing map and the site (section III)."""
 
 from __future__ import annotations
 
@@ -9,10 +9,57 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from marsyard.algorithms.hda.elevation import ElevationMap
 from marsyard.algorithms.hda.kernels import elevation as kernels
 from marsyard.algorithms.hda.motion import Motion
 from marsyard.algorithms.hda.options import HdaOptions
+
+#: Minimum sum of bilinear weights of a known cell: a point less than 0.9 of a cell away along an axis.
+MIN_WEIGHT = 0.1
+
+
+@dataclass(frozen=True)
+class ElevationMap:
+    """Elevations on a level grid in the surface frame.
+
+    - elevation_m: z of the middle of each cell; NaN without near points. Rows run along -y, columns along x, as in the
+      image.
+    - corner_m: (x, y) of the middle of the first cell
+    - cell_m: Side of a cell
+    """
+
+    elevation_m: Float[np.ndarray, "rows columns"]
+    corner_m: Float[np.ndarray, "2"]
+    cell_m: float
+
+    def places(self, cells: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """(x, y) of cells (row, column), whole or not."""
+        return np.asarray(self.corner_m + self.cell_m * cells[..., ::-1] * np.array([1.0, -1.0]))
+
+    def cells(self, places: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """(row, column), not whole, of places (x, y)."""
+        offsets = (places - self.corner_m) / self.cell_m * np.array([1.0, -1.0])
+        return np.asarray(offsets[..., ::-1])
+
+
+def elevation_map(points: Float[np.ndarray, "n 3"]) -> ElevationMap | None:
+    """The map of points in the surface frame; None if they cover no area.
+
+    The cell side is sqrt(A / N) with A the area of the horizontal bounding box: about one point per cell. An elevation
+    is the mean of the points about a cell by bilinear weights.
+    """
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    extent = high - low
+    cell = float(np.sqrt(extent[0] * extent[1] / len(points)))
+    if not cell > 1e-6 * float(extent.max()):
+        return None
+    columns, rows = (int(count) for count in np.ceil(extent / cell))
+    corner = 0.5 * (low + high) + 0.5 * cell * np.array([-(columns - 1.0), rows - 1.0])
+    empty = ElevationMap(np.full((rows, columns), np.nan), corner, cell)
+    row, column = empty.cells(points[:, :2]).T
+    sums, weights = kernels.spread(row, column, points[:, 2], (rows, columns))
+    values = np.divide(sums, weights, out=np.full_like(sums, np.nan), where=weights >= MIN_WEIGHT)
+    return ElevationMap(values, corner, cell)
+
 
 #: Least side of the regions that planes are fitted to, cells: a median of squares needs more than a few points.
 MIN_SIDE_CELLS = 3
@@ -94,11 +141,10 @@ def _square_starts(extent: int, side: int) -> Int[np.ndarray, "n"]:
 
 def _interpolation_weights(middles: Float[np.ndarray, "n"], extent: int) -> Float[np.ndarray, "extent n"]:
     """Weights of the middles for every cell along an axis: piecewise linear, extrapolated at the ends."""
+    if len(middles) == 1:
+        return np.ones((extent, 1))
     weights = np.zeros((extent, len(middles)))
     cells = np.arange(extent)
-    if len(middles) == 1:
-        weights[:] = 1.0
-        return weights
     left = np.clip(np.searchsorted(middles, cells, side="right") - 1, 0, len(middles) - 2)
     fraction = (cells - middles[left]) / (middles[left + 1] - middles[left])
     weights[cells, left] = 1.0 - fraction
@@ -221,11 +267,8 @@ def check_footprints(
     lattice[::step, ::step] = True
     # a safe cell off the lattice needs its nearest lattice cell tested, safe or not
     wanted = np.zeros_like(lattice)
-    safe_rows, safe_columns = np.nonzero(safety == Safety.SAFE)
-    nearest = tuple(
-        _nearest_lattice_cell(cells, step, extent)
-        for cells, extent in zip((safe_rows, safe_columns), safety.shape, strict=True)
-    )
+    safe = np.argwhere(safety == Safety.SAFE)
+    nearest = tuple(np.minimum((safe + step // 2) // step * step, (np.array(safety.shape) - 1) // step * step).T)
     wanted[nearest] = True
     rows, columns = np.nonzero(wanted & lattice)
     offsets = disc_cells(0.5 * cells_across)
@@ -237,16 +280,12 @@ def check_footprints(
     max_slope_rad = options.max_slope_rad - options.margin_deviations * options.level_error_rad
     max_roughness_m = roughness_limit_m(resolution, ground.cell_m, options)
     with np.errstate(invalid="ignore"):
-        good = (
-            (np.arctan(slopes / ground.cell_m) <= max_slope_rad)
-            & (roughness <= max_roughness_m)
-            & (max_roughness_m > 0.0)
-        )
+        good = (np.arctan(slopes / ground.cell_m) <= max_slope_rad) & (roughness <= max_roughness_m)
+    good &= max_roughness_m > 0.0
     fails = np.zeros_like(lattice)
     fails[rows[~good], columns[~good]] = True
     result = safety.copy()
-    failed = fails[nearest]
-    result[safe_rows[failed], safe_columns[failed]] = Safety.HAZARD
+    result[tuple(safe[fails[nearest]].T)] = Safety.HAZARD
     return result
 
 
@@ -256,8 +295,3 @@ def disc_cells(radius_cells: float) -> Int[np.ndarray, "n 2"]:
     across = np.arange(-reach, reach + 1)
     cells = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1).reshape(-1, 2)
     return np.asarray(cells[np.hypot(*cells.T) <= radius_cells])
-
-
-def _nearest_lattice_cell(cells: Int[np.ndarray, "n"], step: int, extent: int) -> Int[np.ndarray, "n"]:
-    """Nearest lattice cell along an axis."""
-    return np.asarray(np.minimum((cells + step // 2) // step * step, (extent - 1) // step * step))

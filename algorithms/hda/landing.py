@@ -14,8 +14,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda.details import Ground
-from marsyard.algorithms.hda.elevation import elevation_map
-from marsyard.algorithms.hda.hazards import Resolution, check_footprints, hazard_maps, safe_site
+from marsyard.algorithms.hda.hazards import Resolution, check_footprints, elevation_map, hazard_maps, safe_site
 from marsyard.algorithms.hda.options import HdaOptions, SurfaceFrame
 from marsyard.algorithms.hda.view import LandingScene, View
 

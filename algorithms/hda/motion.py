@@ -83,10 +83,16 @@ def estimate_motion(
     motion is first solved for fixed depths, which avoids the second of the two motions that explain a plane.
     """
     unit = float(np.median(depths))
+    stages = [(scale_px, False, START_TOLERANCE) for scale_px in START_SCALES_PX]
+    stages.append((options.robust_px, True, TOLERANCE))
     candidates = []
     for start in starts:
+        cost, converged = np.inf, False
         motion = kernels.Motion(start.rotation.as_quat(scalar_first=True), start.translation / unit, unit / depths)
-        candidates.append(_minimise_cost(first, second, focal_px, motion, options))
+        for scale_px, with_depths, tolerance in stages:
+            matches = kernels.Matches(first, second, focal_px, scale_px)
+            motion, cost, converged, _ = kernels.solve(matches, motion, with_depths, ITERATIONS, tolerance)
+        candidates.append((motion, cost, converged))
     best, _, converged = min(candidates, key=lambda found: found[1])
     moved = rigid(Rotation.from_quat(best.q, scalar_first=True), unit * best.t)
     with np.errstate(divide="ignore"):
@@ -120,23 +126,6 @@ def assess_motion(
         parallax_px=float(np.median(np.hypot(*(moved - still)[fitting].T))) if np.any(fitting) else 0.0,
         converged=converged,
     )
-
-
-def _minimise_cost(
-    first: Float[np.ndarray, "n 2"],
-    second: Float[np.ndarray, "n 2"],
-    focal_px: float,
-    motion: kernels.Motion,
-    options: HdaOptions,
-) -> tuple[kernels.Motion, float, bool]:
-    """Motion and inverse depths from a start, cost, and whether a minimum was reached."""
-    cost, converged = np.inf, False
-    stages = [(scale_px, False, START_TOLERANCE) for scale_px in START_SCALES_PX]
-    stages.append((options.robust_px, True, TOLERANCE))
-    for scale_px, with_depths, tolerance in stages:
-        matches = kernels.Matches(first, second, focal_px, scale_px)
-        motion, cost, converged, _ = kernels.solve(matches, motion, with_depths, ITERATIONS, tolerance)
-    return motion, cost, converged
 
 
 def _has_plausible_depth(

@@ -129,13 +129,8 @@ class HdaOptions:
 #: Names of options by their minimum.
 _MINIMA = {
     0: (
-        "depth_margin",
-        "hazard_growth",
-        "unknown_growth",
-        "margin_deviations",
-        "match_error_px",
-        "level_error_rad",
-        "seed",
+        *("depth_margin", "hazard_growth", "unknown_growth", "margin_deviations"),
+        *("match_error_px", "level_error_rad", "seed"),
     ),
     1: ("grid_px", "search_half_px", "plane_trials"),
     2: ("template_half_px", "window_half_px", "block_px"),

@@ -76,20 +76,14 @@ def select_features(counts: UInt16[np.ndarray, "rows columns"], options: HdaOpti
     border = template_reach_px(options)
     interest[:border] = interest[-border:] = -np.inf
     interest[:, :border] = interest[:, -border:] = -np.inf
-    blocks = _cut_blocks(interest, options.block_px)
+    side = options.block_px
+    filled = np.pad(interest, [(0, -extent % side) for extent in interest.shape], constant_values=-np.inf)
+    blocks = filled.reshape(filled.shape[0] // side, side, filled.shape[1] // side, side).swapaxes(1, 2)
     best = blocks.reshape(*blocks.shape[:2], -1).argmax(axis=-1)
-    row, column = (i * options.block_px for i in np.indices(best.shape))
-    row, column = row + best // options.block_px, column + best % options.block_px
+    row, column = (i * side for i in np.indices(best.shape))
+    row, column = row + best // side, column + best % side
     found = np.isfinite(blocks.max(axis=(2, 3)))
     return np.column_stack([column[found], row[found]]).astype(np.float64)
-
-
-def _cut_blocks(values: Float[np.ndarray, "rows columns"], side: int) -> Float[np.ndarray, "m n side side"]:
-    """The array cut into squares, padded with minus infinity."""
-    rows, columns = values.shape
-    filled = np.pad(values, ((0, -rows % side), (0, -columns % side)), constant_values=-np.inf)
-    cut = filled.reshape(filled.shape[0] // side, side, filled.shape[1] // side, side)
-    return np.ascontiguousarray(cut.swapaxes(1, 2))
 
 
 #: Limits of an alignment: a height change of a fifth stretches the image by a quarter, and the first steps overshoot.

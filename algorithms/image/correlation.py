@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy import fft, ndimage
 
 from marsyard.algorithms.image.kernels import correlation as kernels
@@ -138,7 +138,11 @@ def coarse_to_fine_peak(
     pyramid = [(template, window)]
     for _ in range(levels):
         pyramid.append((halve(pyramid[-1][0]), halve(pyramid[-1][1])))
-    places, values = _local_maxima(normalized_correlation(*pyramid[-1]), candidates if levels else 1)
+    surface = normalized_correlation(*pyramid[-1])
+    maxima = np.argwhere(surface >= cv2.dilate(surface, np.ones((3, 3), np.uint8)))
+    values = surface[maxima[:, 0], maxima[:, 1]]
+    order = np.argsort(-values, kind="stable")[: candidates if levels else 1]
+    places, values = maxima[order], values[order]
     for small, large in reversed(pyramid[:-1]):
         a, bright = kernels.centred(np.ascontiguousarray(small, dtype=np.float32))
         b = np.ascontiguousarray(large, dtype=np.float32)
@@ -164,13 +168,3 @@ def _check_fit(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ 
 def _flat_energy(template: Float[np.ndarray, "_ _"], largest: float) -> float:
     """The energy of a flat patch, for values up to `largest`."""
     return kernels.FLAT_ENERGY * template.size * largest * largest
-
-
-def _local_maxima(
-    surface: Float[np.ndarray, "rows columns"], count: int
-) -> tuple[Int[np.ndarray, "places 2"], Float[np.ndarray, " places"]]:
-    """Row and column of the highest local maxima (of 3 x 3), at most `count`, in descending order."""
-    maxima = np.argwhere(surface >= cv2.dilate(surface, np.ones((3, 3), np.uint8)))
-    values = surface[maxima[:, 0], maxima[:, 1]]
-    order = np.argsort(-values, kind="stable")[:count]
-    return maxima[order], values[order]

@@ -75,28 +75,20 @@ def refine_shift(
     for _ in range(iterations):
         if np.hypot(*(position - start)) > reach or np.any(position < 3.0) or np.any(position > last):
             return None
-        step = _step(a, shifted_patch(coefficients, position, (template.shape[0], template.shape[1])))
-        if step is None:
+        samples = shifted_patch(coefficients, position, (template.shape[0], template.shape[1]))
+        b = samples[0] - samples[0].mean()
+        energy = float(np.sum(b * b))
+        gain = float(np.sum(a * b)) / energy if energy > 0.0 else 0.0
+        slopes = samples[1:].reshape(2, -1)
+        jacobian = gain * (slopes - slopes.mean(axis=1, keepdims=True))
+        normal = jacobian @ jacobian.T
+        if gain <= 0.0 or np.linalg.det(normal) <= 1e-10 * np.trace(normal) ** 2:
             return None
+        step = np.linalg.solve(normal, jacobian @ (a - gain * b).ravel())
         position = position + step
         if np.hypot(*step) < ALIGNMENT_TOLERANCE_PX:
             break
     return position + near if np.hypot(*(position - start)) <= reach else None
-
-
-def _step(a: Float[np.ndarray, "n m"], samples: Float[np.ndarray, "3 n m"]) -> Float[np.ndarray, "2"] | None:
-    """One Gauss-Newton step of the shift (row, column), with the gain; see `shifted_patch`."""
-    b = samples[0] - samples[0].mean()
-    energy = float(np.sum(b * b))
-    gain = float(np.sum(a * b)) / energy if energy > 0.0 else 0.0
-    if gain <= 0.0:
-        return None
-    slopes = samples[1:].reshape(2, -1)
-    jacobian = gain * (slopes - slopes.mean(axis=1, keepdims=True))
-    normal = jacobian @ jacobian.T
-    if np.linalg.det(normal) <= 1e-10 * np.trace(normal) ** 2:
-        return None
-    return np.asarray(np.linalg.solve(normal, jacobian @ (a - gain * b).ravel()))
 
 
 #: Model of the registration: shift; with a linear map; with a quadratic map of the offsets.

@@ -41,11 +41,6 @@ def stereo_range_error_m(range_m: float, focal_px: float, baseline_m: float, dis
     return range_m * range_m / (focal_px * baseline_m) * disparity_error_px
 
 
-def untracked_approach_error_m(designation_error_m: float, navigation_error_m: float) -> float:
-    """Error at the goal without a tracker, Eq. 3: designation and navigation, root sum square."""
-    return float(np.hypot(designation_error_m, navigation_error_m))
-
-
 def drift_error_m(range_m: float, focal_px: float, drift_px: float) -> float:
     """Error across the line of sight of a point that drifted in the picture, Eq. 4."""
     return range_m / focal_px * drift_px
@@ -92,7 +87,7 @@ class AccuracyRow:
 
 
 def accuracy_row(design: StereoDesign) -> AccuracyRow:
-    """A row of Table I.
+    """A row of Table I; without a tracker (Eq. 3) designation and navigation add as a root sum square.
 
     Each column is rounded before the next is computed, as in the paper: 42.0 cm for the navcam is
     ``sqrt(38.8^2 + 16^2)``; with 38.75 it would be 41.9.
@@ -102,7 +97,7 @@ def accuracy_row(design: StereoDesign) -> AccuracyRow:
     return AccuracyRow(
         name=design.name,
         designation_cm=designation,
-        untracked_cm=round_half_up(untracked_approach_error_m(designation, navigation), 1),
+        untracked_cm=round_half_up(float(np.hypot(designation, navigation)), 1),
         stereo_cm=round_half_up(100.0 * stereo_range_error_m(GOAL_M, design.focal_px, design.baseline_m), 1),
         drift_cm_px=round_half_up(100.0 * drift_error_m(GOAL_M, design.focal_px, 1.0), 2),
     )

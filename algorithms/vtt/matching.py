@@ -168,16 +168,10 @@ def match_by_correlation(
     corner = np.array([peak.row, peak.column]) + np.array(window_corner[::-1], dtype=np.float64) - image.corner[::-1]
     best = Refinement(corner, peak.value, peak.value)
     if options.subpixel:
-        best = refine_match(template, image, corner, _biquadratic_top(template, window, peak), peak, options)
+        offset = np.zeros(2)
+        if not peak.on_border:
+            row, column = peak.row - 1, peak.column - 1
+            about = window[row : row + options.template_px + 2, column : column + options.template_px + 2]
+            offset = biquadratic_offset(normalized_correlation(template, about), Peak(1, 1, peak.value, False))
+        best = refine_match(template, image, corner, offset, peak, options)
     return Match(best.corner[::-1] + half + image.corner, best.score, template)
-
-
-def _biquadratic_top(
-    template: Float[np.ndarray, "n n"], window: Float[np.ndarray, "rows columns"], peak: Peak
-) -> Float[np.ndarray, "2"]:
-    """Offset (row, column) of the fit to the correlation about its peak; zero on the window's border."""
-    if peak.on_border:
-        return np.zeros(2)
-    side = len(template)
-    about = window[peak.row - 1 : peak.row + side + 1, peak.column - 1 : peak.column + side + 1]
-    return biquadratic_offset(normalized_correlation(template, about), Peak(1, 1, peak.value, False))

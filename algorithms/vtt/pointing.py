@@ -32,22 +32,21 @@ def mast_angles(
     stays in both. None without a solution within the mast's limits.
     """
     cameras = (mast.left, mast.right) if pair else (mast.left,)
-    angles = _initial_angles(position_rover, mast.geometry)
+    min_azimuth, max_azimuth = mast.geometry.azimuth_limits_rad
+    min_elevation, max_elevation = mast.geometry.elevation_limits_rad
+    # start along the direction from the elevation axis to the point, without the axis' own rotation
+    x, y, z = position_rover - mast.geometry.base_m - np.array([0.0, 0.0, mast.geometry.elbow_m[2]])
+    angles = np.array([np.arctan2(-y, x), np.arctan2(z, np.hypot(x, y))])
     for _ in range(STEPS):
         offset, slope = _offset(position_rover, mast.geometry, cameras, angles)
         if not np.all(np.isfinite(slope)) or abs(np.linalg.det(slope)) < 1e-9:
             return None
         angles = angles - np.linalg.solve(slope, offset)
         if np.hypot(*offset) < TOLERANCE_PX:
-            azimuth = float(np.arctan2(np.sin(angles[0]), np.cos(angles[0])))
-            return (azimuth, float(angles[1])) if _is_within_limits(azimuth, float(angles[1]), mast.geometry) else None
+            azimuth, elevation = float(np.arctan2(np.sin(angles[0]), np.cos(angles[0]))), float(angles[1])
+            allowed = min_azimuth <= azimuth <= max_azimuth and min_elevation <= elevation <= max_elevation
+            return (azimuth, elevation) if allowed else None
     return None
-
-
-def _initial_angles(position_rover: Float[np.ndarray, "3"], mast: MastGeometry) -> Float[np.ndarray, "2"]:
-    """Direction from the elevation axis to the point, neglecting the axis' own rotation."""
-    x, y, z = position_rover - mast.base_m - np.array([0.0, 0.0, mast.elbow_m[2]])
-    return np.array([np.arctan2(-y, x), np.arctan2(z, np.hypot(x, y))])
 
 
 def _offset(
@@ -71,11 +70,6 @@ def _offset(
     offsets = [camera.project(point)[0] - middle(camera) for camera in cameras]
     slopes = [camera.projection_jacobian(point) @ motion for camera in cameras]
     return np.mean(offsets, axis=0), np.mean(slopes, axis=0)
-
-
-def _is_within_limits(azimuth_rad: float, elevation_rad: float, mast: MastGeometry) -> bool:
-    (min_azimuth, max_azimuth), (min_elevation, max_elevation) = mast.azimuth_limits_rad, mast.elevation_limits_rad
-    return min_azimuth <= azimuth_rad <= max_azimuth and min_elevation <= elevation_rad <= max_elevation
 
 
 def middle(camera: CameraModel) -> Float[np.ndarray, "2"]:
@@ -119,7 +113,7 @@ def aim_at_pixel(target: PixelTarget, mast: MastCalibration, options: VttOptions
     """The mast aim at the designation; the right image part covers all ranges allowed."""
     margin = 0.5 * options.search_px + SURROUND
     box = box_around(target.pixel[None], margin, mast.left)
-    curve = epipolar_pixels(mast.left, mast.right, target.pixel, options.seed_range_m)
+    curve = epipolar_pixels(mast.left.rays(target.pixel), mast.left, mast.right, options.seed_range_m)
     seen = curve[mast.right.in_frame(curve)]
     if box is None or len(seen) == 0:
         return None

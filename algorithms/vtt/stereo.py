@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak, normalized_correlation
 from marsyard.algorithms.vtt.matching import Refinement, refine_match
@@ -32,21 +32,14 @@ class StereoMatch:
     band_corner: tuple[int, int]
 
 
-def epipolar_pixels(
-    left: CameraModel, right: CameraModel, pixel: Float[np.ndarray, "2"], ranges_m: tuple[float, float]
-) -> Float[np.ndarray, "n 2"]:
-    """Right pixels of the points along the left pixel's line of sight, from far to near; both cameras in one frame."""
-    return pixels_along(left.rays(pixel), left, right, ranges_m)
-
-
 #: Origin and unit direction of a line of sight.
 Sight = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
 
 
-def pixels_along(
+def epipolar_pixels(
     sight: Sight, left: CameraModel, right: CameraModel, ranges_m: tuple[float, float]
 ) -> Float[np.ndarray, "n 2"]:
-    """As `epipolar_pixels`, from the left pixel's line of sight.
+    """Right pixels of the points along a left pixel's line of sight, from far to near; both cameras in one frame.
 
     Points are about half a pixel of disparity apart; those invisible to the right camera are omitted. Lens distortion
     bends the curve.
@@ -91,7 +84,10 @@ def point_stereo(
         return None
     band = image.counts[near[1] : far[1], near[0] : far[0]].astype(np.float64)
     surface = normalized_correlation(template, band)
-    peak = highest_peak(np.where(_is_off_curve(local - near - half, surface.shape, tolerance), -1.0, surface))
+    # only positions within the tolerance above or below the curve
+    columns_px, rows_px = (local[np.argsort(local[:, 0])] - near - half).T
+    along = np.interp(np.arange(surface.shape[1]), columns_px, rows_px)
+    peak = highest_peak(np.where(np.abs(np.arange(surface.shape[0])[:, None] - along) > tolerance, -1.0, surface))
     corner = near[::-1] + np.array([peak.row, peak.column], dtype=np.float64)
     best = Refinement(corner, peak.value, peak.value)
     if options.subpixel:
@@ -102,13 +98,6 @@ def point_stereo(
         band=band,
         band_corner=(int(near[0]) + image.corner[0], int(near[1]) + image.corner[1]),
     )
-
-
-def _is_off_curve(curve: Float[np.ndarray, "n 2"], shape: tuple[int, ...], tolerance: float) -> Bool[np.ndarray, "_ _"]:
-    """Whether positions of the surface are further than the tolerance above or below the curve."""
-    order = np.argsort(curve[:, 0])
-    along = np.interp(np.arange(shape[1]), curve[order, 0], curve[order, 1])
-    return np.asarray(np.abs(np.arange(shape[0])[:, None] - along) > tolerance)
 
 
 def triangulated(

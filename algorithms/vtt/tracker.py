@@ -27,7 +27,7 @@ from marsyard.algorithms.vtt.matching import (
 )
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position
-from marsyard.algorithms.vtt.stereo import StereoMatch, nearest_point, pixels_along, point_stereo, search_ranges
+from marsyard.algorithms.vtt.stereo import StereoMatch, epipolar_pixels, nearest_point, point_stereo, search_ranges
 from marsyard.algorithms.vtt.target import (
     designated_position_world,
     lever_pixels,
@@ -222,9 +222,8 @@ def seed_track(track: Track, measurements: RoverMeasurements, options: VttOption
     window, window_corner = search_window(measurements.left, pixel, options.search_px)
     details = VttDetails(True, pixel, window, window_corner, match=Match(pixel, 1.0, template), template=template)
     located = triangulate_target(stop, pixel, template, ranges, details, options)
-    if located.sighting is None or located.details.stereo is None:
-        return located
-    if located.details.stereo.score < options.min_stereo_score:
+    stereo = located.details.stereo
+    if located.sighting is not None and stereo is not None and stereo.score < options.min_stereo_score:
         return Finding((TargetLoss.LOW_STEREO_SCORE,), located.details)
     return located
 
@@ -240,8 +239,7 @@ def follow_track(
     if seen is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(False, None))
     predicted = seen[0]
-    scale = magnification(last.position_head, last.camera.c, expected, stop.left.c)
-    change = Change(scale, roll_angle(seen))
+    change = Change(magnification(last.position_head, last.camera.c, expected, stop.left.c), roll_angle(seen))
     window, window_corner = search_window(measurements.left, predicted, options.search_px)
     details = VttDetails(False, predicted, window, window_corner, change)
     applied = Change(change.magnification if options.scale else 1.0, change.roll_rad if options.roll else 0.0)
@@ -254,7 +252,7 @@ def follow_track(
     located = triangulate_target(stop, match.pixel, template, ranges, details, options)
     if located.sighting is None:
         return located
-    return check_losses(track, last, located, located.sighting, stop, stop.distance_m(expected), options)
+    return check_losses(track, last, located, stop, stop.distance_m(expected), options)
 
 
 def triangulate_target(
@@ -267,7 +265,7 @@ def triangulate_target(
 ) -> Finding:
     """Triangulate the target from its left pixel by point stereo over these ranges."""
     sight = stop.left.rays(pixel)
-    curve = pixels_along(sight, stop.left, stop.right, ranges_m)
+    curve = epipolar_pixels(sight, stop.left, stop.right, ranges_m)
     stereo = point_stereo(template, stop.measurements.right, curve, options)
     if stereo is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), details)
@@ -289,16 +287,13 @@ def triangulate_target(
 
 
 def check_losses(
-    track: Track,
-    last: Sighting,
-    located: Finding,
-    sighting: Sighting,
-    stop: Stop,
-    expected_m: float,
-    options: VttOptions,
+    track: Track, last: Sighting, located: Finding, stop: Stop, expected_m: float, options: VttOptions
 ) -> Finding:
     """Apply the four loss criteria to a match."""
-    details = located.details
+    details, sighting = located.details, located.sighting
+    match, stereo, position = details.match, details.stereo, details.position_world
+    if sighting is None or match is None or stereo is None or position is None or track.seed_world is None:
+        raise ValueError("only a target that was matched, ranged and seeded can be judged")
     moved = sighting.world_from_rover.translation - last.world_from_rover.translation
     since_update = sighting.world_from_rover.translation - track.world_from_rover.translation
     journey = Journey(
@@ -308,12 +303,18 @@ def check_losses(
         step_m=float(np.linalg.norm(moved)),
         driven_m=track.driven_m + float(np.linalg.norm(since_update)),
     )
-    evidence = _evidence(track, details, expected_m)
+    evidence = Evidence(
+        match_score=match.score,
+        stereo_score=stereo.score,
+        distance_correction_m=details.distance_m - expected_m,
+        position_correction_m=float(np.linalg.norm(position - track.seed_world)),
+    )
     allowed: Tolerances = tolerances(journey, stop.left, stop.right, options)
+    turned = sighting.azimuth_world_rad - last.azimuth_world_rad
     details = replace(
         details,
         step_m=journey.step_m,
-        azimuth_change_rad=_azimuth_change_rad(last, sighting),
+        azimuth_change_rad=float(np.arctan2(np.sin(turned), np.cos(turned))),
         evidence=evidence,
         allowed=allowed,
     )
@@ -321,36 +322,14 @@ def check_losses(
     return Finding(failed, details) if failed else replace(located, details=details)
 
 
-def _evidence(track: Track, details: VttDetails, expected_m: float) -> Evidence:
-    match, stereo, position = details.match, details.stereo, details.position_world
-    if match is None or stereo is None or position is None or track.seed_world is None:
-        raise ValueError("only a target that was matched, ranged and seeded can be judged")
-    return Evidence(
-        match_score=match.score,
-        stereo_score=stereo.score,
-        distance_correction_m=details.distance_m - expected_m,
-        position_correction_m=float(np.linalg.norm(position - track.seed_world)),
-    )
-
-
-def _azimuth_change_rad(last: Sighting, now: Sighting) -> float:
-    """Change of the line of sight's azimuth in the world, clockwise from above."""
-    turned = now.azimuth_world_rad - last.azimuth_world_rad
-    return float(np.arctan2(np.sin(turned), np.cos(turned)))
-
-
 def advance_track(track: Track, finding: Finding, measurements: RoverMeasurements, options: VttOptions) -> Track:
     """The track after an update; a new match replaces the template."""
     pose, sighting = measurements.world_from_rover, finding.sighting
     state, lost_updates = next_state(track.state, track.lost_updates, sighting is not None, options.max_lost_updates)
-    moved = float(np.linalg.norm(pose.translation - track.world_from_rover.translation))
-    after = replace(
-        track,
-        state=state,
-        lost_updates=lost_updates,
-        world_from_rover=pose,
-        driven_m=track.driven_m + moved if track.sighting is not None else 0.0,
-    )
+    after = replace(track, state=state, lost_updates=lost_updates, world_from_rover=pose)
+    if track.sighting is not None:
+        moved = float(np.linalg.norm(pose.translation - track.world_from_rover.translation))
+        after = replace(after, driven_m=track.driven_m + moved)
     if sighting is None:
         return after
     if track.sighting is None:

@@ -230,7 +230,7 @@ def test_no_roll_is_given_for_what_the_camera_cannot_see() -> None:
 @pytest.mark.parametrize("mast", [navcam(), pancam()])
 def test_the_epipolar_curve_goes_through_the_points_of_the_ray(mast: MastCalibration) -> None:
     pixel = np.array([700.3, 250.8])
-    curve = epipolar_pixels(mast.left, mast.right, pixel, (2.0, 20.0))
+    curve = epipolar_pixels(mast.left.rays(pixel), mast.left, mast.right, (2.0, 20.0))
     _, direction = mast.left.rays(pixel)
     for range_m in (2.0, 3.3, 7.0, 20.0):
         u, v = mast.right.project(mast.left.c + range_m * direction)[0]
@@ -268,6 +268,6 @@ def test_lines_of_sight_that_do_not_meet_give_no_range() -> None:
 
 def test_points_of_the_epipolar_curve_are_half_a_pixel_apart() -> None:
     left, right = navcam().left, navcam().right
-    pixels = epipolar_pixels(left, right, np.array([500.0, 500.0]), (4.0, 8.0))
+    pixels = epipolar_pixels(left.rays(np.array([500.0, 500.0])), left, right, (4.0, 8.0))
     steps = np.linalg.norm(np.diff(pixels, axis=0), axis=1)
     assert np.all((steps > 0.25) & (steps < 0.6))
