@@ -86,10 +86,6 @@ def answer_time_s(answer: object, taken_s: float) -> float:
     return details.time_s if isinstance(details, ProgramDetails) else taken_s
 
 
-#: Scored result of one algorithm.
-Judged = CaseResult
-
-
 def case_result(
     algorithms: Sequence[str], judge: Callable[[str], CaseResult], conditions: Mapping[str, Scalar]
 ) -> CaseResult:

@@ -25,8 +25,8 @@ from marsyard.scenarios.user_files import (
     cells_by_column,
     check_together,
     finite_number,
+    format_problems,
     header_problems,
-    listed,
     read_lines,
 )
 from marsyard.sim.files import check_regular
@@ -193,7 +193,7 @@ def _read(file: Path, form: OfflineForm[Any], _time: int, _size: int) -> Mapping
     hint = f"allowed: {', '.join(form.columns)}; units are those of the names"
     problems = list(header_problems(header, ("case", *form.required), form.columns, hint))
     if problems:
-        raise ValueError(listed(file, problems))
+        raise ValueError(format_problems(file, problems))
     answers: dict[int, Any] = {}
     first_lines: dict[int, int] = {}
     for line, cells in lines:
@@ -206,7 +206,7 @@ def _read(file: Path, form: OfflineForm[Any], _time: int, _size: int) -> Mapping
             continue
         answers[case], first_lines[case] = answer, line
     if problems:
-        raise ValueError(listed(file, problems))
+        raise ValueError(format_problems(file, problems))
     return answers
 
 

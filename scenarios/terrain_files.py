@@ -1,4 +1,4 @@
-"""Validate terrain files of a user by their headers before `marsyard.sim.terrain` reads them.
+"""Validate terrain files of a user by their headers before `marsyard.sim.terrain` reads them, and use them as sites.
 
 A GeoTIFF must have a projection in metres (or another length, by which it is scaled) that preserves lengths, square
 cells with grid north up, a no-data value if it has gaps, and heights in metres. An .npz archive is checked likewise.
@@ -17,8 +17,8 @@ import numpy as np
 from pydantic import AfterValidator
 
 from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, npz_headers
-from marsyard.sim.terrain import TerrainParameters
-from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, check_holes, read_rasters
+from marsyard.sim.terrain import Site, TerrainParameters, site
+from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, check_holes, choose_grid, read_rasters
 
 #: Maximum posts of a DTM and pixels of a picture along a side: limits of the largest terrain and of memory.
 _MAX_POSTS, _MAX_PIXELS = 5461, 8192
@@ -263,3 +263,44 @@ def map_scale(file: Any) -> MapScale | None:
         true_north = np.cross(normal, true_east)
         azimuth_deg = float(np.degrees(np.arctan2(north @ true_east, north @ true_north)))
     return MapScale(1.0 / float(ground[1]), 1.0 / float(ground[0]), azimuth_deg)
+
+
+#: Suffixes of terrain models.
+ENDINGS = (".npz", ".tif", ".tiff")
+#: Preset of the light, air, scattering and fine texture of imported ground.
+LIGHT_OF = "gusev"
+#: Fraction of posts without height up to which a terrain model is used, unless stated.
+MAX_HOLE_FRACTION = float(RealTerrain.model_fields["max_hole_fraction"].default)
+
+
+def is_terrain_file(name: str) -> bool:
+    """Return whether a name is that of a terrain model's file, not of a site."""
+    return Path(name).suffix.lower() in ENDINGS
+
+
+def site_or_file(name: str, max_hole_fraction: float = MAX_HOLE_FRACTION) -> Site:
+    """Return a preset by name, or the site of a terrain model's file. Raises ValueError."""
+    return imported_site(Path(name), max_hole_fraction) if is_terrain_file(name) else site(name)
+
+
+def imported_site(path: Path, max_hole_fraction: float = MAX_HOLE_FRACTION) -> Site:
+    """Return a terrain model's file as a site: one terrain at both scales, without rocks or craters.
+
+    Raises TerrainFileError.
+    """
+    source = RealTerrain(dtm=path, max_hole_fraction=max_hole_fraction)
+    check_source(source)
+    return _imported(source, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=4)
+def _imported(source: RealTerrain, _changed_ns: int) -> Site:
+    samples, spacing_m = choose_grid(source)
+    terrain = TerrainParameters(samples=samples, spacing_m=spacing_m, craters_per_km2=0.0, source=source)
+    changes = {
+        "name": source.dtm.name,
+        "description": f"terrain model {source.dtm} in the light of {LIGHT_OF}",
+        "descent": terrain,
+        "ground": terrain,
+    }
+    return site(LIGHT_OF).model_copy(update=changes)

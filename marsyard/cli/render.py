@@ -53,7 +53,7 @@ class Shot:
     @classmethod
     def usual(cls, site: str, camera: str, **settings: Any) -> Shot:
         """A picture from the camera's usual pose with these settings. Raises ValueError for an invalid one."""
-        from marsyard.scenarios.imported_site import MAX_HOLE_FRACTION, is_terrain_file, site_or_file
+        from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, is_terrain_file, site_or_file
         from marsyard.scenarios.views import STANCES
         from marsyard.sim.sensor import PRESETS
         from marsyard.sim.terrain import sites
@@ -85,7 +85,7 @@ class Shot:
     @property
     def place(self) -> Site:
         """The site, or that of the terrain model's file. Raises ValueError where it cannot be used."""
-        from marsyard.scenarios.imported_site import site_or_file
+        from marsyard.scenarios.terrain_files import site_or_file
 
         return site_or_file(self.site, self.max_hole_fraction)
 

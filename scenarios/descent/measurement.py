@@ -9,11 +9,10 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import Rotation
 
+from marsyard.scenarios.descent.exposure import World, calibrated_camera
 from marsyard.scenarios.descent.faults import faulty_altitudes, faulty_attitudes
 from marsyard.scenarios.descent.flight import MARGIN_S, DescentFlight, gravity_m_s2
-from marsyard.scenarios.descent.optics import calibrated_camera
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.instruments import (
     CustomAltimeter,

@@ -14,11 +14,10 @@ from marsyard.algorithms.dimes import DimesDetails
 from marsyard.scenarios.algorithm_run import case_result
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import picture_columns
-from marsyard.scenarios.descent.exposure import take_exposures
+from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
 from marsyard.scenarios.descent.faults import faulty_terrain
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, picture_states, true_velocity
 from marsyard.scenarios.descent.measurement import Instruments, measure
-from marsyard.scenarios.descent.optics import camera_optics
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.score import (
     Pictures,
@@ -30,12 +29,10 @@ from marsyard.scenarios.descent.score import (
     propagate_to_firing,
     touchdown,
 )
-from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.estimators import VELOCITY
-from marsyard.scenarios.exposure import Sample, pixel_sample
+from marsyard.scenarios.exposure import Optics, Sample, pixel_sample
 from marsyard.scenarios.faults import deliver, faulty_detector
 from marsyard.scenarios.interface import CaseResult, Scalar
-from marsyard.scenarios.optics import Optics
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredDescent, scored
 from marsyard.scenarios.velocity import (
@@ -71,11 +68,11 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains."""
-        return tuple(range(self.checked(parameters).place.bank))
+        return tuple(range(self.check_parameters(parameters).place.bank))
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """The terrain below the descent; none with dunes of a fault, which are not in the bank."""
-        p = self.checked(parameters)
+        p = self.check_parameters(parameters)
         return (p.place.terrain,) if faulty_terrain(p.faults, p.terrain) == p.terrain else ()
 
     def input_terrain(self, p: DescentScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
@@ -84,7 +81,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
         """Pictures of a case without delivery faults, with the truth of their pixels."""
-        p = self.checked(parameters)
+        p = self.check_parameters(parameters)
         world = World.of(p)
         states = picture_states(p, create_flight(p, world.surface, streams))
         optics = camera_optics(p.camera)
@@ -105,7 +102,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Simulate one descent and score all algorithms."""
-        p = self.checked(parameters)
+        p = self.check_parameters(parameters)
         descent = Descent.simulate(p, streams)
         shared = descent.conditions()
         return case_result(p.algorithms, lambda algorithm: _score_algorithm(descent, algorithm, shared), shared)

@@ -14,10 +14,10 @@ from marsyard.algorithms.dimes.binning import View, altitudes_at_images, bin_fac
 from marsyard.algorithms.dimes.overlap import search_geometry, template_candidates
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, sun_columns
+from marsyard.scenarios.descent.exposure import World
 from marsyard.scenarios.descent.flight import mean_velocities
 from marsyard.scenarios.descent.measurement import Instruments
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, LandingParameters
-from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.interface import Scalar
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State

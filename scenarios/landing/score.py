@@ -17,8 +17,7 @@ from marsyard.scenarios.landing.faults import stuck_range_m
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.helicopter import horizontal_distance_m, land
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.pictures import Pair
-from marsyard.scenarios.landing.truth import GroundTruth, RenderedFlight
+from marsyard.scenarios.landing.pictures import GroundTruth, Pair, RenderedFlight
 from marsyard.sim.dynamics.rotorcraft import GroundPatch
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor import height_above_ground

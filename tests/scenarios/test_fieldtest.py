@@ -13,6 +13,7 @@ import pytest
 
 from marsyard import scenarios
 from marsyard.algorithms.interface import VelocityOutcome
+from marsyard.scenarios.exposure import camera_optics
 from marsyard.scenarios.fieldtest.ephemeris import sun_direction
 from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters
 from marsyard.scenarios.fieldtest.run import ElevationModel, Run, RunKey, field_camera, simulate_run
@@ -25,7 +26,6 @@ from marsyard.scenarios.fieldtest.scenario import (
     sun_at,
 )
 from marsyard.scenarios.fieldtest.triples import Category
-from marsyard.scenarios.optics import camera_optics
 from marsyard.scenarios.parts import ScoredFlight
 from marsyard.scenarios.views import Eye, site_scene
 from marsyard.sim.streams import Streams

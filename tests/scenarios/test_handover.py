@@ -24,7 +24,7 @@ from marsyard.reports.verdicts import Status, judge_campaign
 from marsyard.scenarios.conformance.inputs import descent
 from marsyard.scenarios.handover import Handover
 from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by
-from marsyard.scenarios.registry import scenario
+from marsyard.scenarios.systems import scenario
 from marsyard.scenarios.velocity import run_estimator
 from marsyard.sim.streams import Streams
 from tests.scenarios import spies

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from marsyard.scenarios.descent.optics import calibrated_camera, camera_optics
+from marsyard.scenarios.descent.exposure import World, calibrated_camera, camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters, DescentScenarioParameters, binned_size_for
-from marsyard.scenarios.descent.world import World
 from marsyard.sim.sensor import CustomCamera
 from marsyard.sim.terrain import site
 

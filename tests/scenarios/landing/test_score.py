@@ -13,9 +13,9 @@ from marsyard.campaigns.running.engine import check_metrics
 from marsyard.scenarios.conformance.parts import motion
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.pictures import GroundTruth
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
 from marsyard.scenarios.landing.score import landing_row, site_populations, site_row
-from marsyard.scenarios.landing.truth import GroundTruth
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.streams import Streams
