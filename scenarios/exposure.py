@@ -110,7 +110,6 @@ class ProvidesSamples(Protocol):
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
         """Yield the pictures of one case that `run` gives to its algorithms."""
-        ...
 
 
 def render_state(

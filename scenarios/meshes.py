@@ -140,7 +140,17 @@ def _read(path: str, _changed_ns: int) -> Mesh:
     formats = sorted(set(trimesh.available_formats()) - _ARCHIVES)
     if kind not in formats:
         raise MeshFileError(f"{path}: '.{kind}' is no format of meshes; allowed: {', '.join(formats)}")
-    _check_expanded(path, kind)
+    # a small file may expand to a mesh that is too large
+    try:
+        size = 0
+        if kind in _ZIPPED:
+            size = expanded_bytes(path)
+        elif kind in ("glb", "gltf"):
+            size = _accessor_bytes(Path(path).read_bytes(), kind)
+    except (*ARCHIVE_ERRORS, struct.error, AttributeError, RecursionError) as fault:
+        raise MeshFileError(f"{path}: cannot be read as a mesh ({fault})") from fault
+    if size > MAX_BYTES:
+        raise MeshFileError(f"{path}: expands to {size} bytes; allowed: up to {MAX_BYTES >> 20} MiB")
     try:
         loaded = trimesh.load(path, force="mesh", process=False)
         digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
@@ -161,21 +171,6 @@ def _read(path: str, _changed_ns: int) -> Mesh:
     vertices, numbers = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
     merged = trimesh.Trimesh(vertices, numbers.reshape(-1, 3), process=False)
     return Mesh(digest, triangles, np.array(merged.vertex_normals, dtype=np.float64)[np.array(merged.faces)])
-
-
-def _check_expanded(path: str, kind: str) -> None:
-    """Raise MeshFileError where a small file expands to a mesh that is too large, before expanding it."""
-    try:
-        if kind in _ZIPPED:
-            size = expanded_bytes(path)
-        elif kind in ("glb", "gltf"):
-            size = _accessor_bytes(Path(path).read_bytes(), kind)
-        else:
-            return
-    except (*ARCHIVE_ERRORS, struct.error, AttributeError, RecursionError) as fault:
-        raise MeshFileError(f"{path}: cannot be read as a mesh ({fault})") from fault
-    if size > MAX_BYTES:
-        raise MeshFileError(f"{path}: expands to {size} bytes; allowed: up to {MAX_BYTES >> 20} MiB")
 
 
 def _accessor_bytes(contents: bytes, kind: str) -> int:

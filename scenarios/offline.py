@@ -101,10 +101,7 @@ def _with_site(estimate: SiteEstimate, measurements: LandingMeasurements) -> Sit
 
 VELOCITY_FORM: OfflineForm[VelocityEstimate] = OfflineForm(
     required=("velocity_east_m_s", "velocity_north_m_s"),
-    optional=(
-        ("covariance_east_m2_s2", "covariance_east_north_m2_s2", "covariance_north_m2_s2"),
-        ("start_s", "end_s"),
-    ),
+    optional=(("covariance_east_m2_s2", "covariance_east_north_m2_s2", "covariance_north_m2_s2"), ("start_s", "end_s")),
     outcomes=VelocityOutcome,
     answer=_velocity,
     nothing=lambda _: VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None),
@@ -128,13 +125,6 @@ def is_offline(spec: str) -> bool:
 def answers_file(spec: str) -> Path | None:
     """Return the path of a table of answers; None for other names."""
     return Path(spec.removeprefix(ANSWERS)) if spec.startswith(ANSWERS) else None
-
-
-def check_offline(spec: str, form: OfflineForm[Any]) -> None:
-    """Raise ValueError where a table cannot be read; the message names lines and columns."""
-    file = answers_file(spec)
-    if file is not None:
-        read_answers(file, form)
 
 
 def create_offline(spec: str, form: OfflineForm[Any], case: int) -> Any:

@@ -25,7 +25,6 @@ class NamesFiles(Protocol):
 
     def input_files(self) -> Sequence[str]:
         """Return the paths of the files, as stated."""
-        ...
 
 
 def input_files(parameters: Any) -> tuple[str, ...]:

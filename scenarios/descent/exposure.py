@@ -172,12 +172,8 @@ class HeatShield:
     @classmethod
     def draw(cls, first: State, angle_rad: float, rng: np.random.Generator) -> HeatShield:
         """Draw a shield below the lander at its first picture; `angle_rad` is its angular diameter face on."""
-        azimuth, off_nadir, drift_azimuth, axis_azimuth = rng.uniform(0.0, 1.0, 4) * [
-            2 * np.pi,
-            OFF_NADIR_RAD,
-            2 * np.pi,
-            2 * np.pi,
-        ]
+        circle = 2 * np.pi
+        azimuth, off_nadir, drift_azimuth, axis_azimuth = rng.uniform(size=4) * [circle, OFF_NADIR_RAD, circle, circle]
         below = np.array([np.sin(azimuth) * np.sin(off_nadir), np.cos(azimuth) * np.sin(off_nadir), -np.cos(off_nadir)])
         drift = np.array([DRIFT_M_S * np.sin(drift_azimuth), DRIFT_M_S * np.cos(drift_azimuth), -FASTER_M_S])
         axis = np.array([np.cos(axis_azimuth), np.sin(axis_azimuth), 0.0])

@@ -171,11 +171,7 @@ def landing_row(p: LandingParameters, landed: Touchdown, measured_s: float, avai
 
 
 def feasible_overlap_row(
-    states: Sequence[State],
-    world: World,
-    camera: CameraModel,
-    calibration: DetectorCalibration,
-    options: DimesOptions,
+    states: Sequence[State], world: World, camera: CameraModel, calibration: DetectorCalibration, options: DimesOptions
 ) -> dict[str, Scalar]:
     """Columns of the feasible overlap of three pictures: DIMES' grid points at which template and search area fit.
 
