@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -231,17 +230,15 @@ class Stance:
 
 #: Typical stances of the cameras of `marsyard.sim.sensor.PRESETS`: first picture of a descent, masts of 1.5 m, MER's
 #: hazcams 0.53 m above the ground (Maki et al. 2003), a helicopter at 10 m.
-STANCES: Mapping[str, Stance] = MappingProxyType(
-    {
-        "mer-descent-flown": Stance("descent", 2000.0, -90.0),
-        "mer-descent-field": Stance("descent", 2000.0, -90.0),
-        "mer-navcam": Stance("ground", 1.5, -18.0),
-        "mer-hazcam": Stance("ground", 0.53, -40.0),
-        "research-navcam": Stance("ground", 1.5, -13.0),
-        "research-pancam": Stance("ground", 1.5, -5.0),
-        "xc-55": Stance("ground", 10.0, -90.0),
-    }
-)
+STANCES: Mapping[str, Stance] = {
+    "mer-descent-flown": Stance("descent", 2000.0, -90.0),
+    "mer-descent-field": Stance("descent", 2000.0, -90.0),
+    "mer-navcam": Stance("ground", 1.5, -18.0),
+    "mer-hazcam": Stance("ground", 0.53, -40.0),
+    "research-navcam": Stance("ground", 1.5, -13.0),
+    "research-pancam": Stance("ground", 1.5, -5.0),
+    "xc-55": Stance("ground", 10.0, -90.0),
+}
 
 
 def camera_pose(

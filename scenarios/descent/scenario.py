@@ -25,7 +25,6 @@ from marsyard.scenarios.descent.score import (
     feasible_overlap_row,
     instrument_conditions,
     instrument_errors,
-    landing_row,
     propagate_to_firing,
     touchdown,
 )
@@ -186,7 +185,11 @@ def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scal
         **velocity_row("velocity", velocity, true),
         **consistency_row(estimate, true),
         **velocity_row("firing_velocity", propagated, at_firing),
-        **landing_row(p.landing, landed, float(attempt.row["estimation_time_s"]), available_s),
+        "touchdown_speed_with_m_s": float(np.hypot(*landed.with_answer)),
+        "touchdown_speed_without_m_s": float(np.hypot(*landed.without_answer)),
+        "answer_punctual": landed.punctual,
+        # the measured computation time, scaled to the flight computer
+        "answer_in_time": p.landing.processor_factor * float(attempt.row["estimation_time_s"]) <= available_s,
         **stream_row(estimate, descent.truth),
         **attempt.row,
     }

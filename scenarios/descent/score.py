@@ -160,16 +160,6 @@ def instrument_errors(world: World, states: Sequence[State], measurements: Desce
     return row
 
 
-def landing_row(p: LandingParameters, landed: Touchdown, measured_s: float, available_s: float) -> dict[str, Scalar]:
-    """Columns of the landing; `answer_in_time` scales the measured computation time to the flight computer."""
-    return {
-        "touchdown_speed_with_m_s": float(np.hypot(*landed.with_answer)),
-        "touchdown_speed_without_m_s": float(np.hypot(*landed.without_answer)),
-        "answer_punctual": landed.punctual,
-        "answer_in_time": p.processor_factor * measured_s <= available_s,
-    }
-
-
 def feasible_overlap_row(
     states: Sequence[State], world: World, camera: CameraModel, calibration: DetectorCalibration, options: DimesOptions
 ) -> dict[str, Scalar]:

@@ -11,8 +11,8 @@ from scipy.ndimage import distance_transform_edt
 
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.exposure import Optics, camera_optics, render_state, sunlight_ratio
-from marsyard.scenarios.faults import faulty_detector
-from marsyard.scenarios.landing.faults import deliver_pictures, faulty_ranges, faulty_sun_deg
+from marsyard.scenarios.faults import deliver, faulty_detector
+from marsyard.scenarios.landing.faults import faulty_ranges, faulty_sun_deg
 from marsyard.scenarios.landing.flight import Flight, calibrated_camera
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
@@ -94,10 +94,11 @@ def take_pictures(p: LandingScenarioParameters, world: World, flight: Flight, op
     light = [frame.radiance * np.float32(world.brightness) for frame in frames]
     detector = auto_expose(detector, light[0], p.exposure, streams.generator("test pictures")).detector
     counts = [detector.expose(one, noise, motion) for one, motion in zip(light, motions, strict=True)]
+    delivered = deliver(counts, 2 * p.faults.repeated_picture, p.faults.black_picture, p.faults.lost_rows)
     camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
     first, second = (
         DetectorImage(one, state.time_s, camera, detector.calibration)
-        for one, state in zip(deliver_pictures(p.faults, counts), flight.states, strict=True)
+        for one, state in zip(delivered, flight.states, strict=True)
     )
     return Pair((first, second), (frames[0], frames[1]))
 

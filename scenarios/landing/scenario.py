@@ -29,7 +29,6 @@ from marsyard.scenarios.landing.score import (
 )
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredLanding, scored
-from marsyard.sim.frames import rigid
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
@@ -101,11 +100,10 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
                 **attempt.row,
             }
             if attempt.answer is not None:
-                first, second = (rigid(state.attitude, state.position_m) for state in flight.states)
                 answered = ScoredLanding(
                     measurements=measurements,
                     answer=attempt.answer,
-                    true_poses=(first, second),
+                    true_poses=(flight.states[0].world_from_body, flight.states[1].world_from_body),
                     states=flight.states,
                     ground=truth,
                 )
