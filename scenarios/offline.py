@@ -73,15 +73,13 @@ class OfflineForm(Generic[Answer]):
 
 
 def _velocity(outcome: Enum, numbers: Mapping[str, float]) -> VelocityEstimate:
-    east, north = (numbers.get(name) for name in VELOCITY_FORM.required)
-    first, mixed, second, start, end = (numbers.get(name) for group in VELOCITY_FORM.optional for name in group)
+    groups = (VELOCITY_FORM.required, *VELOCITY_FORM.optional)
+    velocity, covariance, span = ([numbers[name] for name in group if name in numbers] for group in groups)
     stated = VelocityEstimate(
         outcome=VelocityOutcome(outcome),
-        velocity_m_s=None if east is None or north is None else np.array([east, north]),
-        covariance_m2_s2=None
-        if first is None or mixed is None or second is None
-        else np.array([[first, mixed], [mixed, second]]),
-        span_s=None if start is None or end is None else (start, end),
+        velocity_m_s=np.array(velocity) if velocity else None,
+        covariance_m2_s2=np.array([covariance[:2], covariance[1:]]) if covariance else None,
+        span_s=(span[0], span[1]) if span else None,
     )
     return check_velocity(stated)
 

@@ -115,18 +115,11 @@ class Eye:
         horizontal = float(np.cos(elevation))
         sees_all_round = np.sin(half_angle) >= horizontal or half_angle >= np.pi / 2
         half_width = np.pi if sees_all_round else np.arcsin(np.sin(half_angle) / horizontal)
+        half_width = float(min(half_width + np.radians(3.0), np.pi))
         highest = elevation + half_angle
         # twice the distance of level ground, for descending slopes
         reach = 2.0 * height / np.tan(-highest) + _NEAR_M if highest < -np.radians(5.0) else np.inf
-        return cls(
-            east,
-            north,
-            height,
-            rays.pixel_rad,
-            float(np.arctan2(axis[0], axis[1])),
-            float(min(half_width + np.radians(3.0), np.pi)),
-            float(reach),
-        )
+        return cls(east, north, height, rays.pixel_rad, float(np.arctan2(axis[0], axis[1])), half_width, float(reach))
 
 
 def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:

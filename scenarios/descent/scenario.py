@@ -23,7 +23,6 @@ from marsyard.scenarios.descent.score import (
     Pictures,
     conditions,
     feasible_overlap_row,
-    instrument_conditions,
     instrument_errors,
     propagate_to_firing,
     touchdown,
@@ -159,8 +158,7 @@ class Descent:
         """Columns independent of the algorithm."""
         return {
             **self.overlap,
-            **conditions(self.p, self.world, self.states, self.at_firing),
-            **instrument_conditions(self.instruments),
+            **conditions(self.p, self.world, self.states, self.at_firing, self.instruments),
             **instrument_errors(self.world, self.states, self.measurements),
             **self.flight.row,
             **picture_columns(self.p.render.backend, self.pictures),

@@ -87,9 +87,14 @@ def propagate_to_firing(
 
 
 def conditions(
-    p: DescentScenarioParameters, world: World, states: Sequence[State], at_firing: State
+    p: DescentScenarioParameters, world: World, states: Sequence[State], at_firing: State, instruments: Instruments
 ) -> dict[str, Scalar]:
-    """Columns of the case's conditions, from the simulated objects."""
+    """Columns of the case's conditions, from the simulated objects, and of the user's own instruments.
+
+    Before entry: the azimuth of flight. Of the inertial unit: the change of temperature.
+    """
+    approach = instruments.approach
+    entry = -approach.attitudes(np.array([approach.start_s])).as_matrix()[0, :, 2]
     heights = height_above_ground(world.surface, np.stack([state.position_m for state in states]))
     row: dict[str, Scalar] = {
         "site": p.site or "plain",
@@ -109,19 +114,9 @@ def conditions(
         row[f"attitude_rate_{number}_deg_s"] = attitude_rate_deg_s(state)
     row["off_nadir_max_deg"] = max(off_nadir_deg(state) for state in states)
     row["attitude_rate_max_deg_s"] = max(attitude_rate_deg_s(state) for state in states)
-    return row
-
-
-def instrument_conditions(instruments: Instruments) -> dict[str, Scalar]:
-    """Columns of the azimuth of flight before entry, the change of temperature, and own instruments."""
-    approach = instruments.approach
-    flight = -approach.attitudes(np.array([approach.start_s])).as_matrix()[0, :, 2]
-    change_k = instruments.imu.gyro.warm_up.temperature_k(np.array([np.inf]))[0]
-    return {
-        "approach_heading_deg": float(np.degrees(np.arctan2(flight[0], flight[1])) % 360.0),
-        "imu_warm_up_change_k": float(change_k),
-        **instruments.row,
-    }
+    row["approach_heading_deg"] = float(np.degrees(np.arctan2(entry[0], entry[1])) % 360.0)
+    row["imu_warm_up_change_k"] = float(instruments.imu.gyro.warm_up.temperature_k(np.array([np.inf]))[0])
+    return {**row, **instruments.row}
 
 
 def instrument_errors(world: World, states: Sequence[State], measurements: DescentMeasurements) -> dict[str, Scalar]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float64, UInt8, UInt16
+from jaxtyping import Bool, Float, UInt8, UInt16
 from scipy.ndimage import distance_transform_edt
 
 from marsyard.scenarios.base import LoadGround
@@ -103,17 +103,6 @@ def take_pictures(p: LandingScenarioParameters, world: World, flight: Flight, op
     return Pair((first, second), (frames[0], frames[1]))
 
 
-def visible_in_both(pair: Pair, flight: Flight, points_m: Float64[np.ndarray, "n 3"], border_px: float) -> np.ndarray:
-    """Whether points of the ground (world axes) lie in both pictures, at least `border_px` from their borders."""
-    visible = np.ones(len(points_m), dtype=bool)
-    for image, state in zip(pair.images, flight.states, strict=True):
-        pixels, ahead = image.camera.moved(state.world_from_body).project(points_m)
-        with np.errstate(invalid="ignore"):
-            low, high = pixels >= border_px, pixels <= np.array(image.camera.size) - 1.0 - border_px
-        visible &= ahead & np.all(low & high, axis=1)
-    return visible
-
-
 def measure(p: LandingScenarioParameters, flight: Flight, pair: Pair, streams: Streams) -> LandingMeasurements:
     """The measurements of a case.
 
@@ -162,8 +151,8 @@ class GroundTruth:
         right = flight.states[0].attitude.apply(np.array([1.0, 0.0, 0.0]))[:2]
         right = right / np.hypot(*right)
         axes = np.array([right, [-right[1], right[0]]])
-        points = pair.frames[0].points_world()[::8, ::8, :2].reshape(-1, 2)
-        hull = cv2.convexHull(points[np.all(np.isfinite(points), axis=1)].astype(np.float32))
+        seen = pair.frames[0].points_world()[::8, ::8, :2].reshape(-1, 2)
+        hull = cv2.convexHull(seen[np.all(np.isfinite(seen), axis=1)].astype(np.float32))
         outline = (hull[:, 0].astype(np.float64) - centre[:2]) @ axes.T
         step = STEP_DIAMETERS * limits.diameter_m
         low, high = (np.floor(end / step) * step for end in (outline.min(axis=0), outline.max(axis=0)))
@@ -175,7 +164,12 @@ class GroundTruth:
         west_south, east_north = corners.min(axis=0) - margin, corners.max(axis=0) + margin
         relief = Relief.of(world.ground, west_south, east_north, SPACING_DIAMETERS * limits.diameter_m, world.meshes)
         heights = relief.averaged(places, relief.spacing_m)
-        visible = visible_in_both(pair, flight, np.concatenate([corners, heights.reshape(-1, 1)], axis=1), 0.0)
+        # points of the ground in both pictures
+        points, visible = np.concatenate([corners, heights.reshape(-1, 1)], axis=1), np.ones(len(corners), dtype=bool)
+        for image, state in zip(pair.images, flight.states, strict=True):
+            pixels, ahead = image.camera.moved(state.world_from_body).project(points)
+            with np.errstate(invalid="ignore"):
+                visible &= ahead & np.all((pixels >= 0.0) & (pixels <= np.array(image.camera.size) - 1.0), axis=1)
         around = distance_transform_edt(np.pad(visible.reshape(heights.shape), 1))[1:-1, 1:-1] * step
         covered = around >= 0.5 * limits.diameter_m
         return cls(relief, limits, places, relief.footprints(places, limits), covered, step)
