@@ -115,16 +115,14 @@ def run_algorithm(ask: Callable[[], object], check: Callable[[object], Answer]) 
         raw = ask()
         taken = time.process_time() - started
         answer = check(raw)
-    except AlgorithmError as error:
-        columns: dict[str, Scalar] = {"estimation_time_s": time.process_time() - started}
-        if error.stderr:
-            columns[STDERR] = error.stderr
-        return AlgorithmRun(None, Failure(error.fault.name, str(error), ""), columns)
     except Exception as error:
+        row: dict[str, Scalar] = {"estimation_time_s": time.process_time() - started}
+        if isinstance(error, AlgorithmError):
+            row |= {STDERR: error.stderr} if error.stderr else {}
+            return AlgorithmRun(None, Failure(error.fault.name, str(error), ""), row)
         fault = Fault.OUT_OF_MEMORY if isinstance(error, MemoryError) else Fault.CRASHED
-        failure = Failure(fault.name, describe_error(error), traceback.format_exc())
-        return AlgorithmRun(None, failure, {"estimation_time_s": time.process_time() - started})
-    row: dict[str, Scalar] = {"estimation_time_s": answer_time_s(answer, taken)}
+        return AlgorithmRun(None, Failure(fault.name, describe_error(error), traceback.format_exc()), row)
+    row = {"estimation_time_s": answer_time_s(answer, taken)}
     details = getattr(answer, "details", None)
     if isinstance(details, ProgramDetails):
         row[STDERR] = details.stderr

@@ -277,15 +277,13 @@ def is_terrain_file(name: str) -> bool:
 
 
 def site_or_file(name: str, max_hole_fraction: float = MAX_HOLE_FRACTION) -> Site:
-    """Return a preset by name, or the site of a terrain model's file. Raises ValueError."""
-    return imported_site(Path(name), max_hole_fraction) if is_terrain_file(name) else site(name)
+    """Return a preset by name, or a terrain model's file as a site: one terrain at both scales, no rocks or craters.
 
-
-def imported_site(path: Path, max_hole_fraction: float = MAX_HOLE_FRACTION) -> Site:
-    """Return a terrain model's file as a site: one terrain at both scales, without rocks or craters.
-
-    Raises TerrainFileError.
+    Raises ValueError, or TerrainFileError.
     """
+    if not is_terrain_file(name):
+        return site(name)
+    path = Path(name)
     source = RealTerrain(dtm=path, max_hole_fraction=max_hole_fraction)
     check_source(source)
     return _imported(source, path.stat().st_mtime_ns)

@@ -19,7 +19,6 @@ from marsyard.sim.camera import Cahv, Cahvor, CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Frame, Photometry, Scene, Sun
-from marsyard.sim.render.clouds import CloudLayer
 from marsyard.sim.sensor import Detector
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Environment, Surface, TerrainBank
@@ -63,29 +62,18 @@ class World:
         ground = SiteGround(p.preset, terrain, surface, bank.rocks(p.place.terrain))
         return cls(surface, ground, sun, p.meshes, sunlight_ratio(air, elevation, p.detector))
 
-    def scene(
-        self,
-        east_m: float,
-        north_m: float,
-        lowest_m: float,
-        pixel_rad: float,
-        *,
-        caster_diameter_m: float = 0.0,
-        clouds: CloudLayer | None = None,
-    ) -> Scene:
-        """Scene of all pictures of a descent.
+    def scene(self, east_m: float, north_m: float, lowest_m: float, pixel_rad: float) -> Scene:
+        """Scene of all pictures of a descent, without the lander's shadow and clouds.
 
         - east_m, north_m: position below the first picture
         - lowest_m: height above ground of the last picture, which determines the smallest rocks
-        - caster_diameter_m: diameter of the disc that casts the lander's shadow
         """
         if self.ground is None:
             finest = min(MESH_FINEST_M, MESH_FINEST_HEIGHTS * lowest_m)
             scene = Scene(self.surface, (east_m, north_m), self.sun, Photometry(), mesh_finest_m=finest)
         else:
             scene = site_scene(self.ground, Eye(east_m, north_m, lowest_m, pixel_rad), self.sun)
-        scene = add_meshes(scene, self.meshes, (east_m, north_m))
-        return replace(scene, caster_diameter_m=caster_diameter_m, clouds=clouds)
+        return add_meshes(scene, self.meshes, (east_m, north_m))
 
 
 #: Height over which the optical depth of haze is stated, m: that of the first picture.
@@ -111,14 +99,9 @@ def take_exposures(
     """Detector counts and rendered frame of each picture, one by one, without delivery faults."""
     first, last = states[0].position_m, states[-1].position_m
     below_first, below_last = (float(world.surface.height(point[0], point[1])) for point in (first, last))
-    scene = world.scene(
-        float(first[0]),
-        float(first[1]),
-        float(last[2]) - below_last,
-        optics.rays.pixel_rad,
-        caster_diameter_m=p.lander.caster_diameter_m,
-        clouds=draw_clouds(p.faults, below_first, streams.generator("clouds")),
-    )
+    scene = world.scene(float(first[0]), float(first[1]), float(last[2]) - below_last, optics.rays.pixel_rad)
+    clouds = draw_clouds(p.faults, below_first, streams.generator("clouds"))
+    scene = replace(scene, caster_diameter_m=p.lander.caster_diameter_m, clouds=clouds)
     # the camera is at the body's origin; its alignment error, unknown to the lander, is a rotation alone
     tilt = np.radians(p.camera.alignment_error_deg) * streams.generator("camera alignment").standard_normal(3)
     mounting = RigidTransform.from_rotation(Rotation.from_rotvec(tilt))

@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float, UInt8, UInt16
 from scipy.ndimage import distance_transform_edt
 
 from marsyard.scenarios.base import LoadGround
-from marsyard.scenarios.exposure import Optics, camera_optics, render_state, sunlight_ratio
+from marsyard.scenarios.exposure import Optics, camera_optics, draw_calibrated, render_state, sunlight_ratio
 from marsyard.scenarios.faults import deliver, faulty_detector
 from marsyard.scenarios.landing.faults import faulty_ranges, faulty_sun_deg
-from marsyard.scenarios.landing.flight import Flight, calibrated_camera
+from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
 from marsyard.scenarios.meshes import MeshParameters, add_meshes
@@ -112,7 +112,8 @@ def measure(p: LandingScenarioParameters, flight: Flight, pair: Pair, streams: S
     unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
     reading = unit.readings(np.zeros(1), np.array([pair.axis_range_m]), streams.generator("laser noise"))
     slant = float(faulty_ranges(p.faults, reading.values, p.height_m)[0])
-    camera = calibrated_camera(p, streams).binned(columns=1, rows=p.detector.rows_summed)
+    calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
+    camera = calibrated.binned(columns=1, rows=p.detector.rows_summed)
     first, second = (replace(image, camera=camera) for image in pair.images)
     ahead = (slant if np.isfinite(slant) else p.height_m) * camera.a
     return LandingMeasurements(
