@@ -107,8 +107,8 @@ def _npz_problems(source: RealTerrain) -> Iterator[str]:
                 yield f"{name} is {posting}; allowed: metres between posts, above 0"
 
 
-def _geotiff_problems(file: Any, max_side: int) -> Iterator[str]:
-    """Yield problems of a file's size, cells and projection."""
+def _geotiff_problems(file: Any, max_side: int, are_heights: bool) -> Iterator[str]:
+    """Yield problems of a file's size, cells and projection, and of the unit and type of heights."""
     if min(file.width, file.height) < 4:
         yield f"has {file.width} x {file.height} values; at least 4 x 4 are needed"
     if max(file.width, file.height) > max_side:
@@ -134,10 +134,8 @@ def _geotiff_problems(file: Any, max_side: int) -> Iterator[str]:
             f"its projection stretches lengths by {scale.smallest:.3f} to {scale.largest:.3f}, depending on their "
             f"direction; allowed: within {_MAX_STRETCH:g} of 1: project it about its own middle with rio warp --dst-crs"
         )
-
-
-def _height_problems(file: Any) -> Iterator[str]:
-    """Yield problems of the unit and type of a DTM's heights."""
+    if not are_heights:
+        return
     if file.dtypes[0] == "uint8":
         yield "holds 8-bit values, which are a picture's; heights in metres are needed"
     if (file.units[0] or "").strip().lower() not in _METRES:
@@ -156,10 +154,9 @@ def _raise_first(path: Path, problems: Iterator[str]) -> None:
 def _check_geotiff(path: Path, max_side: int, *, heights_of: RealTerrain | None = None) -> Any:
     """Check the header and, of a DTM, the heights; return the projection."""
     with _open(path) as file:
-        _raise_first(path, _geotiff_problems(file, max_side))
+        _raise_first(path, _geotiff_problems(file, max_side, heights_of is not None))
         if heights_of is None:
             return file.crs
-        _raise_first(path, _height_problems(file))
         values = file.read(1, masked=True)
         if values.dtype.kind not in "iuf":
             raise TerrainFileError(f"{path}: holds values of type {values.dtype}; heights in metres are needed")
