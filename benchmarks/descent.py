@@ -12,7 +12,7 @@ from benchmarks.pictures import descent_pose, descent_scene
 from benchmarks.stages import stages
 from benchmarks.timing import Figure, core_seconds
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.scenarios.descent.optics import camera_optics
+from marsyard.scenarios.descent.exposure import camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import default_backend

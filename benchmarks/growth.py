@@ -31,7 +31,7 @@ from marsyard.campaigns.definition.configuration import CampaignConfiguration, R
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
-from marsyard.scenarios.descent.optics import camera_optics
+from marsyard.scenarios.descent.exposure import camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.render import PixelRays, process_renderer

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.pictures import SUN, descent_exposure, descent_pose, descent_scene, on_all_cores
 from benchmarks.timing import Figure, core_seconds
-from marsyard.scenarios.descent.optics import camera_optics
+from marsyard.scenarios.descent.exposure import camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters
 from marsyard.sim.render.rays import VIEW_SIDE_PX
 from marsyard.sim.render.renderer import ground_mesh

@@ -18,7 +18,7 @@ from pydantic_core import PydanticUndefined
 
 from marsyard.campaigns.definition.catalogue import catalogue
 from marsyard.scenarios.measured.layout import COLUMNS, IngestFile
-from marsyard.scenarios.registry import scenario, scenario_names
+from marsyard.scenarios.systems import scenario, scenario_names
 
 #: Where they are written, and what each begins with.
 FOLDER = Path(__file__).parent / "reference" / "generated"

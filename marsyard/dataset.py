@@ -24,7 +24,7 @@ from marsyard.campaigns.definition.identity import configuration_hash
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.running.preparation import plan_inputs
 from marsyard.scenarios.exposure import ProvidesSamples
-from marsyard.scenarios.registry import scenario, scenario_names
+from marsyard.scenarios.systems import scenario, scenario_names
 from marsyard.sim.camera import BODY_FRAME, write_cahvor
 
 MANIFEST = "dataset.json"

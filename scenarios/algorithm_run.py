@@ -1,4 +1,4 @@
-"""Run the algorithms of a case separately: a failure of one does not affect the others.
+"""Run the algorithms of a case separately: a failure of one does not affect the others, nor do changes of its inputs.
 
 The first algorithm of a campaign is under test: its columns have no prefix. Those of the compared ones have their label
 as a prefix (`homography.velocity_error_m_s`), with their own `outcome`, `answered` and `error`.
@@ -6,19 +6,24 @@ as a prefix (`homography.velocity_error_m_s`), with their own `outcome`, `answer
 
 from __future__ import annotations
 
+import copy
+import hashlib
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.exchange import ProgramDetails
 from marsyard.algorithms.faults import AlgorithmError, Fault, describe_error
 from marsyard.scenarios.estimators import labels
-from marsyard.scenarios.handover import Given, Handover
 from marsyard.scenarios.interface import CaseResult, Failure, Scalar, record_conditions
 
 Answer = TypeVar("Answer")
+Given = TypeVar("Given")
 
 #: Columns of the algorithm under test, and of a program's standard error.
 ALGORITHM, STDERR = "algorithm", "stderr"
@@ -44,6 +49,65 @@ class AlgorithmRun(Generic[Answer]):
         return self.failure.outcome if self.failure is not None else Fault.CRASHED.name
 
 
+class Handover(Generic[Given]):
+    """One algorithm's read-only copy `given` of its inputs: data classes, arrays and poses."""
+
+    def __init__(self, original: Given) -> None:
+        self.given = copy_inputs(original)
+        self._fingerprint = hash_inputs(self.given)
+
+    def check(self) -> None:
+        """Raise AlgorithmError (BAD_ANSWER) if the algorithm changed its copy, pictures included."""
+        if hash_inputs(self.given) != self._fingerprint:
+            raise AlgorithmError(
+                Fault.BAD_ANSWER, "it changed the measurements that it was given; allowed: to read them, or copies"
+            )
+
+
+def copy_inputs(original: Given, *, writable: bool = False) -> Given:
+    """Return a deep copy whose arrays are read-only, or writable to detect changes.
+
+    Rotations and transforms are immutable and not copied: a copy would be normalised again, with other last digits.
+    """
+    poses = {id(part): part for part in _parts(original) if isinstance(part, Rotation | RigidTransform)}
+    copied = copy.deepcopy(original, dict(poses))
+    for part in _parts(copied):
+        if isinstance(part, np.ndarray):
+            part.flags.writeable = writable
+    return copied
+
+
+def hash_inputs(value: Any, leave: tuple[str, ...] = ()) -> str:
+    """Compute the SHA-256 of all values in arrays, poses and data classes, without the fields in `leave`."""
+    digest = hashlib.sha256()
+    for part in _parts(value, leave):
+        if isinstance(part, np.ndarray):
+            digest.update(f"{part.dtype}{part.shape}".encode())
+            digest.update(np.ascontiguousarray(part).data)
+        elif isinstance(part, Rotation):
+            digest.update(part.as_quat().tobytes())
+        elif isinstance(part, RigidTransform):
+            digest.update(part.as_matrix().tobytes())
+        else:
+            digest.update(repr(part).encode())
+    return digest.hexdigest()
+
+
+def _parts(value: Any, leave: tuple[str, ...] = ()) -> Iterator[Any]:
+    """Yield the arrays, poses and other values in data classes, lists and tuples, and the names of the types."""
+    if is_dataclass(value) and not isinstance(value, type):
+        yield type(value).__name__
+        for field in fields(value):
+            if field.name not in leave:
+                yield from _parts(getattr(value, field.name), leave)
+    elif isinstance(value, list | tuple):
+        yield len(value)
+        for inner in value:
+            yield from _parts(inner, leave)
+    else:
+        yield value
+
+
 def run_algorithm(ask: Callable[[], object], check: Callable[[object], Answer]) -> AlgorithmRun[Answer]:
     """Run an algorithm and validate its answer; all exceptions become failures of the algorithm."""
     started = time.process_time()
@@ -51,16 +115,14 @@ def run_algorithm(ask: Callable[[], object], check: Callable[[object], Answer]) 
         raw = ask()
         taken = time.process_time() - started
         answer = check(raw)
-    except AlgorithmError as error:
-        columns: dict[str, Scalar] = {"estimation_time_s": time.process_time() - started}
-        if error.stderr:
-            columns[STDERR] = error.stderr
-        return AlgorithmRun(None, Failure(error.fault.name, str(error), ""), columns)
     except Exception as error:
+        row: dict[str, Scalar] = {"estimation_time_s": time.process_time() - started}
+        if isinstance(error, AlgorithmError):
+            row |= {STDERR: error.stderr} if error.stderr else {}
+            return AlgorithmRun(None, Failure(error.fault.name, str(error), ""), row)
         fault = Fault.OUT_OF_MEMORY if isinstance(error, MemoryError) else Fault.CRASHED
-        failure = Failure(fault.name, describe_error(error), traceback.format_exc())
-        return AlgorithmRun(None, failure, {"estimation_time_s": time.process_time() - started})
-    row: dict[str, Scalar] = {"estimation_time_s": answer_time_s(answer, taken)}
+        return AlgorithmRun(None, Failure(fault.name, describe_error(error), traceback.format_exc()), row)
+    row = {"estimation_time_s": answer_time_s(answer, taken)}
     details = getattr(answer, "details", None)
     if isinstance(details, ProgramDetails):
         row[STDERR] = details.stderr
@@ -84,10 +146,6 @@ def answer_time_s(answer: object, taken_s: float) -> float:
     """Return the computation time: the measured processor time; of a program, the wall-clock time that it reports."""
     details = getattr(answer, "details", None)
     return details.time_s if isinstance(details, ProgramDetails) else taken_s
-
-
-#: Scored result of one algorithm.
-Judged = CaseResult
 
 
 def case_result(

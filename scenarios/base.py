@@ -26,7 +26,7 @@ class BaseScenario(Generic[ParametersType]):
     name: str
     parameters_type: type[ParametersType]
 
-    def checked(self, parameters: BaseModel) -> ParametersType:
+    def check_parameters(self, parameters: BaseModel) -> ParametersType:
         """Return the parameters with their type. Raises TypeError for those of another scenario."""
         if not isinstance(parameters, self.parameters_type):
             expected, given = self.parameters_type.__name__, type(parameters).__name__
@@ -46,12 +46,12 @@ class TerrainScenario(BaseScenario[ParametersType], ABC):
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Build one terrain into the cache on disk."""
-        bank, number = self.input_terrain(self.checked(parameters), shared_input)
+        bank, number = self.input_terrain(self.check_parameters(parameters), shared_input)
         bank.terrain(number)
 
     def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
         """Return the bytes of a terrain that is not on disk."""
-        bank, number = self.input_terrain(self.checked(parameters), shared_input)
+        bank, number = self.input_terrain(self.check_parameters(parameters), shared_input)
         return bank.missing_bytes(number)
 
 

@@ -31,7 +31,15 @@ from marsyard.algorithms.interface import SiteEstimator, TargetTracker, Velocity
 from marsyard.algorithms.streams import STREAM_METHODS, StreamedEstimator
 from marsyard.algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
 from marsyard.scenarios.import_path import import_object, source_files
-from marsyard.scenarios.offline import SITE_FORM, VELOCITY_FORM, OfflineForm, check_offline, create_offline, is_offline
+from marsyard.scenarios.offline import (
+    SITE_FORM,
+    VELOCITY_FORM,
+    OfflineForm,
+    answers_file,
+    create_offline,
+    is_offline,
+    read_answers,
+)
 from marsyard.scenarios.systems import systems
 
 #: Entry points of other packages' algorithms.
@@ -76,7 +84,9 @@ class Task(Generic[Algorithm, Options]):
                 raise ValueError(f"'{spec}': a {self.what} takes no stream of pictures; allowed: exec:, serve:")
             return
         if is_offline(spec):
-            check_offline(spec, self._form(spec))
+            form, file = self._form(spec), answers_file(spec)
+            if file is not None:
+                read_answers(file, form)
             return
         factory = self._import(spec)
         methods = STREAM_METHODS if self._is_stream(factory) else self.methods
@@ -147,13 +157,6 @@ class Task(Generic[Algorithm, Options]):
             raise ValueError(f"algorithm '{spec}' cannot be loaded from {installed()[spec].value}: {error}") from error
 
 
-def _executable_velocity(command: exchange.Command, limits: exchange.ExecutableLimits) -> VelocityEstimator:
-    """Wrap a program that gets three pictures at once, or all pictures one by one."""
-    if command.stream:
-        return StreamedEstimator(exchange.ExecutableVelocityStream(command, limits))
-    return exchange.ExecutableVelocityEstimator(command, limits)
-
-
 VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
     name="velocity",
     what="velocity estimator",
@@ -163,7 +166,12 @@ VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
         "phase-correlation": lambda _: PhaseCorrelationEstimator(),
         "homography": lambda _: HomographyEstimator(),
     },
-    executable=_executable_velocity,
+    # a program gets three pictures at once, or all pictures one by one
+    executable=lambda command, limits: (
+        StreamedEstimator(exchange.ExecutableVelocityStream(command, limits))
+        if command.stream
+        else exchange.ExecutableVelocityEstimator(command, limits)
+    ),
     options=DimesOptions,
     offline=VELOCITY_FORM,
     streamed=StreamedEstimator,

@@ -82,24 +82,19 @@ class Scenario(Protocol):
     @property
     def name(self) -> str:
         """Name in campaign files."""
-        ...
 
     @property
     def parameters_type(self) -> type[BaseModel]:
         """Model (pydantic, extra keys forbidden, frozen) of the values that a campaign may set or disperse."""
-        ...
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Return the numbers of the inputs shared by cases that `prepare` builds once (the terrains of a bank)."""
-        ...
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Build one shared input into the cache on disk if it is missing. Safe to call in parallel."""
-        ...
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Run one case with its drawn parameters and its random streams; see `record_conditions`."""
-        ...
 
 
 @runtime_checkable
@@ -108,11 +103,9 @@ class SelectsInputs(Protocol):
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """Return the numbers, out of `shared_inputs`, of the inputs of a case with these drawn parameters."""
-        ...
 
     def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
         """Return the bytes that preparing an input would add to the cache; 0 if it is there."""
-        ...
 
 
 @runtime_checkable
@@ -122,12 +115,10 @@ class HasAlgorithms(Protocol):
     @property
     def task(self) -> Task[Any, Any]:
         """Task of the algorithms."""
-        ...
 
     @property
     def algorithm_table(self) -> tuple[str, ...]:
         """Table of the parameters with the selection; empty for the top level."""
-        ...
 
 
 @runtime_checkable
@@ -137,4 +128,3 @@ class HasParts(Protocol):
     @property
     def part_keys(self) -> Mapping[str, Kind]:
         """Kinds of the parts by the dotted path of the parameter that names them, one name or a list."""
-        ...

@@ -73,7 +73,7 @@ class MeshParameters(UserFile):
         return read_mesh(file).sha256
 
     def standing(self, surface: Surface, near: tuple[float, float]) -> Objects:
-        """Place the mesh on the ground, at its repetition nearest to a point (x, y)."""
+        """Location the mesh on the ground, at its repetition nearest to a point (x, y)."""
         mesh = read_mesh(self.file)
         corners = _UPRIGHT[self.up].apply(mesh.triangles.reshape(-1, 3))
         extent = float(np.ptp(corners[:, :2], axis=0).max())
@@ -110,7 +110,7 @@ class Mesh:
 
 
 def standing(meshes: Sequence[MeshParameters], surface: Surface, near: tuple[float, float]) -> Objects:
-    """Place all meshes on the ground, each at its repetition nearest to a point (x, y)."""
+    """Location all meshes on the ground, each at its repetition nearest to a point (x, y)."""
     return Objects.joined([one.standing(surface, near) for one in meshes]) if meshes else Objects.none()
 
 
@@ -140,7 +140,17 @@ def _read(path: str, _changed_ns: int) -> Mesh:
     formats = sorted(set(trimesh.available_formats()) - _ARCHIVES)
     if kind not in formats:
         raise MeshFileError(f"{path}: '.{kind}' is no format of meshes; allowed: {', '.join(formats)}")
-    _check_expanded(path, kind)
+    # a small file may expand to a mesh that is too large
+    try:
+        size = 0
+        if kind in _ZIPPED:
+            size = expanded_bytes(path)
+        elif kind in ("glb", "gltf"):
+            size = _accessor_bytes(Path(path).read_bytes(), kind)
+    except (*ARCHIVE_ERRORS, struct.error, AttributeError, RecursionError) as fault:
+        raise MeshFileError(f"{path}: cannot be read as a mesh ({fault})") from fault
+    if size > MAX_BYTES:
+        raise MeshFileError(f"{path}: expands to {size} bytes; allowed: up to {MAX_BYTES >> 20} MiB")
     try:
         loaded = trimesh.load(path, force="mesh", process=False)
         digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
@@ -161,21 +171,6 @@ def _read(path: str, _changed_ns: int) -> Mesh:
     vertices, numbers = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
     merged = trimesh.Trimesh(vertices, numbers.reshape(-1, 3), process=False)
     return Mesh(digest, triangles, np.array(merged.vertex_normals, dtype=np.float64)[np.array(merged.faces)])
-
-
-def _check_expanded(path: str, kind: str) -> None:
-    """Raise MeshFileError where a small file expands to a mesh that is too large, before expanding it."""
-    try:
-        if kind in _ZIPPED:
-            size = expanded_bytes(path)
-        elif kind in ("glb", "gltf"):
-            size = _accessor_bytes(Path(path).read_bytes(), kind)
-        else:
-            return
-    except (*ARCHIVE_ERRORS, struct.error, AttributeError, RecursionError) as fault:
-        raise MeshFileError(f"{path}: cannot be read as a mesh ({fault})") from fault
-    if size > MAX_BYTES:
-        raise MeshFileError(f"{path}: expands to {size} bytes; allowed: up to {MAX_BYTES >> 20} MiB")
 
 
 def _accessor_bytes(contents: bytes, kind: str) -> int:

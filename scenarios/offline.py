@@ -25,8 +25,8 @@ from marsyard.scenarios.user_files import (
     cells_by_column,
     check_together,
     finite_number,
+    format_problems,
     header_problems,
-    listed,
     read_lines,
 )
 from marsyard.sim.files import check_regular
@@ -73,15 +73,13 @@ class OfflineForm(Generic[Answer]):
 
 
 def _velocity(outcome: Enum, numbers: Mapping[str, float]) -> VelocityEstimate:
-    east, north = (numbers.get(name) for name in VELOCITY_FORM.required)
-    first, mixed, second, start, end = (numbers.get(name) for group in VELOCITY_FORM.optional for name in group)
+    groups = (VELOCITY_FORM.required, *VELOCITY_FORM.optional)
+    velocity, covariance, span = ([numbers[name] for name in group if name in numbers] for group in groups)
     stated = VelocityEstimate(
         outcome=VelocityOutcome(outcome),
-        velocity_m_s=None if east is None or north is None else np.array([east, north]),
-        covariance_m2_s2=None
-        if first is None or mixed is None or second is None
-        else np.array([[first, mixed], [mixed, second]]),
-        span_s=None if start is None or end is None else (start, end),
+        velocity_m_s=np.array(velocity) if velocity else None,
+        covariance_m2_s2=np.array([covariance[:2], covariance[1:]]) if covariance else None,
+        span_s=(span[0], span[1]) if span else None,
     )
     return check_velocity(stated)
 
@@ -101,10 +99,7 @@ def _with_site(estimate: SiteEstimate, measurements: LandingMeasurements) -> Sit
 
 VELOCITY_FORM: OfflineForm[VelocityEstimate] = OfflineForm(
     required=("velocity_east_m_s", "velocity_north_m_s"),
-    optional=(
-        ("covariance_east_m2_s2", "covariance_east_north_m2_s2", "covariance_north_m2_s2"),
-        ("start_s", "end_s"),
-    ),
+    optional=(("covariance_east_m2_s2", "covariance_east_north_m2_s2", "covariance_north_m2_s2"), ("start_s", "end_s")),
     outcomes=VelocityOutcome,
     answer=_velocity,
     nothing=lambda _: VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None),
@@ -128,13 +123,6 @@ def is_offline(spec: str) -> bool:
 def answers_file(spec: str) -> Path | None:
     """Return the path of a table of answers; None for other names."""
     return Path(spec.removeprefix(ANSWERS)) if spec.startswith(ANSWERS) else None
-
-
-def check_offline(spec: str, form: OfflineForm[Any]) -> None:
-    """Raise ValueError where a table cannot be read; the message names lines and columns."""
-    file = answers_file(spec)
-    if file is not None:
-        read_answers(file, form)
 
 
 def create_offline(spec: str, form: OfflineForm[Any], case: int) -> Any:
@@ -193,7 +181,7 @@ def _read(file: Path, form: OfflineForm[Any], _time: int, _size: int) -> Mapping
     hint = f"allowed: {', '.join(form.columns)}; units are those of the names"
     problems = list(header_problems(header, ("case", *form.required), form.columns, hint))
     if problems:
-        raise ValueError(listed(file, problems))
+        raise ValueError(format_problems(file, problems))
     answers: dict[int, Any] = {}
     first_lines: dict[int, int] = {}
     for line, cells in lines:
@@ -206,7 +194,7 @@ def _read(file: Path, form: OfflineForm[Any], _time: int, _size: int) -> Mapping
             continue
         answers[case], first_lines[case] = answer, line
     if problems:
-        raise ValueError(listed(file, problems))
+        raise ValueError(format_problems(file, problems))
     return answers
 
 

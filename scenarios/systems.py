@@ -1,4 +1,4 @@
-"""Registry of the systems of Marsyard and of installed packages.
+"""Registry of the systems and scenarios of Marsyard, of installed packages and of the user.
 
 A package adds a system by an entry point of the group `marsyard.systems`::
 
@@ -10,14 +10,17 @@ An unusable system is left out, with one message in `problems`.
 
 from __future__ import annotations
 
+import difflib
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from typing import cast
 
 from marsyard.scenarios.import_path import import_object
+from marsyard.scenarios.interface import Scenario
 from marsyard.scenarios.system import System
 
 #: Entry points of other packages' systems.
@@ -138,3 +141,42 @@ def row_columns(scenario: str) -> RowColumns | None:
         return RowColumns(tuple(stated["flags"]), tuple(stated["numbers"]), stated.get("named_flags", ""))
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise ValueError(f"{system.columns}: states no columns: {type(error).__name__}: {error}") from error
+
+
+class UnknownScenarioError(LookupError):
+    """No scenario has the name, or the path cannot be imported."""
+
+
+def scenario_names() -> list[str]:
+    """Return the names of the scenarios of all systems."""
+    return sorted(scenario_paths())
+
+
+def scenario(name: str) -> Scenario:
+    """Create the scenario of a name, or of a class ``module:Class`` that implements `Scenario`.
+
+    Raises UnknownScenarioError, whose message states the allowed names.
+    """
+    path = name if ":" in name else scenario_paths().get(name)
+    if path is None:
+        near = difflib.get_close_matches(name, scenario_names(), n=1)
+        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        allowed = ", ".join(scenario_names())
+        message = f"unknown scenario '{name}'{hint}; allowed: {allowed}, or your own as 'module:Class'"
+        raise UnknownScenarioError("; ".join((message, *problems())))
+    try:
+        scenario_type = import_object(path)
+    except ImportError as error:
+        raise UnknownScenarioError(f"no scenario at '{path}': {error}") from error
+    missing = [
+        part for part in ("parameters_type", "shared_inputs", "prepare", "run") if not hasattr(scenario_type, part)
+    ]
+    if missing:
+        raise UnknownScenarioError(f"'{path}' is not a scenario: it has no {', '.join(missing)}")
+    return cast(Scenario, scenario_type())
+
+
+def scenario_source(name: str) -> str:
+    """Return ``module:Class`` of a scenario of another package; the name of any other."""
+    path = scenario_paths().get(name, name)
+    return name if path.startswith("marsyard.") else path

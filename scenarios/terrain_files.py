@@ -1,4 +1,4 @@
-"""Validate terrain files of a user by their headers before `marsyard.sim.terrain` reads them.
+"""Validate terrain files of a user by their headers before `marsyard.sim.terrain` reads them, and use them as sites.
 
 A GeoTIFF must have a projection in metres (or another length, by which it is scaled) that preserves lengths, square
 cells with grid north up, a no-data value if it has gaps, and heights in metres. An .npz archive is checked likewise.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -17,8 +18,8 @@ import numpy as np
 from pydantic import AfterValidator
 
 from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, npz_headers
-from marsyard.sim.terrain import TerrainParameters
-from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, check_holes, read_rasters
+from marsyard.sim.terrain import Site, TerrainParameters, site
+from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, check_holes, choose_grid, read_rasters
 
 #: Maximum posts of a DTM and pixels of a picture along a side: limits of the largest terrain and of memory.
 _MAX_POSTS, _MAX_PIXELS = 5461, 8192
@@ -51,7 +52,8 @@ def check_source(source: RealTerrain) -> None:
 def _check(source: RealTerrain, _changed_ns: tuple[int, ...]) -> None:
     dtm = source.dtm
     if dtm.suffix == ".npz":
-        _check_npz(source)
+        _raise_first(dtm, _npz_problems(source))
+        _check_values(dtm, read_rasters(source)[0].values, source, "mark posts without height with NaN")
         dtm_crs = None
     else:
         dtm_crs = _check_geotiff(dtm, _MAX_POSTS, heights_of=source)
@@ -77,72 +79,84 @@ def _check_present(path: Path) -> os.stat_result:
     return status
 
 
-def _check_npz(source: RealTerrain) -> None:
-    """Check the headers of an archive, and then its heights."""
-    path = source.dtm
+def _npz_problems(source: RealTerrain) -> Iterator[str]:
+    """Yield problems of an archive's headers."""
     try:
-        headers = npz_headers(path)
+        headers = npz_headers(source.dtm)
     except ARCHIVE_ERRORS as fault:
-        raise TerrainFileError(f"{path}: is no .npz archive of arrays ({fault})") from fault
+        raise TerrainFileError(f"{source.dtm}: is no .npz archive of arrays ({fault})") from fault
     missing = [name for name in ("dem", "dem_gsd") if name not in headers]
     if missing:
-        raise TerrainFileError(f"{path}: lacks {', '.join(missing)}; needed: dem (m, row 0 in the north), dem_gsd (m)")
+        yield f"lacks {', '.join(missing)}; needed: dem (m, row 0 in the north), dem_gsd (m)"
     if "ortho" in headers and "ortho_gsd" not in headers:
-        raise TerrainFileError(f"{path}: has an ortho, but lacks ortho_gsd (m between its pixels)")
-    for name, header in headers.items():
-        if name not in _ARRAYS:
-            continue
-        shape, dtype = header
+        yield "has an ortho, but lacks ortho_gsd (m between its pixels)"
+    for name, (shape, dtype) in headers.items():
         limit = _MAX_POSTS if name == "dem" else _MAX_PIXELS
-        if dtype.kind not in "biuf":
-            raise TerrainFileError(f"{path}: {name} holds values of type {dtype}; allowed: real numbers")
-        if _ARRAYS[name] == 0 and np.prod(shape, dtype=np.float64) != 1:
-            raise TerrainFileError(f"{path}: {name} has the shape {shape}; one number is needed")
-        if _ARRAYS[name] == 2 and (len(shape) != 2 or min(shape) < 4 or max(shape) > limit):
-            raise TerrainFileError(
-                f"{path}: {name} has a grid of shape {shape}; two dimensions of 4 to {limit} values are needed"
-            )
+        if name in _ARRAYS and dtype.kind not in "biuf":
+            yield f"{name} holds values of type {dtype}; allowed: real numbers"
+        if _ARRAYS.get(name) == 0 and np.prod(shape, dtype=np.float64) != 1:
+            yield f"{name} has the shape {shape}; one number is needed"
+        if _ARRAYS.get(name) == 2 and (len(shape) != 2 or min(shape) < 4 or max(shape) > limit):
+            yield f"{name} has a grid of shape {shape}; two dimensions of 4 to {limit} values are needed"
     if "ortho_valid" in headers and headers["ortho_valid"][0] != headers.get("ortho", headers["ortho_valid"])[0]:
-        raise TerrainFileError(f"{path}: ortho_valid has another shape than ortho")
-    with np.load(path, allow_pickle=False) as file:
+        yield "ortho_valid has another shape than ortho"
+    with np.load(source.dtm, allow_pickle=False) as file:
         for name in [name for name in ("dem_gsd", "ortho_gsd") if name in headers]:
             posting = float(file[name].reshape(()))
             if not (np.isfinite(posting) and posting > 0.0):
-                raise TerrainFileError(f"{path}: {name} is {posting}; allowed: metres between posts, above 0")
-    _check_values(path, read_rasters(source)[0].values, source, "mark posts without height with NaN")
+                yield f"{name} is {posting}; allowed: metres between posts, above 0"
+
+
+def _geotiff_problems(file: Any, max_side: int, are_heights: bool) -> Iterator[str]:
+    """Yield problems of a file's size, cells and projection, and of the unit and type of heights."""
+    if min(file.width, file.height) < 4:
+        yield f"has {file.width} x {file.height} values; at least 4 x 4 are needed"
+    if max(file.width, file.height) > max_side:
+        yield (
+            f"has {file.width} x {file.height} values; at most {max_side} along a side are used: cut a part out with "
+            "rio clip --bounds, or make it coarser with rio warp --res"
+        )
+    cell, crs = file.transform, file.crs
+    if not (np.isfinite(cell.a) and cell.a > 0.0):
+        yield f"its cells are {cell.a:g} wide; north up and east right are needed (rio warp)"
+    if cell.b or cell.d or abs(cell.a + cell.e) > 1e-6 * abs(cell.a):
+        yield "has rotated or oblong cells; square ones, north up, are needed (rio warp --res)"
+    if crs is None:
+        yield "states no projection; state it with rio edit-info --crs"
+    elif crs.is_geographic:
+        yield "is in degrees; project it to metres with rio warp --dst-crs"
+    elif not crs.is_projected:
+        yield "its coordinates are no map projection's; project it with rio warp --dst-crs"
+    scale = map_scale(file)
+    # a projection without a known inverse is accepted
+    if scale is not None and max(scale.largest - 1.0, 1.0 - scale.smallest) > _MAX_STRETCH:
+        yield (
+            f"its projection stretches lengths by {scale.smallest:.3f} to {scale.largest:.3f}, depending on their "
+            f"direction; allowed: within {_MAX_STRETCH:g} of 1: project it about its own middle with rio warp --dst-crs"
+        )
+    if not are_heights:
+        return
+    if file.dtypes[0] == "uint8":
+        yield "holds 8-bit values, which are a picture's; heights in metres are needed"
+    if (file.units[0] or "").strip().lower() not in _METRES:
+        yield f"its heights are in {file.units[0]!r}; metres are needed (rio calc)"
+    if file.scales[0] != 1.0 or file.offsets[0] != 0.0:
+        yield f"states scale {file.scales[0]:g} and offset {file.offsets[0]:g}; apply them with rio calc"
+
+
+def _raise_first(path: Path, problems: Iterator[str]) -> None:
+    """Raise TerrainFileError for the first problem; later checks rely on it."""
+    problem = next(problems, None)
+    if problem is not None:
+        raise TerrainFileError(f"{path}: {problem}")
 
 
 def _check_geotiff(path: Path, max_side: int, *, heights_of: RealTerrain | None = None) -> Any:
     """Check the header and, of a DTM, the heights; return the projection."""
     with _open(path) as file:
-        if min(file.width, file.height) < 4:
-            raise TerrainFileError(f"{path}: has {file.width} x {file.height} values; at least 4 x 4 are needed")
-        if max(file.width, file.height) > max_side:
-            raise TerrainFileError(
-                f"{path}: has {file.width} x {file.height} values; at most {max_side} along a side are used: cut a "
-                "part out with rio clip --bounds, or make it coarser with rio warp --res"
-            )
-        cell = file.transform
-        if not (np.isfinite(cell.a) and cell.a > 0.0):
-            raise TerrainFileError(
-                f"{path}: its cells are {cell.a:g} wide; north up and east right are needed (rio warp)"
-            )
-        if cell.b or cell.d or abs(cell.a + cell.e) > 1e-6 * abs(cell.a):
-            raise TerrainFileError(
-                f"{path}: has rotated or oblong cells; square ones, north up, are needed (rio warp --res)"
-            )
-        _check_projection(path, file)
+        _raise_first(path, _geotiff_problems(file, max_side, heights_of is not None))
         if heights_of is None:
             return file.crs
-        if file.dtypes[0] == "uint8":
-            raise TerrainFileError(f"{path}: holds 8-bit values, which are a picture's; heights in metres are needed")
-        unit = (file.units[0] or "").strip().lower()
-        if unit not in _METRES:
-            raise TerrainFileError(f"{path}: its heights are in {file.units[0]!r}; metres are needed (rio calc)")
-        if file.scales[0] != 1.0 or file.offsets[0] != 0.0:
-            raise TerrainFileError(
-                f"{path}: states scale {file.scales[0]:g} and offset {file.offsets[0]:g}; apply them with rio calc"
-            )
         values = file.read(1, masked=True)
         if values.dtype.kind not in "iuf":
             raise TerrainFileError(f"{path}: holds values of type {values.dtype}; heights in metres are needed")
@@ -160,30 +174,11 @@ def _open(path: Path) -> Any:
     except ImportError as error:
         raise TerrainFileError(f"{path}: reading GeoTIFF needs rasterio: pip install rasterio (extra 'geo')") from error
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a file without a position is refused by `_check_projection`
+        warnings.simplefilter("ignore")  # a file without a position is refused by `_geotiff_problems`
         try:
             return rasterio.open(path)
         except rasterio.errors.RasterioError as fault:
             raise TerrainFileError(f"{path}: is no GeoTIFF ({fault})") from fault
-
-
-def _check_projection(path: Path, file: Any) -> None:
-    crs = file.crs
-    if crs is None:
-        raise TerrainFileError(f"{path}: states no projection; state it with rio edit-info --crs")
-    if crs.is_geographic:
-        raise TerrainFileError(f"{path}: is in degrees; project it to metres with rio warp --dst-crs")
-    if not crs.is_projected:
-        raise TerrainFileError(f"{path}: its coordinates are no map projection's; project it with rio warp --dst-crs")
-    scale = map_scale(file)
-    if scale is None:  # a projection without a known inverse is accepted
-        return
-    if max(scale.largest - 1.0, 1.0 - scale.smallest) > _MAX_STRETCH:
-        raise TerrainFileError(
-            f"{path}: its projection stretches lengths by {scale.smallest:.3f} to {scale.largest:.3f}, depending on "
-            f"their direction; allowed: within {_MAX_STRETCH:g} of 1: project it about its own middle with "
-            "rio warp --dst-crs"
-        )
 
 
 def grid_north_deg(path: Path) -> float | None:
@@ -263,3 +258,42 @@ def map_scale(file: Any) -> MapScale | None:
         true_north = np.cross(normal, true_east)
         azimuth_deg = float(np.degrees(np.arctan2(north @ true_east, north @ true_north)))
     return MapScale(1.0 / float(ground[1]), 1.0 / float(ground[0]), azimuth_deg)
+
+
+#: Suffixes of terrain models.
+ENDINGS = (".npz", ".tif", ".tiff")
+#: Preset of the light, air, scattering and fine texture of imported ground.
+LIGHT_OF = "gusev"
+#: Fraction of posts without height up to which a terrain model is used, unless stated.
+MAX_HOLE_FRACTION = float(RealTerrain.model_fields["max_hole_fraction"].default)
+
+
+def is_terrain_file(name: str) -> bool:
+    """Return whether a name is that of a terrain model's file, not of a site."""
+    return Path(name).suffix.lower() in ENDINGS
+
+
+def site_or_file(name: str, max_hole_fraction: float = MAX_HOLE_FRACTION) -> Site:
+    """Return a preset by name, or a terrain model's file as a site: one terrain at both scales, no rocks or craters.
+
+    Raises ValueError, or TerrainFileError.
+    """
+    if not is_terrain_file(name):
+        return site(name)
+    path = Path(name)
+    source = RealTerrain(dtm=path, max_hole_fraction=max_hole_fraction)
+    check_source(source)
+    return _imported(source, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=4)
+def _imported(source: RealTerrain, _changed_ns: int) -> Site:
+    samples, spacing_m = choose_grid(source)
+    terrain = TerrainParameters(samples=samples, spacing_m=spacing_m, craters_per_km2=0.0, source=source)
+    changes = {
+        "name": source.dtm.name,
+        "description": f"terrain model {source.dtm} in the light of {LIGHT_OF}",
+        "descent": terrain,
+        "ground": terrain,
+    }
+    return site(LIGHT_OF).model_copy(update=changes)

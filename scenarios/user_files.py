@@ -25,7 +25,6 @@ class NamesFiles(Protocol):
 
     def input_files(self) -> Sequence[str]:
         """Return the paths of the files, as stated."""
-        ...
 
 
 def input_files(parameters: Any) -> tuple[str, ...]:
@@ -76,7 +75,7 @@ class UserFile(Parameters):
         return self
 
 
-def listed(file: Path, problems: Sequence[str]) -> str:
+def format_problems(file: Path, problems: Sequence[str]) -> str:
     """Format the problems of a file as one message, with a maximum number of them."""
     more = [f"... and {len(problems) - _MAX_PROBLEMS} more"] if len(problems) > _MAX_PROBLEMS else []
     return "\n  ".join([f"{file}:", *problems[:_MAX_PROBLEMS], *more])

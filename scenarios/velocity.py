@@ -11,8 +11,7 @@ from marsyard.algorithms.dimes import DimesDetails, dimes_products
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator
 from marsyard.algorithms.streams import StreamedEstimator, set_span
-from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm
-from marsyard.scenarios.handover import Handover
+from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm_on_copy
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.offline import RecordedAnswer, Recorder
 from marsyard.sim.measurements import DescentMeasurements
@@ -33,25 +32,20 @@ def run_estimator(
 
     Streams and recorders get all pictures. Other estimators get three of them, and fail without.
     """
-    handover = Handover(measurements)
     tags = measurements.tags_s
 
-    def answer() -> object:
+    def answer(given: DescentMeasurements) -> object:
         nonlocal tags
         estimator = make()
         if isinstance(estimator, StreamedEstimator | Recorder | RecordedAnswer):
-            return estimator.estimate(handover.given)
+            return estimator.estimate(given)
         if triple is None:
             raise ValueError(f"it takes three pictures, and {len(measurements.images)} are taken")
-        three = handover.given if len(measurements.images) == len(triple) else handover.given.select(triple)
+        three = given if len(measurements.images) == len(triple) else given.select(triple)
         tags = three.tags_s
         return estimator.estimate(three)
 
-    def check(answer: object) -> VelocityEstimate:
-        handover.check()
-        return set_span(answer, tags)
-
-    return run_algorithm(answer, check)
+    return run_algorithm_on_copy(answer, lambda answer: set_span(answer, tags), measurements)
 
 
 def check_last_interval(answer: object, measurements: DescentMeasurements) -> VelocityEstimate:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -116,18 +115,11 @@ class Eye:
         horizontal = float(np.cos(elevation))
         sees_all_round = np.sin(half_angle) >= horizontal or half_angle >= np.pi / 2
         half_width = np.pi if sees_all_round else np.arcsin(np.sin(half_angle) / horizontal)
+        half_width = float(min(half_width + np.radians(3.0), np.pi))
         highest = elevation + half_angle
         # twice the distance of level ground, for descending slopes
         reach = 2.0 * height / np.tan(-highest) + _NEAR_M if highest < -np.radians(5.0) else np.inf
-        return cls(
-            east,
-            north,
-            height,
-            rays.pixel_rad,
-            float(np.arctan2(axis[0], axis[1])),
-            float(min(half_width + np.radians(3.0), np.pi)),
-            float(reach),
-        )
+        return cls(east, north, height, rays.pixel_rad, float(np.arctan2(axis[0], axis[1])), half_width, float(reach))
 
 
 def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
@@ -231,17 +223,15 @@ class Stance:
 
 #: Typical stances of the cameras of `marsyard.sim.sensor.PRESETS`: first picture of a descent, masts of 1.5 m, MER's
 #: hazcams 0.53 m above the ground (Maki et al. 2003), a helicopter at 10 m.
-STANCES: Mapping[str, Stance] = MappingProxyType(
-    {
-        "mer-descent-flown": Stance("descent", 2000.0, -90.0),
-        "mer-descent-field": Stance("descent", 2000.0, -90.0),
-        "mer-navcam": Stance("ground", 1.5, -18.0),
-        "mer-hazcam": Stance("ground", 0.53, -40.0),
-        "research-navcam": Stance("ground", 1.5, -13.0),
-        "research-pancam": Stance("ground", 1.5, -5.0),
-        "xc-55": Stance("ground", 10.0, -90.0),
-    }
-)
+STANCES: Mapping[str, Stance] = {
+    "mer-descent-flown": Stance("descent", 2000.0, -90.0),
+    "mer-descent-field": Stance("descent", 2000.0, -90.0),
+    "mer-navcam": Stance("ground", 1.5, -18.0),
+    "mer-hazcam": Stance("ground", 0.53, -40.0),
+    "research-navcam": Stance("ground", 1.5, -13.0),
+    "research-pancam": Stance("ground", 1.5, -5.0),
+    "xc-55": Stance("ground", 10.0, -90.0),
+}
 
 
 def camera_pose(

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from marsyard.scenarios.handover import Handover
+from marsyard.scenarios.algorithm_run import Handover
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 

@@ -9,13 +9,12 @@ import numpy as np
 
 from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.hda import HdaEstimator, HdaOptions, TrackSeed
+from marsyard.scenarios.exposure import camera_optics
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.pictures import World, measure, take_pictures
+from marsyard.scenarios.landing.pictures import GroundTruth, World, measure, take_pictures
 from marsyard.scenarios.landing.score import map_row, motion_row
-from marsyard.scenarios.landing.truth import GroundTruth
-from marsyard.scenarios.optics import camera_optics
 from marsyard.sim.sensor import DetectorParameters, LaserParameters, preset
 from marsyard.sim.streams import Streams
 

@@ -238,7 +238,7 @@ def _from_above(scene: Scene, camera: CameraModel, place: np.ndarray, time_s: fl
 
 
 def run_sun(quick: bool) -> Iterator[Measure]:
-    """Place and light of the sun's disc in the sky."""
+    """Location and light of the sun's disc in the sky."""
     camera = cameras()["MER navcam, CAHVOR, 45 deg"]
     off, flux = [], []
     for azimuth_deg, elevation_deg in (

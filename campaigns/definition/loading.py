@@ -37,8 +37,7 @@ from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
 from marsyard.scenarios.estimators import labels
 from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
 from marsyard.scenarios.parts.named import SCORE
-from marsyard.scenarios.registry import UnknownScenarioError, scenario
-from marsyard.scenarios.systems import RowColumns, row_columns
+from marsyard.scenarios.systems import RowColumns, UnknownScenarioError, row_columns, scenario
 
 #: Keys of the file that `--set` may name; any other key is one of the parameters.
 _FILE_KEYS = (

@@ -23,7 +23,7 @@ from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, UNFINISHED, Case
 from marsyard.campaigns.store.products import Keep, PackedProducts, pack_products
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by
-from marsyard.scenarios.registry import scenario
+from marsyard.scenarios.systems import scenario
 from marsyard.sim.cache import CacheWarning
 
 #: Maximum bit length of stored integers: a float64 is below 2 ** 1024.

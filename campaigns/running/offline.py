@@ -23,7 +23,7 @@ from marsyard.campaigns.store.table import TABLE_FILE, read_rows
 from marsyard.scenarios.estimators import Task
 from marsyard.scenarios.interface import HasAlgorithms
 from marsyard.scenarios.offline import ANSWERS, CASES, read_answers
-from marsyard.scenarios.registry import scenario
+from marsyard.scenarios.systems import scenario
 
 #: Description of an exported folder for programs, and for the team that answers.
 MANIFEST_FILE, README_FILE = "export.json", "README.md"

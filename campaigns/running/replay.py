@@ -19,7 +19,7 @@ from marsyard.campaigns.store.products import KEEP_ALL, PackedProducts
 from marsyard.campaigns.store.record import read, stored_configuration
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.store.table import stored_row
-from marsyard.scenarios.registry import UnknownScenarioError, scenario
+from marsyard.scenarios.systems import UnknownScenarioError, scenario
 
 
 @dataclass(frozen=True)

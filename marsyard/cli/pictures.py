@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt16
 
-from marsyard.scenarios.imported_site import MAX_HOLE_FRACTION, is_terrain_file, site_or_file
+from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, is_terrain_file, site_or_file
 from marsyard.scenarios.views import STANCES, Eye, SiteGround, camera_pose, site_scene
 from marsyard.sim.camera import BODY_FRAME, CameraModel, write_cahvor
 from marsyard.sim.frames import direction

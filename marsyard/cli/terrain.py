@@ -65,8 +65,7 @@ def stats(
     """Print albedo, slopes, relief and image contrast of a site's terrain next to the paper's figures."""
     import numpy as np
 
-    from marsyard.scenarios.imported_site import MAX_HOLE_FRACTION, site_or_file
-    from marsyard.scenarios.terrain_files import grid_north_deg
+    from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, grid_north_deg, site_or_file
     from marsyard.sim.terrain.bank import synthesise
     from marsyard.sim.terrain.imported import embed
     from marsyard.sim.terrain.sites import PAPER

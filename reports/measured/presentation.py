@@ -28,9 +28,9 @@ _MAX_ROWS = 60
 _MIN_DRAWN = 3
 #: Further columns of the table where the rows have them.
 _QUANTITIES = (
-    "matches", "matches_wrong_share", MEDIAN, MOST, "residual_worst_pair_px", "turned_most_deg", "moved_most_m",
-    "beside_inertial_m_s", "pair_discrepancy_m_s", "rotation_beside_poses_deg", "direction_beside_poses_deg",
-    "baseline_beside_poses_share",
+    "matches", "outlier_fraction", MEDIAN, MOST, "residual_worst_pair_px", "max_rotation_deg", "max_translation_m",
+    "inertial_difference_m_s", "pair_discrepancy_m_s", "rotation_pose_difference_deg", "direction_pose_difference_deg",
+    "baseline_pose_difference_fraction",
 )  # fmt: skip
 _TEXT = (
     "Whatever is known of the truth, pictures and poses must agree. Features are matched from each picture to the "
@@ -65,7 +65,7 @@ def agreement_section(subject: Subject) -> Section | None:
     plates = []
     if np.count_nonzero(np.isfinite(medians)) >= _MIN_DRAWN:
         plates.append(plate(residual_figure(frame), "agreement", "Residuals of the cases, the smallest median first."))
-    note = (_INERTIAL if "beside_inertial_m_s" in names else "") + _NO_DRAWS
+    note = (_INERTIAL if "inertial_difference_m_s" in names else "") + _NO_DRAWS
     grid = Grid(head, rows, max(0, len(frame) - _MAX_ROWS))
     data = {
         "cases": len(frame),

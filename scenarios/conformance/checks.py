@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from marsyard.algorithms.faults import AlgorithmError
+from marsyard.scenarios.algorithm_run import copy_inputs, hash_inputs
 from marsyard.scenarios.estimators import algorithm_sources
-from marsyard.scenarios.handover import copy_inputs, hash_inputs
 
 #: Modules of `marsyard` that an algorithm may import (docs/architecture.md).
 OPEN_MODULES = ("marsyard.sim.frames", "marsyard.sim.camera", "marsyard.sim.measurements", "marsyard.algorithms")

@@ -11,9 +11,9 @@ import numpy as np
 
 from marsyard.algorithms.answers import check_site, check_velocity
 from marsyard.algorithms.interface import SiteOutcome, VelocityEstimate, VelocityOutcome
+from marsyard.scenarios.algorithm_run import copy_inputs
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, fingerprint
-from marsyard.scenarios.handover import copy_inputs
 from marsyard.sim.measurements import DescentMeasurements
 
 #: Pictures of an ordinary stream; of shortened streams, too short and long enough for an answer; of a long stream.

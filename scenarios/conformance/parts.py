@@ -21,8 +21,8 @@ from marsyard.algorithms.interface import (
 )
 from marsyard.scenarios.conformance import inputs, trackers
 from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, fingerprint
+from marsyard.scenarios.landing.pictures import GroundTruth
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
-from marsyard.scenarios.landing.truth import GroundTruth
 from marsyard.scenarios.parts.instruments import InstrumentTruth, check_readings
 from marsyard.scenarios.parts.motions import DescentPlace, Poses, check_poses
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, KINDS, SCORE, Kind, check_columns, installed

@@ -1,24 +1,80 @@
-"""Pictures of a descent through the true camera, with dust haze and the falling heat shield in the view."""
+"""Pictures of a descent: terrain and light, the camera, and dust haze and the falling heat shield in the view."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.scenarios.descent.faults import draw_clouds
-from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.descent.world import World
-from marsyard.scenarios.exposure import render_state
-from marsyard.scenarios.optics import Optics
+from marsyard.scenarios.descent.faults import draw_clouds, faulty_terrain
+from marsyard.scenarios.descent.parameters import CameraParameters, DescentScenarioParameters
+from marsyard.scenarios.exposure import Optics, add_calibration_error, render_state, sunlight_ratio
+from marsyard.scenarios.exposure import camera_optics as shared_optics
+from marsyard.scenarios.meshes import MeshParameters, add_meshes
+from marsyard.scenarios.views import Eye, SiteGround, site_scene
+from marsyard.sim.camera import Cahv, Cahvor, CameraModel
 from marsyard.sim.dynamics import State
-from marsyard.sim.render import Frame, Sun
+from marsyard.sim.frames import direction
+from marsyard.sim.render import Frame, Photometry, Scene, Sun
 from marsyard.sim.sensor import Detector
 from marsyard.sim.streams import Streams
-from marsyard.sim.terrain import Environment
+from marsyard.sim.terrain import Environment, Surface, TerrainBank
+
+#: Finest spacing of a plain terrain's mesh: that of pictures from 1200 m and above, and as a fraction of lower heights.
+MESH_FINEST_M, MESH_FINEST_HEIGHTS = 12.0, 0.01
+
+
+@dataclass(frozen=True)
+class World:
+    """Terrain and light of a descent.
+
+    - ground: the terrain with its site's light, texture and rocks; None for a plain terrain
+    - meshes: own bodies on the ground
+    - brightness: sunlight at the ground over the reference sunlight of the detector's responsivity
+    """
+
+    surface: Surface
+    ground: SiteGround | None
+    sun: Sun
+    meshes: tuple[MeshParameters, ...] = ()
+    brightness: float = 1.0
+
+    @property
+    def air(self) -> Environment:
+        """Atmosphere of the site; Mars for a plain terrain."""
+        return Environment() if self.ground is None else self.ground.site.environment
+
+    @classmethod
+    def of(cls, p: DescentScenarioParameters) -> World:
+        """Create a case's world; its terrain is read from the cache or built."""
+        terrain = faulty_terrain(p.faults, p.terrain)
+        bank = TerrainBank(terrain, p.location.bank_seed)
+        surface = bank.terrain(p.location.terrain)
+        elevation = float(np.radians(p.sun.elevation_deg))
+        towards_sun = direction(np.radians(p.sun.azimuth_deg), elevation)
+        if p.preset is None:
+            return cls(surface, None, Sun(towards_sun), p.meshes)
+        air = p.preset.environment
+        sun = Sun(towards_sun, air.sun_radius_rad)
+        ground = SiteGround(p.preset, terrain, surface, bank.rocks(p.location.terrain))
+        return cls(surface, ground, sun, p.meshes, sunlight_ratio(air, elevation, p.detector))
+
+    def scene(self, east_m: float, north_m: float, lowest_m: float, pixel_rad: float) -> Scene:
+        """Scene of all pictures of a descent, without the lander's shadow and clouds.
+
+        - east_m, north_m: position below the first picture
+        - lowest_m: height above ground of the last picture, which determines the smallest rocks
+        """
+        if self.ground is None:
+            finest = min(MESH_FINEST_M, MESH_FINEST_HEIGHTS * lowest_m)
+            scene = Scene(self.surface, (east_m, north_m), self.sun, Photometry(), mesh_finest_m=finest)
+        else:
+            scene = site_scene(self.ground, Eye(east_m, north_m, lowest_m, pixel_rad), self.sun)
+        return add_meshes(scene, self.meshes, (east_m, north_m))
+
 
 #: Height over which the optical depth of haze is stated, m: that of the first picture.
 HAZE_HEIGHT_M = 2000.0
@@ -43,14 +99,9 @@ def take_exposures(
     """Detector counts and rendered frame of each picture, one by one, without delivery faults."""
     first, last = states[0].position_m, states[-1].position_m
     below_first, below_last = (float(world.surface.height(point[0], point[1])) for point in (first, last))
-    scene = world.scene(
-        float(first[0]),
-        float(first[1]),
-        float(last[2]) - below_last,
-        optics.rays.pixel_rad,
-        caster_diameter_m=p.lander.caster_diameter_m,
-        clouds=draw_clouds(p.faults, below_first, streams.generator("clouds")),
-    )
+    scene = world.scene(float(first[0]), float(first[1]), float(last[2]) - below_last, optics.rays.pixel_rad)
+    clouds = draw_clouds(p.faults, below_first, streams.generator("clouds"))
+    scene = replace(scene, caster_diameter_m=p.lander.caster_diameter_m, clouds=clouds)
     # the camera is at the body's origin; its alignment error, unknown to the lander, is a rotation alone
     tilt = np.radians(p.camera.alignment_error_deg) * streams.generator("camera alignment").standard_normal(3)
     mounting = RigidTransform.from_rotation(Rotation.from_rotvec(tilt))
@@ -104,12 +155,8 @@ class HeatShield:
     @classmethod
     def draw(cls, first: State, angle_rad: float, rng: np.random.Generator) -> HeatShield:
         """Draw a shield below the lander at its first picture; `angle_rad` is its angular diameter face on."""
-        azimuth, off_nadir, drift_azimuth, axis_azimuth = rng.uniform(0.0, 1.0, 4) * [
-            2 * np.pi,
-            OFF_NADIR_RAD,
-            2 * np.pi,
-            2 * np.pi,
-        ]
+        circle = 2 * np.pi
+        azimuth, off_nadir, drift_azimuth, axis_azimuth = rng.uniform(size=4) * [circle, OFF_NADIR_RAD, circle, circle]
         below = np.array([np.sin(azimuth) * np.sin(off_nadir), np.cos(azimuth) * np.sin(off_nadir), -np.cos(off_nadir)])
         drift = np.array([DRIFT_M_S * np.sin(drift_azimuth), DRIFT_M_S * np.cos(drift_azimuth), -FASTER_M_S])
         axis = np.array([np.cos(axis_azimuth), np.sin(axis_azimuth), 0.0])
@@ -139,3 +186,37 @@ class HeatShield:
         reflected = np.where(towards < 0.0, OUTSIDE, INSIDE) * lit
         covered = np.where(hit, reflected, radiance.reshape(-1))
         return covered.astype(np.float32).reshape(radiance.shape)
+
+
+def camera_optics(parameters: CameraParameters) -> Optics:
+    """True camera in the body frame: at its origin, looking down, columns to the east at zero attitude."""
+    model = parameters.model
+    return shared_optics(_camera(parameters, 1.0, (0.0, 0.0), 0.0) if model is None else model.camera())
+
+
+def calibrated_camera(parameters: CameraParameters, rng: np.random.Generator) -> CameraModel:
+    """The true camera of `camera_optics` with drawn calibration errors."""
+    p = parameters
+    focal, column, row, distortion = rng.standard_normal(4)
+    centre = (p.centre_error_px * float(column), p.centre_error_px * float(row))
+    focal_error, corner_px = p.focal_error * focal, p.distortion_error_px * distortion
+    if p.model is not None:
+        return add_calibration_error(p.model.camera(), focal_error, centre, corner_px)
+    return _camera(p, 1.0 + focal_error, centre, corner_px)
+
+
+def _camera(p: CameraParameters, focal: float, centre_px: tuple[float, float], corner_px: float) -> Cahvor:
+    """The camera with a factor on its focal length, a shift of its centre, and outward distortion of its corners."""
+    middle = (0.5 * (p.columns - 1), 0.5 * (p.rows - 1))
+    focal_px = p.focal_length_mm / (1e-3 * p.pixel_pitch_um)
+    pinhole = Cahv.from_axes(
+        (focal * focal_px, focal * focal_px),
+        (p.columns, p.rows),
+        axis=np.array([0.0, 0.0, -1.0]),
+        right=np.array([1.0, 0.0, 0.0]),
+        image_centre=(middle[0] + centre_px[0], middle[1] + centre_px[1]),
+    )
+    # CAHVOR moves a point at the angle a from the axis outwards by (R0 + R1 tan(a)^2 + ...) of its distance
+    corner = float(np.hypot(*middle))
+    radial_1 = p.radial_1 + corner_px / corner / (corner / focal_px) ** 2
+    return Cahvor.from_cahv(pinhole, r=np.array([p.radial_0, radial_1, p.radial_2]))

@@ -14,7 +14,7 @@ from marsyard.scenarios.descent.recorded import AFTER_S, check_looks_down
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.motions import CustomMotion, DescentPlace
 from marsyard.sim.dynamics import State, SwingDescent, Trajectory
-from marsyard.sim.dynamics.recorded import TrajectoryFileError
+from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 
@@ -57,6 +57,19 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
     ground = float(surface.height(p.location.east_m, p.location.north_m))
     below = np.array([p.location.east_m, p.location.north_m, ground])
     times = faulty_times(p.faults, p.picture_times_s)
+    if p.flight is None:
+        descent = SwingDescent.simulate(
+            p.descent,
+            below + np.array([0.0, 0.0, p.descent.altitude_first_m]),
+            streams.generator("gusts"),
+            ground_height_m=ground,
+            gravity_m_s2=gravity_m_s2(p),
+            lead_s=LEAD_S,
+        )
+        columns = {f"descent_{name}": value for name, value in descent.parameters.model_dump().items()}
+        return DescentFlight(descent, LEAD_S, descent.thruster_firing_s, columns)
+    motion: RecordedMotion
+    row: Mapping[str, Scalar]
     if isinstance(p.flight, CustomMotion):
         place = DescentPlace(
             ground_height=lambda east, north: float(surface.height(below[0] + east, below[1] + north) - below[2]),
@@ -68,23 +81,18 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
         )
         motion, row = p.flight.compute(place, below, streams.generator("own motion"))
         check_looks_down(p.flight.motion, motion, times)
-        check_clearance(p.flight.motion, motion, times, surface)
-        return DescentFlight(motion, p.flight.lead_s, _firing_s(p, motion, surface), row)
-    if p.flight is not None:
-        recorded = p.flight.motion(below, gravity_m_s2(p))
-        check_clearance(p.flight.file, recorded, times, surface)
-        columns: dict[str, Scalar] = {"flight_file": p.flight.file, "flight_first_picture_s": p.flight.start_s}
-        return DescentFlight(recorded, p.flight.lead_s, _firing_s(p, recorded, surface), columns)
-    descent = SwingDescent.simulate(
-        p.descent,
-        below + np.array([0.0, 0.0, p.descent.altitude_first_m]),
-        streams.generator("gusts"),
-        ground_height_m=ground,
-        gravity_m_s2=gravity_m_s2(p),
-        lead_s=LEAD_S,
-    )
-    columns = {f"descent_{name}": value for name, value in descent.parameters.model_dump().items()}
-    return DescentFlight(descent, LEAD_S, descent.thruster_firing_s, columns)
+    else:
+        motion = p.flight.motion(below, gravity_m_s2(p))
+        row = {"flight_file": p.flight.file, "flight_first_picture_s": p.flight.start_s}
+    positions = motion.motion(np.array(times)).positions_m
+    heights = positions[:, 2] - surface.height(positions[:, 0], positions[:, 1])
+    buried = np.flatnonzero(heights <= 0.0)
+    if buried.size:
+        raise TrajectoryFileError(
+            f"{p.flight.motion if isinstance(p.flight, CustomMotion) else p.flight.file}: at picture {buried[0] + 1} "
+            f"the camera is {-heights[buried[0]]:.1f} m below the ground; allowed: above it"
+        )
+    return DescentFlight(motion, p.flight.lead_s, _firing_s(p, motion, surface), row)
 
 
 def _firing_s(p: DescentScenarioParameters, motion: Trajectory, surface: Surface) -> float:
@@ -97,18 +105,6 @@ def _firing_s(p: DescentScenarioParameters, motion: Trajectory, surface: Surface
         return float(times[0 if low.size else -1])
     crossing = slice(low[0] - 1, low[0] + 1)
     return float(np.interp(-p.descent.thruster_firing_m, -heights[crossing], times[crossing]))
-
-
-def check_clearance(name: str, motion: Trajectory, times_s: Sequence[float], surface: Surface) -> None:
-    """Raise TrajectoryFileError where the named flight is below the ground at a picture."""
-    positions = motion.motion(np.array(times_s)).positions_m
-    heights = positions[:, 2] - surface.height(positions[:, 0], positions[:, 1])
-    buried = np.flatnonzero(heights <= 0.0)
-    if buried.size:
-        raise TrajectoryFileError(
-            f"{name}: at picture {buried[0] + 1} the camera is {-heights[buried[0]]:.1f} m below the ground; "
-            "allowed: above it"
-        )
 
 
 def picture_states(p: DescentScenarioParameters, flight: DescentFlight) -> list[State]:

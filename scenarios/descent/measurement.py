@@ -9,11 +9,10 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import Rotation
 
+from marsyard.scenarios.descent.exposure import World, calibrated_camera
 from marsyard.scenarios.descent.faults import faulty_altitudes, faulty_attitudes
 from marsyard.scenarios.descent.flight import MARGIN_S, DescentFlight, gravity_m_s2
-from marsyard.scenarios.descent.optics import calibrated_camera
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.instruments import (
     CustomAltimeter,
@@ -35,7 +34,7 @@ class Instruments:
     - approach: flight before the descent, along which navigation errors grow
     - navigation: propagated attitude and velocity, from shortly before the first picture to the thrusters' firing
     - altimeter: the radar, or the readings of a user's own instrument
-    - clock: source of the pictures' time tags
+    - tags_s: time tags of the pictures
     - attitude_source: readings of a user's own instrument at the time tags; None for attitudes of the navigation
     - row: columns of the user's own instruments
     """
@@ -44,7 +43,7 @@ class Instruments:
     imu: Imu
     navigation: InertialSolution
     altimeter: RadarAltimeter | InstrumentReadings
-    clock: Clock
+    tags_s: Float64[np.ndarray, "pictures"]
     attitude_source: InstrumentReadings | None
     row: Mapping[str, Scalar]
 
@@ -59,7 +58,7 @@ class Instruments:
         surface, motion = world.surface, flight.motion
         # readings and columns of the user's own instruments, by parameter table
         own: dict[str, tuple[InstrumentReadings, Mapping[str, Scalar]]] = {}
-        tags = _time_tags(p, clock, streams)
+        tags = clock.tags(np.array(p.picture_times_s), streams.generator("image time tags"))
         for table, times in (("altimeter", np.array(p.picture_times_s)), ("attitude_source", tags)):
             instrument = getattr(p, table)
             if isinstance(instrument, CustomAltimeter | CustomAttitudeSource):
@@ -83,14 +82,10 @@ class Instruments:
             altimeter=own["altimeter"][0]
             if isinstance(p.altimeter, CustomAltimeter)
             else RadarAltimeter.drawn(p.altimeter, world.surface, streams.generator("altimeter")),
-            clock=clock,
+            tags_s=tags,
             attitude_source=own["attitude_source"][0] if "attitude_source" in own else None,
             row={name: value for _, row in own.values() for name, value in row.items()},
         )
-
-
-def _time_tags(p: DescentScenarioParameters, clock: Clock, streams: Streams) -> Float64[np.ndarray, "n"]:
-    return clock.tags(np.array(p.picture_times_s), streams.generator("image time tags"))
 
 
 def measure(
@@ -103,7 +98,7 @@ def measure(
     streams: Streams,
 ) -> DescentMeasurements:
     """Measurements of an estimator: attitudes at the pictures' tags, altitudes of the last readings before them."""
-    tags = _time_tags(p, instruments.clock, streams)
+    tags = instruments.tags_s
     model = calibrated_camera(p.camera, streams.generator("camera calibration"))
     camera = model.binned(columns=1, rows=p.detector.rows_summed)
     images = [

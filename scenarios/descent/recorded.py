@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.recorded_axes import RecordedAxes
 from marsyard.scenarios.user_files import UserFile
-from marsyard.sim.dynamics.recorded import RecordedMotion, RecordedPoses, TrajectoryFileError, read_poses
+from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError, read_poses
 from marsyard.sim.parameters import bounded
 
 #: Required duration of the flight after the last picture, s.
@@ -42,23 +42,18 @@ class FlightFile(UserFile, RecordedAxes):
         return read_poses(file).sha256
 
     @property
-    def poses(self) -> RecordedPoses:
-        """Poses of the file."""
-        return read_poses(self.file)
-
-    @property
     def start_s(self) -> float:
         """File's time of the first picture."""
         if self.first_picture_s is not None:
             return self.first_picture_s
-        return float(self.poses.times_s[0]) + self.lead_s
+        return float(read_poses(self.file).times_s[0]) + self.lead_s
 
     def check(self, pictures_s: Sequence[float]) -> None:
         """Raise ValueError where the flight does not cover the pictures, looks up, or is below the ground at one."""
         motion = self.motion(np.zeros(3), 0.0)
         first, last = motion.span_s
         if first > -self.lead_s + 1e-9 or last < max(pictures_s) + AFTER_S:
-            begin, end = self.poses.times_s[0], self.poses.times_s[-1]
+            begin, end = read_poses(self.file).times_s[[0, -1]]
             raise TrajectoryFileError(
                 f"{self.file}: covers {begin:.3f} to {end:.3f} s; pictures from {self.start_s:.3f} to "
                 f"{self.start_s + max(pictures_s):.3f} s, lead_s {self.lead_s:g} s before and {AFTER_S:g} s after them "
@@ -74,7 +69,7 @@ class FlightFile(UserFile, RecordedAxes):
 
     def motion(self, ground_m: Float64[np.ndarray, "3"], gravity_m_s2: float) -> RecordedMotion:
         """The flight in the terrain's world, time 0 at the first picture; `ground_m` is the ground at the place."""
-        poses = self.poses
+        poses = read_poses(self.file)
         world = Rotation.from_rotvec(np.radians(-self.turn_deg) * np.array([0.0, 0.0, 1.0])) * self.world
         recorded = world * Rotation.from_quat(poses.quaternions)
         positions = world.apply(poses.positions_m) + self.levers(recorded)

@@ -14,28 +14,23 @@ from marsyard.algorithms.dimes import DimesDetails
 from marsyard.scenarios.algorithm_run import case_result
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import picture_columns
-from marsyard.scenarios.descent.exposure import take_exposures
+from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
 from marsyard.scenarios.descent.faults import faulty_terrain
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, picture_states, true_velocity
 from marsyard.scenarios.descent.measurement import Instruments, measure
-from marsyard.scenarios.descent.optics import camera_optics
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.score import (
     Pictures,
     conditions,
     feasible_overlap_row,
-    instrument_conditions,
     instrument_errors,
-    landing_row,
     propagate_to_firing,
     touchdown,
 )
-from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.estimators import VELOCITY
-from marsyard.scenarios.exposure import Sample, pixel_sample
+from marsyard.scenarios.exposure import Optics, Sample, pixel_sample
 from marsyard.scenarios.faults import deliver, faulty_detector
 from marsyard.scenarios.interface import CaseResult, Scalar
-from marsyard.scenarios.optics import Optics
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredDescent, scored
 from marsyard.scenarios.velocity import (
@@ -71,11 +66,11 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains."""
-        return tuple(range(self.checked(parameters).location.bank))
+        return tuple(range(self.check_parameters(parameters).location.bank))
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """The terrain below the descent; none with dunes of a fault, which are not in the bank."""
-        p = self.checked(parameters)
+        p = self.check_parameters(parameters)
         return (p.location.terrain,) if faulty_terrain(p.faults, p.terrain) == p.terrain else ()
 
     def input_terrain(self, p: DescentScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
@@ -84,7 +79,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
         """Pictures of a case without delivery faults, with the truth of their pixels."""
-        p = self.checked(parameters)
+        p = self.check_parameters(parameters)
         world = World.of(p)
         states = picture_states(p, create_flight(p, world.surface, streams))
         optics = camera_optics(p.camera)
@@ -105,7 +100,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Simulate one descent and score all algorithms."""
-        p = self.checked(parameters)
+        p = self.check_parameters(parameters)
         descent = Descent.simulate(p, streams)
         shared = descent.conditions()
         return case_result(p.algorithms, lambda algorithm: _score_algorithm(descent, algorithm, shared), shared)
@@ -163,8 +158,7 @@ class Descent:
         """Columns independent of the algorithm."""
         return {
             **self.overlap,
-            **conditions(self.p, self.world, self.states, self.at_firing),
-            **instrument_conditions(self.instruments),
+            **conditions(self.p, self.world, self.states, self.at_firing, self.instruments),
             **instrument_errors(self.world, self.states, self.measurements),
             **self.flight.row,
             **picture_columns(self.p.render.backend, self.pictures),
@@ -189,7 +183,11 @@ def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scal
         **velocity_row("velocity", velocity, true),
         **consistency_row(estimate, true),
         **velocity_row("firing_velocity", propagated, at_firing),
-        **landing_row(p.landing, landed, float(attempt.row["estimation_time_s"]), available_s),
+        "touchdown_speed_corrected_m_s": float(np.hypot(*landed.with_answer)),
+        "touchdown_speed_uncorrected_m_s": float(np.hypot(*landed.without_answer)),
+        "answer_punctual": landed.punctual,
+        # the measured computation time, scaled to the flight computer
+        "answer_in_time": p.landing.processor_factor * float(attempt.row["estimation_time_s"]) <= available_s,
         **stream_row(estimate, descent.truth),
         **attempt.row,
     }

@@ -14,10 +14,10 @@ from marsyard.algorithms.dimes.binning import View, altitudes_at_images, bin_fac
 from marsyard.algorithms.dimes.overlap import search_geometry, template_candidates
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, sun_columns
+from marsyard.scenarios.descent.exposure import World
 from marsyard.scenarios.descent.flight import mean_velocities
 from marsyard.scenarios.descent.measurement import Instruments
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, LandingParameters
-from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.interface import Scalar
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
@@ -87,9 +87,14 @@ def propagate_to_firing(
 
 
 def conditions(
-    p: DescentScenarioParameters, world: World, states: Sequence[State], at_firing: State
+    p: DescentScenarioParameters, world: World, states: Sequence[State], at_firing: State, instruments: Instruments
 ) -> dict[str, Scalar]:
-    """Columns of the case's conditions, from the simulated objects."""
+    """Columns of the case's conditions, from the simulated objects, and of the user's own instruments.
+
+    Before entry: the azimuth of flight. Of the inertial unit: the change of temperature.
+    """
+    approach = instruments.approach
+    entry = -approach.attitudes(np.array([approach.start_s])).as_matrix()[0, :, 2]
     heights = height_above_ground(world.surface, np.stack([state.position_m for state in states]))
     row: dict[str, Scalar] = {
         "site": p.site or "plain",
@@ -109,19 +114,9 @@ def conditions(
         row[f"attitude_rate_{number}_deg_s"] = attitude_rate_deg_s(state)
     row["off_nadir_max_deg"] = max(off_nadir_deg(state) for state in states)
     row["attitude_rate_max_deg_s"] = max(attitude_rate_deg_s(state) for state in states)
-    return row
-
-
-def instrument_conditions(instruments: Instruments) -> dict[str, Scalar]:
-    """Columns of the azimuth of flight before entry, the change of temperature, and own instruments."""
-    approach = instruments.approach
-    flight = -approach.attitudes(np.array([approach.start_s])).as_matrix()[0, :, 2]
-    change_k = instruments.imu.gyro.warm_up.temperature_k(np.array([np.inf]))[0]
-    return {
-        "approach_heading_deg": float(np.degrees(np.arctan2(flight[0], flight[1])) % 360.0),
-        "imu_warm_up_change_k": float(change_k),
-        **instruments.row,
-    }
+    row["approach_heading_deg"] = float(np.degrees(np.arctan2(entry[0], entry[1])) % 360.0)
+    row["imu_warm_up_change_k"] = float(instruments.imu.gyro.warm_up.temperature_k(np.array([np.inf]))[0])
+    return {**row, **instruments.row}
 
 
 def instrument_errors(world: World, states: Sequence[State], measurements: DescentMeasurements) -> dict[str, Scalar]:
@@ -160,22 +155,8 @@ def instrument_errors(world: World, states: Sequence[State], measurements: Desce
     return row
 
 
-def landing_row(p: LandingParameters, landed: Touchdown, measured_s: float, available_s: float) -> dict[str, Scalar]:
-    """Columns of the landing; `answer_in_time` scales the measured computation time to the flight computer."""
-    return {
-        "touchdown_speed_corrected_m_s": float(np.hypot(*landed.with_answer)),
-        "touchdown_speed_uncorrected_m_s": float(np.hypot(*landed.without_answer)),
-        "answer_punctual": landed.punctual,
-        "answer_in_time": p.processor_factor * measured_s <= available_s,
-    }
-
-
 def feasible_overlap_row(
-    states: Sequence[State],
-    world: World,
-    camera: CameraModel,
-    calibration: DetectorCalibration,
-    options: DimesOptions,
+    states: Sequence[State], world: World, camera: CameraModel, calibration: DetectorCalibration, options: DimesOptions
 ) -> dict[str, Scalar]:
     """Columns of the feasible overlap of three pictures: DIMES' grid points at which template and search area fit.
 

@@ -8,7 +8,7 @@ from pydantic import AwareDatetime, Field, field_validator, model_validator
 
 from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.estimators import VELOCITY
-from marsyard.scenarios.optics import CalibrationParameters
+from marsyard.scenarios.exposure import CalibrationParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredFlight
 from marsyard.sim.dynamics.helicopter import HelicopterParameters
 from marsyard.sim.parameters import NonNegative, Parameters, Positive

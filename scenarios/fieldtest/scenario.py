@@ -12,15 +12,14 @@ from jaxtyping import Float64, UInt16
 from pydantic import BaseModel
 
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.algorithm_run import Judged, case_result, run_algorithm_on_copy
+from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
 from marsyard.scenarios.base import LoadGround, TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, picture_columns, sun_columns
 from marsyard.scenarios.estimators import VELOCITY
-from marsyard.scenarios.exposure import render_state, sunlight_ratio
+from marsyard.scenarios.exposure import camera_optics, draw_calibrated, render_state, sunlight_ratio
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
 from marsyard.scenarios.fieldtest.run import Category, Run, RunKey, Triple, field_camera, simulate_run
 from marsyard.scenarios.interface import CaseResult, Scalar
-from marsyard.scenarios.optics import camera_optics, draw_calibrated
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredFlight, scored
 from marsyard.scenarios.velocity import check_last_interval, consistency_row, velocity_products, velocity_row
@@ -67,11 +66,11 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Return the numbers of the sites."""
-        return tuple(range(len(self.checked(parameters).site_names)))
+        return tuple(range(len(self.check_parameters(parameters).site_names)))
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """Return the site of the case's run. Raises ValueError for a case beyond the runs' triples."""
-        p = self.checked(parameters)
+        p = self.check_parameters(parameters)
         number, _ = _find_triple(p, case)
         return (p.site_names.index(p.runs[number].site),)
 
@@ -81,7 +80,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Run one triple."""
-        p = self.checked(parameters)
+        p = self.check_parameters(parameters)
         number, index = _find_triple(p, streams.case)
         key = RunKey(p, number, streams.seed, streams.campaign)
         run, ground = self._simulate_run(key), run_ground(key, self.load_ground)
@@ -106,7 +105,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
             **picture_columns(p.backend, pictures),
         }
 
-        def judge(algorithm: str) -> Judged:
+        def judge(algorithm: str) -> CaseResult:
             attempt = run_algorithm_on_copy(
                 lambda given: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case).estimate(given),
                 lambda answer: check_last_interval(answer, measurements),

@@ -16,7 +16,7 @@ from scipy.ndimage import distance_transform_edt
 from marsyard.algorithms.hda import Ground, Safety
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import Flight
-from marsyard.scenarios.landing.truth import GroundTruth
+from marsyard.scenarios.landing.pictures import GroundTruth
 
 #: Bounds of the hazard classes over the limit, and names of the classes between them.
 CLASSES = (1.0, 1.5, 2.0, 3.0)

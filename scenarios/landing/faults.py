@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from marsyard.scenarios.faults import Pictures, SizedFaults, deliver
+from marsyard.scenarios.faults import SizedFaults
 from marsyard.scenarios.landing.helicopter import HelicopterParameters
 from marsyard.sim.parameters import bounded
 from marsyard.sim.sensor.satellite_navigation import Outage
@@ -64,11 +64,6 @@ def arrived_numbers(faults: Faults, count: int, rng: np.random.Generator) -> Int
     """Sorted numbers of a flight's pictures that arrive, at least two."""
     kept = max(2, count - round(faults.lost_pictures * count))
     return np.sort(rng.permutation(count)[:kept]).astype(np.int64)
-
-
-def deliver_pictures(faults: Faults, pictures: Pictures) -> list[np.ndarray]:
-    """The pictures as they arrive."""
-    return deliver(pictures, 2 * faults.repeated_picture, faults.black_picture, faults.lost_rows)
 
 
 def faulty_ranges(faults: Faults, ranges_m: Float64[np.ndarray, "n"], height_m: float) -> Float64[np.ndarray, "n"]:

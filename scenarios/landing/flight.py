@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.spatial.transform import Rotation
 
+from marsyard.scenarios.exposure import draw_calibrated
 from marsyard.scenarios.landing.faults import arrived_numbers, faulty_helicopter, faulty_ranges
 from marsyard.scenarios.landing.helicopter import Transit
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, PairParameters
-from marsyard.scenarios.optics import draw_calibrated
 from marsyard.scenarios.views import nadir_pose
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
@@ -63,9 +63,8 @@ class Flight:
         unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
         readings = unit.readings(transit.times_s, np.array(true), streams.generator("laser noise, transit"))
         ranges = faulty_ranges(p.faults, readings.values, height)[numbers]
-        choice = choose_pair(
-            [transit.pose(int(n)) for n in numbers], ranges, calibrated_camera(p, streams), p.pair, height
-        )
+        calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
+        choice = choose_pair([transit.pose(int(n)) for n in numbers], ranges, calibrated, p.pair, height)
         first, second = int(numbers[choice.first]), int(numbers[choice.second])
         poses = (transit.pose(first), transit.pose(second))
         return cls((states[first], states[second]), poses, transit.up_body(first), transit)
@@ -74,11 +73,6 @@ class Flight:
     def position_error_m(self) -> Float64[np.ndarray, "3"]:
         """Estimated minus true position at the first picture."""
         return np.asarray(np.array(self.poses[0].world_from_body.translation) - self.states[0].position_m)
-
-
-def calibrated_camera(p: LandingScenarioParameters, streams: Streams) -> CameraModel:
-    """The calibrated camera in the body frame: the true one with calibration errors."""
-    return draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
 
 
 def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams) -> tuple[State, State]:

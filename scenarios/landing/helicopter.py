@@ -55,8 +55,7 @@ class HelicopterParameters(Parameters):
     compass: TiltCompassParameters = TiltCompassParameters()
     navigation: FilterParameters = FilterParameters()
     picture_clock: ClockParameters = Field(
-        default=ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005),
-        description="errors of the time tags (assumed)",
+        default=ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005), description="errors of the time tags (assumed)"
     )
     averaging_after_s: float = Field(
         default=2.0, ge=2.0, le=3600.0, description="touchdown to the first solution (assumed)"
@@ -256,7 +255,27 @@ def land(
     time = flight.first(Phase.ON_GROUND)
     if time is None:
         return None
-    return _touchdown(transit, flight, navigated, time, iterations, change_m, streams)
+    # the receiver's averaged solutions, with the helicopter at rest
+    receiver, last_state = transit.instruments.receiver, path.state(path.span_s[1])
+    standing = Resting(last_state.position_m, last_state.attitude, path.gravity_m_s2)
+    first = time + p.averaging_after_s
+    times = receiver.sampling.within(first, first + p.averaging_s)
+    solutions = receiver.measure(standing, times, streams.generator("receiver's noise, standing"))
+    valid = np.isfinite(solutions.positions_m[:, 0])
+    count = int(np.count_nonzero(valid))
+    nothing = np.full(3, np.nan)
+    return Touchdown(
+        flight=flight,
+        navigated=navigated,
+        time_s=time,
+        state=path.state(time),
+        believed_m=navigated.solution.positions_m[int(np.searchsorted(navigated.boundaries_s, time, side="right")) - 1],
+        gps_m=solutions.positions_m[valid].mean(axis=0) if count else nothing,
+        gps_deviation_m=solutions.reported_m[valid].mean(axis=0) if count else nothing,
+        gps_solutions=count,
+        iterations=iterations,
+        change_m=change_m,
+    )
 
 
 def _at_knots(
@@ -264,37 +283,3 @@ def _at_knots(
 ) -> Float64[np.ndarray, "knots 9"]:
     """Values at a path's knots by linear interpolation, held before the first and after the last."""
     return np.stack([np.interp(path.knots_s, times_s, column) for column in values.T], axis=1)
-
-
-def _touchdown(
-    transit: Transit,
-    flight: RotorcraftFlight,
-    navigated: NavigatedPart,
-    time: float,
-    iterations: int,
-    change_m: float,
-    streams: Streams,
-) -> Touchdown:
-    # the receiver's averaged solutions, with the helicopter at rest
-    p, receiver, path = transit.parameters, transit.instruments.receiver, flight.path
-    end = path.state(path.span_s[1])
-    standing = Resting(end.position_m, end.attitude, path.gravity_m_s2)
-    first = time + p.averaging_after_s
-    times = receiver.sampling.within(first, first + p.averaging_s)
-    solutions = receiver.measure(standing, times, streams.generator("receiver's noise, standing"))
-    valid = np.isfinite(solutions.positions_m[:, 0])
-    count = int(np.count_nonzero(valid))
-    nothing = np.full(3, np.nan)
-    last = int(np.searchsorted(navigated.boundaries_s, time, side="right")) - 1
-    return Touchdown(
-        flight=flight,
-        navigated=navigated,
-        time_s=time,
-        state=flight.path.state(time),
-        believed_m=navigated.solution.positions_m[last],
-        gps_m=solutions.positions_m[valid].mean(axis=0) if count else nothing,
-        gps_deviation_m=solutions.reported_m[valid].mean(axis=0) if count else nothing,
-        gps_solutions=count,
-        iterations=iterations,
-        change_m=change_m,
-    )

@@ -12,11 +12,11 @@ from marsyard.algorithms.hda import HdaOptions, TrackSeed
 from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.descent.parameters import Location, RenderParameters, SunParameters
 from marsyard.scenarios.estimators import LANDING
+from marsyard.scenarios.exposure import CalibrationParameters
 from marsyard.scenarios.landing.faults import Faults
 from marsyard.scenarios.landing.helicopter import HelicopterParameters
 from marsyard.scenarios.landing.relief import Limits
 from marsyard.scenarios.meshes import MeshParameters
-from marsyard.scenarios.optics import CalibrationParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredLanding
 from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.camera import CameraModel

@@ -16,7 +16,7 @@ from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.exposure import Sample, pixel_sample, summed_rows
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.pictures import KEPT_GROUNDS, measure
+from marsyard.scenarios.landing.pictures import KEPT_GROUNDS, RenderedFlight, measure
 from marsyard.scenarios.landing.score import (
     conditions,
     landing_row,
@@ -27,10 +27,8 @@ from marsyard.scenarios.landing.score import (
     site_row,
     times_row,
 )
-from marsyard.scenarios.landing.truth import RenderedFlight
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredLanding, scored
-from marsyard.sim.frames import rigid
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
@@ -49,12 +47,12 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains; none of a large bank, whose terrains few flights share (0.1 s each)."""
-        bank = self.checked(parameters).location.bank
+        bank = self.check_parameters(parameters).location.bank
         return tuple(range(bank)) if bank <= KEPT_GROUNDS else ()
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """The terrain below the flight."""
-        return (self.checked(parameters).location.terrain,)
+        return (self.check_parameters(parameters).location.terrain,)
 
     def input_terrain(self, p: LandingScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
         """A terrain of the bank."""
@@ -62,7 +60,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
         """The two delivered pictures of a case, with the truth of their pixels."""
-        case = RenderedFlight.of(self.checked(parameters), streams, self.load_ground)
+        case = RenderedFlight.of(self.check_parameters(parameters), streams, self.load_ground)
         p, pair = case.p, case.pair
         for frame, image, state in zip(pair.frames, pair.images, case.flight.states, strict=True):
             about: dict[str, Any] = {
@@ -78,7 +76,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Fly one case; run each algorithm, and score its answer and the resulting landing."""
-        p = self.checked(parameters)
+        p = self.check_parameters(parameters)
         case = RenderedFlight.of(p, streams, self.load_ground)
         flight, truth = case.flight, case.truth
         measurements = measure(p, flight, case.pair, streams)
@@ -102,11 +100,10 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
                 **attempt.row,
             }
             if attempt.answer is not None:
-                first, second = (rigid(state.attitude, state.position_m) for state in flight.states)
                 answered = ScoredLanding(
                     measurements=measurements,
                     answer=attempt.answer,
-                    true_poses=(first, second),
+                    true_poses=(flight.states[0].world_from_body, flight.states[1].world_from_body),
                     states=flight.states,
                     ground=truth,
                 )

@@ -17,8 +17,7 @@ from marsyard.scenarios.landing.faults import stuck_range_m
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.helicopter import horizontal_distance_m, land
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.pictures import Pair
-from marsyard.scenarios.landing.truth import GroundTruth, RenderedFlight
+from marsyard.scenarios.landing.pictures import GroundTruth, Pair, RenderedFlight
 from marsyard.sim.dynamics.rotorcraft import GroundPatch
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor import height_above_ground
@@ -156,36 +155,30 @@ def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]
     row["tracked_well"] = False
     if not isinstance(details, HdaDetails):
         return row
-    if details.tracks is not None:
-        row |= _tracks_row(details, flight, pair)
+    if details.tracks is not None and len(details.tracks.first) == 0:
+        row["features"] = 0
+    elif details.tracks is not None:
+        tracks = details.tracks
+        column, line = np.rint(tracks.first).astype(np.int64).T
+        points = pair.frames[0].points_world()[line * pair.images[0].calibration.rows_summed, column]
+        camera = pair.images[1].camera.moved(flight.states[1].world_from_body)
+        pixels, ahead = camera.project(points)
+        with np.errstate(invalid="ignore"):
+            inside = np.all((pixels >= BORDER_PX) & (pixels <= np.array(camera.size) - 1.0 - BORDER_PX), axis=1) & ahead
+            right = tracks.accepted & inside & (np.hypot(*(tracks.second - pixels).T) <= CORRECT_PX)
+        accepted = int(tracks.accepted.sum())
+        row |= {
+            "features": len(tracks.first),
+            "tracks": accepted,
+            "features_in_view": int(inside.sum()),
+            "tracks_correct": int(right.sum()),
+            "tracked_fraction": float(right.sum() / inside.sum()) if np.any(inside) else NAN,
+            "tracked_well": bool(np.any(inside) and right.sum() >= WELL_TRACKED * inside.sum()),
+            "tracks_outlier_fraction": float(np.mean(~right[tracks.accepted])) if accepted else NAN,
+        }
     if details.motion is not None:
         row |= motion_errors(details.motion.second_from_first, true_motion(flight, pair))
     return row | solved_row(details)
-
-
-def _tracks_row(details: HdaDetails, flight: Flight, pair: Pair) -> dict[str, Scalar]:
-    """Counts of features in the second picture, and of correct and wrong tracks."""
-    tracks = details.tracks
-    if tracks is None or len(tracks.first) == 0:
-        return {"features": 0}
-    column, row = np.rint(tracks.first).astype(np.int64).T
-    points = pair.frames[0].points_world()[row * pair.images[0].calibration.rows_summed, column]
-    camera = pair.images[1].camera.moved(flight.states[1].world_from_body)
-    pixels, ahead = camera.project(points)
-    with np.errstate(invalid="ignore"):
-        inside = np.all((pixels >= BORDER_PX) & (pixels <= np.array(camera.size) - 1.0 - BORDER_PX), axis=1) & ahead
-        off = np.hypot(*(tracks.second - pixels).T)
-        right = tracks.accepted & inside & (off <= CORRECT_PX)
-    accepted = int(tracks.accepted.sum())
-    return {
-        "features": len(tracks.first),
-        "tracks": accepted,
-        "features_in_view": int(inside.sum()),
-        "tracks_correct": int(right.sum()),
-        "tracked_fraction": float(right.sum() / inside.sum()) if np.any(inside) else NAN,
-        "tracked_well": bool(np.any(inside) and right.sum() >= WELL_TRACKED * inside.sum()),
-        "tracks_outlier_fraction": float(np.mean(~right[tracks.accepted])) if accepted else NAN,
-    }
 
 
 def motion_errors(found: RigidTransform, true: RigidTransform) -> dict[str, Scalar]:

@@ -32,7 +32,7 @@ from marsyard.scenarios.measured.layout import (
 )
 from marsyard.scenarios.system import Ingested
 from marsyard.scenarios.template import toml_environment
-from marsyard.scenarios.user_files import listed
+from marsyard.scenarios.user_files import format_problems
 from marsyard.sim.camera import CameraModel, mount_looking_down, read_cameras, read_pds3_product
 from marsyard.sim.camera.pds import is_pds3
 from marsyard.sim.frames import SITE_FROM_WORLD
@@ -97,7 +97,7 @@ def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
         except ValueError as error:
             problems.append(str(error))
     if problems:
-        raise IngestError(listed(table, problems))
+        raise IngestError(format_problems(table, problems))
     detector, first_camera = file.detector, next(iter(reader.cameras))
     stored = store.StoredCases(
         schema_version=store.SCHEMA,

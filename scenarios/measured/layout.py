@@ -25,8 +25,8 @@ from marsyard.scenarios.user_files import (
     cells_by_column,
     check_together,
     finite_number,
+    format_problems,
     header_problems,
-    listed,
     read_lines,
 )
 from marsyard.sim.files import check_regular, npy_header, open_regular
@@ -220,7 +220,7 @@ def read_table(path: Path, task: str) -> dict[str, list[PictureRow]]:
         raise IngestError(str(error)) from error
     problems = list(header_problems(header, required, allowed, f"allowed for {task}: {', '.join(allowed)}"))
     if problems:
-        raise IngestError(listed(path, problems))
+        raise IngestError(format_problems(path, problems))
     cases: dict[str, list[PictureRow]] = {}
     for line, cells in lines:
         try:
@@ -252,7 +252,7 @@ def read_table(path: Path, task: str) -> dict[str, list[PictureRow]]:
         if not cases:
             problems = ["it has no rows; at least one case is needed"]
     if problems:
-        raise IngestError(listed(path, problems))
+        raise IngestError(format_problems(path, problems))
     return cases
 
 

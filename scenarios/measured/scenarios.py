@@ -18,7 +18,7 @@ from marsyard.algorithms.dimes import DimesDetails, DimesOptions
 from marsyard.algorithms.hda import HdaDetails, HdaOptions, hda_products
 from marsyard.algorithms.hda.view import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate
-from marsyard.scenarios.algorithm_run import AlgorithmRun, Judged, case_result, run_algorithm_on_copy
+from marsyard.scenarios.algorithm_run import AlgorithmRun, case_result, run_algorithm_on_copy
 from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.base import BaseScenario, algorithm_result
 from marsyard.scenarios.descent.parameters import check_binning
@@ -127,7 +127,7 @@ class MatchingScenario(MeasuredScenario[MatchingParameters]):
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Run one case."""
-        p = self.checked(parameters)
+        p = self.check_parameters(parameters)
         images = store.load_images(p.cases, p.case)
         pairs = compare_with_poses(images, match_images(images), [picture.pose for picture in p.case.pictures])
         has_matches = all(pair.residuals_px.size for pair in pairs)
@@ -150,7 +150,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Run one descent."""
-        p = self.checked(parameters)
+        p = self.check_parameters(parameters)
         images = store.load_images(p.cases, p.case)
         measurements = store.descent_measurements(p.case, images)
         matches = match_images(images)
@@ -172,7 +172,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
         true_velocity = p.case.truth.velocity_m_s
         truth = np.array(true_velocity or (np.nan, np.nan), dtype=np.float64)
 
-        def judge(algorithm: str) -> Judged:
+        def judge(algorithm: str) -> CaseResult:
             attempt = attempts[algorithm]
             velocity = _velocity(attempt.answer)
             pairs = compare_with_poses(images, matches, _descent_poses(p.case, measurements, velocity))
@@ -218,7 +218,7 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Run one flight."""
-        p = self.checked(parameters)
+        p = self.check_parameters(parameters)
         images = store.load_images(p.cases, p.case)
         measurements = store.landing_measurements(p.case, images)
         pairs = compare_with_poses(images, match_images(images), [picture.pose for picture in p.case.pictures])
@@ -235,7 +235,7 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
         record_conditions(conditions)
         attempts = _run_algorithms(p, p.hda, measurements, check_site, streams.case)
 
-        def judge(algorithm: str) -> Judged:
+        def judge(algorithm: str) -> CaseResult:
             attempt = attempts[algorithm]
             details = None if attempt.answer is None else attempt.answer.details
             row = _site_answer_row(attempt.answer, measurements, true_poses)

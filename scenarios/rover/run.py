@@ -19,10 +19,9 @@ from marsyard.algorithms.interface import MastAim, TargetTracker, TrackingState
 from marsyard.algorithms.navigation import NavigationOptions, NavigationOutcome, Obstacle, TerrainMap, Wedge, navigate
 from marsyard.algorithms.vtt import GoalReached, HandOffOutcome, hand_off
 from marsyard.algorithms.vtt.pointing import box_around, mast_angles
-from marsyard.scenarios.algorithm_run import answer_time_s
+from marsyard.scenarios.algorithm_run import Handover, answer_time_s
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.estimators import TRACKING
-from marsyard.scenarios.handover import Handover
 from marsyard.scenarios.rover.parameters import LegParameters, RoverScenarioParameters
 from marsyard.scenarios.rover.points import cast_rover_shadow
 from marsyard.scenarios.rover.stops import RunOutcome, StereoCamera, Stop, View

@@ -23,7 +23,7 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import TrackingState
 from marsyard.algorithms.vtt import VttOptions
-from marsyard.scenarios.algorithm_run import Judged, case_result, run_algorithm
+from marsyard.scenarios.algorithm_run import case_result, run_algorithm
 from marsyard.scenarios.base import LoadGround, TerrainScenario
 from marsyard.scenarios.conditions import picture_columns_of_hash
 from marsyard.scenarios.estimators import TRACKING
@@ -214,12 +214,12 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains; none of a large bank, whose terrains few runs share."""
-        bank = self.checked(parameters).world.bank
+        bank = self.check_parameters(parameters).world.bank
         return tuple(range(bank)) if bank <= PREPARED_TERRAINS else ()
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """The run's terrain."""
-        return (self.checked(parameters).world.terrain,)
+        return (self.check_parameters(parameters).world.terrain,)
 
     def input_terrain(self, p: RoverScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
         """A terrain of the bank."""
@@ -227,12 +227,12 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Run the case for each algorithm, with the same draws."""
-        p = self.checked(parameters)
+        p = self.check_parameters(parameters)
         started = time.process_time()
         first = prepare_run(p, streams, self.load_ground)
         known = score.fixed_conditions(p, first)
 
-        def judge(algorithm: str) -> Judged:
+        def judge(algorithm: str) -> CaseResult:
             judged = algorithm == p.algorithm
             candidate = p.model_copy(update={"algorithm": algorithm})
             run_started = started if judged else time.process_time()
@@ -260,11 +260,11 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Numbers of the bank's terrains that runs use."""
-        return tuple(sorted({one.terrain for one in self.checked(parameters).variants}))
+        return tuple(sorted({one.terrain for one in self.check_parameters(parameters).variants}))
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """The terrain of the case's run."""
-        p = self.checked(parameters)
+        p = self.check_parameters(parameters)
         return (p.variants[p.run].terrain,)
 
     def input_terrain(self, p: SharedDriveParameters, shared_input: int) -> tuple[TerrainBank, int]:
@@ -274,7 +274,7 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Track one target of one run with one step; all algorithms see the same pictures."""
-        p = self.checked(parameters)
+        p = self.check_parameters(parameters)
         key, point, algorithm = DriveKey.of(p, streams), p.targets[p.target], p.drive.algorithm
         drive = self._drive(key)
         case = key.drive.model_copy(update={"algorithm": algorithm, "vtt": p.drive.vtt})
@@ -294,7 +294,7 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
             "on_face": visibility.in_view and (p.face_deg is None or visibility.obliquity_max_deg <= p.face_deg),
         }
 
-        def judge(name: str) -> Judged:
+        def judge(name: str) -> CaseResult:
             return _judge(case, lambda: track_views(p, drive, name), known, name == algorithm)
 
         return case_result(p.drive.algorithms, judge, known)
@@ -306,7 +306,7 @@ def _judge(
     known: Mapping[str, Scalar],
     judged: bool,
     started: float | None = None,
-) -> Judged:
+) -> CaseResult:
     """Score a run; `judged` is the run of the algorithm under test, whose conditions and products are stored.
 
     `started` is the processor time at the start of a run that takes its own pictures.
@@ -318,7 +318,7 @@ def _judge(
 
     attempt = run_algorithm(track_and_score, lambda answer: cast(tuple[Run, dict[str, Scalar]], answer))
     if attempt.answer is None:
-        return Judged(attempt.outcome(str), False, attempt.row, failure=attempt.failure)
+        return CaseResult(attempt.outcome(str), False, attempt.row, failure=attempt.failure)
     run, row = attempt.answer
     if started is not None:
         row["run_time_s"] = time.process_time() - started
@@ -328,4 +328,6 @@ def _judge(
         row |= {**score.stored_updates(run, p.score.stored_updates), **score.run_conditions(p, run)}
         row |= picture_columns_of_hash(p.backend, digest)
     row |= scored(p.scores, score.scored_run(run), {*row, *known})
-    return Judged(run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, score.products(p, run) if judged else {})
+    return CaseResult(
+        run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, score.products(p, run) if judged else {}
+    )

@@ -124,7 +124,7 @@ class RunWorld:
 
 
 def place_rocks(p: RoverScenarioParameters, bare: SiteGround, rng: np.random.Generator) -> tuple[SiteGround, RockField]:
-    """Place the target's rock and the obstacles; remove the bank's rocks on them, and large ones near the route."""
+    """Location the target's rock and the obstacles; remove the bank's rocks on them, and large ones near the route."""
     bearing, centre = p.bearing_rad, np.array([p.world.east_m, p.world.north_m])
     along, right = np.array([np.sin(bearing), np.cos(bearing)]), np.array([-np.cos(bearing), np.sin(bearing)])
     shape = p.target.model_dump(include={"diameter_m", "height_m", "shape", "yaw_deg"})

@@ -25,8 +25,8 @@ from marsyard.algorithms.exchange.serving import end_persistent
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.streams import StreamedEstimator, set_span
+from marsyard.scenarios.algorithm_run import hash_inputs
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.handover import hash_inputs
 from marsyard.sim.measurements import DescentFrame, DescentMeasurements
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"

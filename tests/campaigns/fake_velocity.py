@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from marsyard.algorithms.answers import check_velocity
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.algorithm_run import Judged, case_result, run_algorithm
+from marsyard.scenarios.algorithm_run import case_result, run_algorithm
 from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.estimators import VELOCITY, Task
@@ -41,13 +41,13 @@ class FakeVelocityScenario:
         given = inputs.descent()
         measurements = replace(given, interval_velocities_m_s=given.interval_velocities_m_s + common)
 
-        def judge(algorithm: str) -> Judged:
+        def judge(algorithm: str) -> CaseResult:
             attempt = run_algorithm(
                 lambda: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case).estimate(measurements),
                 check_velocity,
             )
             velocity = None if attempt.answer is None else attempt.answer.velocity_m_s
-            return Judged(
+            return CaseResult(
                 outcome=attempt.outcome(lambda answer: answer.outcome.name),
                 answered=velocity is not None,
                 row={**velocity_row("velocity", velocity, inputs.DESCENT_VELOCITY_M_S[:2]), **attempt.row},

@@ -75,7 +75,7 @@ def test_pages_load_nothing_from_elsewhere(site: dict[Path, Page]) -> None:
 
 
 def test_every_scenario_has_a_page_of_its_keys(site: dict[Path, Page]) -> None:
-    from marsyard.scenarios.registry import scenario_names
+    from marsyard.scenarios.systems import scenario_names
 
     names = {path.stem for path in site}
     assert {f"parameters-{name}" for name in scenario_names()} <= names

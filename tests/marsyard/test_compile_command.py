@@ -7,8 +7,7 @@ from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.cli.app import app
-from marsyard.scenarios.registry import scenario_names
-from marsyard.scenarios.systems import systems
+from marsyard.scenarios.systems import scenario_names, systems
 from marsyard.sim.kernel_cache import mark_ready
 
 

@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.cli.app import app
 from marsyard.dataset import _prepare_inputs
+from marsyard.scenarios.descent.exposure import World
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.descent.world import World
 from marsyard.sim.camera import read_cahvor
 
 CAMPAIGN = """name = "samples"

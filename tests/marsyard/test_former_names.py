@@ -16,8 +16,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.store import record
 from marsyard.cli.app import main
 from marsyard.reports.stored import read_run
-from marsyard.scenarios.registry import scenario, scenario_names
-from marsyard.scenarios.systems import row_columns
+from marsyard.scenarios.systems import row_columns, scenario, scenario_names
 from marsyard.sim import renamed
 from marsyard.sim.renamed import RenamedWarning
 

@@ -13,9 +13,10 @@ from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.streams import StreamedEstimator
 from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios import estimators
-from marsyard.scenarios.algorithm_run import Judged, case_result, run_algorithm
+from marsyard.scenarios.algorithm_run import case_result, run_algorithm
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, check_algorithms, labels
+from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.velocity import consistency_row
 
 LIMITS = ExecutableLimits()
@@ -71,12 +72,12 @@ def test_the_same_algorithm_twice_is_refused() -> None:
 
 
 def test_what_one_algorithm_does_wrong_does_not_touch_the_others() -> None:
-    def judge(spec: str) -> Judged:
+    def judge(spec: str) -> CaseResult:
         def ask() -> float:
             return 1.0 / float(spec)
 
         tried = run_algorithm(ask, lambda answer: answer)
-        return Judged(
+        return CaseResult(
             tried.outcome(lambda _: "VALID"), tried.answer is not None, {"error_m": 0.5}, failure=tried.failure
         )
 

@@ -13,6 +13,7 @@ import pytest
 
 from marsyard import scenarios
 from marsyard.algorithms.interface import VelocityOutcome
+from marsyard.scenarios.exposure import camera_optics
 from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters
 from marsyard.scenarios.fieldtest.run import (
     Category,
@@ -31,7 +32,6 @@ from marsyard.scenarios.fieldtest.scenario import (
     scene_at,
     sun_at,
 )
-from marsyard.scenarios.optics import camera_optics
 from marsyard.scenarios.parts import ScoredFlight
 from marsyard.scenarios.views import Eye, site_scene
 from marsyard.sim.streams import Streams

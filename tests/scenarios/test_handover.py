@@ -21,10 +21,10 @@ from marsyard.algorithms.interface import (
     VelocityOutcome,
 )
 from marsyard.reports.verdicts import Status, judge_campaign
+from marsyard.scenarios.algorithm_run import Handover
 from marsyard.scenarios.conformance.inputs import descent
-from marsyard.scenarios.handover import Handover
 from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by
-from marsyard.scenarios.registry import scenario
+from marsyard.scenarios.systems import scenario
 from marsyard.scenarios.velocity import run_estimator
 from marsyard.sim.streams import Streams
 from tests.scenarios import spies

@@ -12,9 +12,9 @@ from marsyard.algorithms.exchange import ExecutableLimits, read_case
 from marsyard.algorithms.faults import AlgorithmError
 from marsyard.algorithms.hda import HdaOptions
 from marsyard.algorithms.interface import SiteOutcome, VelocityOutcome
+from marsyard.scenarios.algorithm_run import hash_inputs
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, algorithm_sources, labels
-from marsyard.scenarios.handover import hash_inputs
 from marsyard.scenarios.offline import SITE_FORM, VELOCITY_FORM, read_answers
 
 LIMITS = ExecutableLimits()

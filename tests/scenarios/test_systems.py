@@ -18,8 +18,19 @@ from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli.app import app
 from marsyard.doctor import Verdict, check_systems
 from marsyard.scenarios.estimators import shipped_names
-from marsyard.scenarios.registry import UnknownScenarioError, scenario, scenario_names, scenario_source
-from marsyard.scenarios.systems import BUILT_IN, problems, registry, row_columns, system_of, systems, template_paths
+from marsyard.scenarios.systems import (
+    BUILT_IN,
+    UnknownScenarioError,
+    problems,
+    registry,
+    row_columns,
+    scenario,
+    scenario_names,
+    scenario_source,
+    system_of,
+    systems,
+    template_paths,
+)
 
 CACHED = (registry, row_columns, shipped_names, requirements.shipped_requirements, requirements._read_shipped)
 HEAD = "from pathlib import Path\nfrom marsyard.scenarios.system import System\nHERE = Path(__file__).parent\n"

@@ -16,7 +16,7 @@ import pytest
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.scenarios.descent.optics import camera_optics
+from marsyard.scenarios.descent.exposure import camera_optics
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.scenarios.fieldtest.run import field_camera

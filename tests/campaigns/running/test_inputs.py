@@ -14,7 +14,7 @@ from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import append_cases
 from marsyard.campaigns.running.preparation import estimate, find_used_inputs, plan_inputs
 from marsyard.scenarios.interface import SelectsInputs
-from marsyard.scenarios.registry import scenario, scenario_names
+from marsyard.scenarios.systems import scenario, scenario_names
 from tests.campaigns.fake_campaign import HEAD, Silence, rows_of, run
 
 CampaignFile = Callable[..., Path]

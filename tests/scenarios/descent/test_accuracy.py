@@ -6,11 +6,9 @@ import numpy as np
 
 from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, Track
 from marsyard.algorithms.dimes.binning import altitudes_at_images
-from marsyard.scenarios.descent.exposure import take_exposures
+from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
 from marsyard.scenarios.descent.flight import create_flight, mean_velocities, picture_states
 from marsyard.scenarios.descent.measurement import Instruments, measure
-from marsyard.scenarios.descent.optics import camera_optics
-from marsyard.scenarios.descent.world import World
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import DescentMeasurements
 from marsyard.sim.sensor import Detector

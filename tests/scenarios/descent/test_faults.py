@@ -9,12 +9,18 @@ import pytest
 from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.descent.exposure import SHIELD_DIAMETER_M, HeatShield, add_haze, take_exposures
+from marsyard.scenarios.descent.exposure import (
+    SHIELD_DIAMETER_M,
+    HeatShield,
+    World,
+    add_haze,
+    calibrated_camera,
+    camera_optics,
+    take_exposures,
+)
 from marsyard.scenarios.descent.faults import Faults, faulty_altitudes, faulty_attitudes, faulty_terrain, faulty_times
 from marsyard.scenarios.descent.flight import create_flight, picture_states
-from marsyard.scenarios.descent.optics import calibrated_camera, camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters
-from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.faults import deliver, faulty_detector
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import direction, rigid

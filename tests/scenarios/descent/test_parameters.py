@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from marsyard.scenarios.descent.optics import calibrated_camera, camera_optics
+from marsyard.scenarios.descent.exposure import World, calibrated_camera, camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters, DescentScenarioParameters, binned_size_for
-from marsyard.scenarios.descent.world import World
 from marsyard.sim.sensor import CustomCamera
 from marsyard.sim.terrain import site
 
@@ -73,8 +72,7 @@ def test_a_site_is_lit_as_it_is() -> None:
     stated_for_earth = {"site": SITES[0], "detector": {"sun_au": 1.0}} | small
     dimmer = World.of(DescentScenarioParameters.model_validate(stated_for_earth))
     assert dimmer.brightness == pytest.approx(mars.brightness / 1.5**2)
-    scene = mars.scene(0.0, 0.0, 1400.0, 8.2e-4, caster_diameter_m=10.9)
-    assert scene.caster_diameter_m == 10.9
+    scene = mars.scene(0.0, 0.0, 1400.0, 8.2e-4)
     assert scene.photometry == mars.ground.photometry(mars.sun)
     assert len(scene.objects) > 0
 

@@ -6,18 +6,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from marsyard.algorithms.hda import Fate, HdaDetails, Matches
+from marsyard.algorithms.hda.view import View
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.scenarios.conformance.parts import motion
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.pictures import GroundTruth
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
-from marsyard.scenarios.landing.score import landing_row, site_populations, site_row
-from marsyard.scenarios.landing.truth import GroundTruth
+from marsyard.scenarios.landing.score import landing_row, site_populations, site_row, solved_row
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
+from marsyard.sim.sensor import preset
 from marsyard.sim.streams import Streams
 
 SAFE_SITE, UNSAFE_SITE = np.array([-3.0, 0.0, 0.0]), np.array([3.0, 0.0, 0.0])
@@ -92,3 +96,19 @@ def test_every_hazardous_flight_has_a_requirement_on_its_answer() -> None:
     (narrow,) = [one for one in asked if one.population == "narrow_site_exists"]
     # a verdict by confidence: "met" must be shown, not seen
     assert (narrow.metric, narrow.decide_by) == ("safe_or_no_site_reported", "confidence")
+
+
+def test_every_match_is_counted_by_what_became_of_it() -> None:
+    fates = np.repeat(np.array(list(Fate), dtype=np.uint8), [50, 4, 3, 2])
+    pixels, nothing = np.zeros((59, 2)), np.zeros(59)
+    matches = Matches(pixels, pixels, pixels, pixels, nothing, nothing, fates, np.zeros((50, 3)))
+    camera = preset("xc-55").cameras()[0]
+    view = View(np.zeros((480, 640), dtype=np.uint16), camera, rigid(Rotation.identity(), np.zeros(3)))
+    row = solved_row(HdaDetails((view, view), matches=matches))
+    assert row == {
+        "points": 50,
+        "matched_fraction": 50 / 59,
+        "matches_dissimilar": 4,
+        "matches_out_of_bounds": 3,
+        "matches_not_returned": 2,
+    }

@@ -1,11 +1,12 @@
-"""The light of a landing."""
+"""The light of a landing, and what its campaign builds before its flights."""
 
 from __future__ import annotations
 
 import pytest
 
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.pictures import World
+from marsyard.scenarios.landing.pictures import KEPT_GROUNDS, World
+from marsyard.scenarios.landing.scenario import LandingScenario
 from marsyard.sim.sensor import preset
 from marsyard.sim.terrain import site
 
@@ -26,3 +27,9 @@ def test_a_detectors_electrons_do_not_depend_on_where_the_sun_stood_in_its_datas
         p = LandingScenarioParameters.model_validate({**small, "detector": detector})
         electrons.append(World.of(p).brightness * p.detector.responsivity_e_s)
     assert electrons == pytest.approx([electrons[0]] * 3, rel=1e-12)
+
+
+@pytest.mark.parametrize(("bank", "built"), [(1, 1), (KEPT_GROUNDS, KEPT_GROUNDS), (KEPT_GROUNDS + 1, 0), (10_000, 0)])
+def test_terrains_of_a_bank_too_large_to_keep_are_built_by_their_flights(bank: int, built: int) -> None:
+    parameters = LandingScenarioParameters.model_validate({"location": {"bank": bank}})
+    assert LandingScenario().shared_inputs(parameters) == tuple(range(built))

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from marsyard.scenarios.descent.exposure import World
 from marsyard.scenarios.descent.flight import create_flight
 from marsyard.scenarios.descent.measurement import Instruments
-from marsyard.scenarios.descent.world import World
 from marsyard.scenarios.parts import DescentPlace, InstrumentReadings, InstrumentTruth, Poses, ScoredDescent
 from marsyard.scenarios.parts.scores import scored
 from marsyard.sim.streams import Streams
