@@ -19,7 +19,7 @@ class Fate(IntEnum):
     """Result of a structure match; the first failed check counts."""
 
     ACCEPTED = 0
-    UNLIKE = 1
+    DISSIMILAR = 1
     OUT_OF_BOUNDS = 2
     NOT_RETURNED = 3
 
@@ -130,7 +130,7 @@ def match_pixels(
     depths = triangulate(places, undistort(second.camera, matched), second_from_first)
     fates = np.full(len(pixels), Fate.ACCEPTED, dtype=np.uint8)
     fates[~((depths > bounds_m[0]) & (depths < bounds_m[1]))] = Fate.OUT_OF_BOUNDS
-    fates[~(correlations >= options.min_match_correlation)] = Fate.UNLIKE
+    fates[~(correlations >= options.min_match_correlation)] = Fate.DISSIMILAR
     if options.max_return_px is not None:
         left = np.flatnonzero(fates == Fate.ACCEPTED)
         way = return_distance(

@@ -25,7 +25,6 @@ from marsyard.cli.options import CampaignArgument, Exit, JsonOption, SetOption, 
 from marsyard.cli.render import gallery, render
 from marsyard.cli.report import compare, dashboard, report
 from marsyard.cli.terrain import app as terrain
-from marsyard.sim.renamed import RenamedWarning, current_options
 
 
 class _PlainFlags:
@@ -188,7 +187,10 @@ def main() -> None:
     # without `pgrep` loky warns at each worker's end, and works all the same
     warnings.filterwarnings("ignore", message="Failed to kill subprocesses")
     warnings.formatwarning = _format_warning
-    sys.argv[1:] = current_options(sys.argv[1:])
+    if not {"--help", "--version"}.issuperset(sys.argv[1:]):  # these answer before NumPy is imported
+        from marsyard.sim.renamed import current_options
+
+        sys.argv[1:] = current_options(sys.argv[1:])
     try:
         app()
     except Exception:

@@ -32,7 +32,7 @@ BORDER_PX = 12.0
 #: Minimum fraction of the features in both pictures to be tracked correctly.
 WELL_TRACKED = 0.9
 #: Reasons for dropped matches.
-DROPPED = (Fate.UNLIKE, Fate.OUT_OF_BOUNDS, Fate.NOT_RETURNED)
+DROPPED = (Fate.DISSIMILAR, Fate.OUT_OF_BOUNDS, Fate.NOT_RETURNED)
 #: Changes between pictures that tracking tolerates (section II.A): about the optical axis, about the others, of height.
 MAX_ROLL_DEG, MAX_TILT_DEG, MAX_CLIMB = 10.0, 20.0, 0.2
 #: Columns of tracks, motion, structure and map.

@@ -91,7 +91,6 @@ class RotorcraftParameters(Parameters):
             max_tilt_rad=rad * self.max_tilt_deg,
             gust_tilt_s_m=rad * self.gust_tilt_deg_s_m,
             gust_yaw_s_m=rad * self.gust_yaw_deg_s_m,
-            position_gain=self.position_gain,
             delay_steps=round(self.delay_s / self.step_s),
         )
 
