@@ -111,7 +111,7 @@ def test_landings_are_held_against_measured_and_true_poses(tmp_path: Path) -> No
     assert np.isclose(row["site_score_displacement_m"], row["max_translation_m"])
 
 
-@pytest.mark.parametrize(("pair_rotation_deg", "least", "most"), [(0.0, 0.0, 0.5), (0.5, 3.0, 12.0)])
+@pytest.mark.parametrize(("turned_deg", "least", "most"), [(0.0, 0.0, 0.5), (0.5, 3.0, 12.0)])
 def test_wrong_attitudes_show(tmp_path: Path, turned_deg: float, least: float, most: float) -> None:
     """An error about the direction of motion moves every match off its line by its angle in pixels."""
     folder = landing_folder(tmp_path / "in", inputs.landing(), "matching")
