@@ -175,6 +175,8 @@ _format_usual = warnings.formatwarning
 def _format_warning(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
 ) -> str:
+    from marsyard.sim.renamed import RenamedWarning
+
     return (
         f"warning: {message}\n"
         if issubclass(category, RenamedWarning)

@@ -53,7 +53,7 @@ def agreement_section(subject: Subject) -> Section | None:
     if "measured_case" not in frame or MEDIAN not in frame:
         return None
     # distances of further algorithms from the first come last
-    apart = [str(name) for name in frame if str(name).endswith((".apart_m_s", ".apart_m"))]
+    apart = [str(name) for name in frame if str(name).endswith((".difference_m_s", ".difference_m"))]
     names = [one for one in (*_QUANTITIES, *apart) if one in frame and np.isfinite(numbers(frame, one)).any()]
     medians = numbers(frame, MEDIAN)
     head = ["Case", "Name", "Outcome", *(label(name) for name in names)]

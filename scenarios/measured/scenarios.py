@@ -345,5 +345,5 @@ def _site_answer_row(
 
     motion = details.motion
     measured = errors([one.world_from_body for one in measurements.poses])
-    row |= {name.replace("_error_", "_beside_poses_"): value for name, value in measured.items()}
+    row |= {name.replace("_error_", "_pose_difference_"): value for name, value in measured.items()}
     return row if true_poses is None else {**row, **errors(true_poses)}

@@ -37,13 +37,13 @@ def test_the_section_tells_cases_and_what_is_apart() -> None:
             residual_median_px=residuals,
             residual_90_percent_px=[1.0, np.nan, 1.2, 3.0],
             matches=[120, 3, 90, 80],
-            **{"mine.apart_m_s": [0.1, np.nan, 0.3, 0.2]},
+            **{"mine.difference_m_s": [0.1, np.nan, 0.3, 0.2]},
         )
     )
     assert section is not None
     assert (section.data["cases"], section.data["unmatched"]) == (4, 1)
     assert section.data["median_of_medians_px"] == 0.6
-    assert section.data["apart"] == {"mine.apart_m_s": 0.2}
+    assert section.data["apart"] == {"mine.difference_m_s": 0.2}
     (block,) = section.blocks
     assert block.grid is not None
     assert list(block.grid.rows[0][:4]) == ["0", "a", "VALID", "120"]

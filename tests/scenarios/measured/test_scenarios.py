@@ -63,7 +63,7 @@ def test_descents_come_through_as_they_were_measured(tmp_path: Path, ned: bool) 
     )
     assert row["pair_discrepancy_m_s"] < 1.0
     other = np.array([row[f"phase_correlation.velocity_estimated_{axis}_m_s"] for axis in "xy"], dtype=np.float64)
-    assert np.isclose(row["phase_correlation.apart_m_s"], np.linalg.norm(other - found))
+    assert np.isclose(row["phase_correlation.difference_m_s"], np.linalg.norm(other - found))
     # the answer takes the constant error of (9, -4) m/s, 34 m between pictures, out of the inertial velocities
     assert row["residual_median_px"] < 1.5
     assert row["matches"] == row["phase_correlation.matches"]
