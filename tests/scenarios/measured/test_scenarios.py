@@ -108,7 +108,7 @@ def test_landings_are_held_against_measured_and_true_poses(tmp_path: Path) -> No
     assert row["rotation_error_deg"] < 0.5
     assert row["residual_median_px"] < 0.5
     assert np.isclose(row["max_translation_m"], np.linalg.norm([1.2, 0.2, -0.2]))
-    assert np.isclose(row["site_score_displacement_m"], row["max_translation_m"])
+    assert np.isclose(row["site_score_moved_m"], row["max_translation_m"])
 
 
 @pytest.mark.parametrize(("turned_deg", "least", "most"), [(0.0, 0.0, 0.5), (0.5, 3.0, 12.0)])
