@@ -69,17 +69,17 @@ def exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
 
 
 def _further_text(verdicts: Sequence[Verdict]) -> str:
-    """The further cases that decide all requirements, or why further cases cannot; may be empty."""
+    """The additional cases that decide all requirements, or why more cases cannot; may be empty."""
     limited = next((verdict for verdict in verdicts if verdict.advice), None)
     if limited is not None:
         return f" {limited.advice}"
     needed = [verdict for verdict in verdicts if verdict.further_cases is not None]
     if not needed:
         return ""
-    most = max(needed, key=lambda verdict: verdict.further_cases or 0)
-    counted = most.clustered is not None and most.clustered.method is ClusterMethod.TERRAIN_COUNT
-    where = ", each on a terrain of its own," if counted else ""
-    return f" {count(most.further_cases or 0, 'further case')}{where} would do if no more fail."
+    largest = max(needed, key=lambda verdict: verdict.further_cases or 0)
+    counted = largest.clustered is not None and largest.clustered.method is ClusterMethod.TERRAIN_COUNT
+    where = ", each on a new terrain," if counted else ""
+    return f" {count(largest.further_cases or 0, 'additional case')} without a failure{where} would decide."
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
         table.add_row(Text("none asked"), "", "", "", "", "")
     lines = []
     if any(not math.isnan(verdict.lower) for verdict in verdicts):
-        lines.append("Bounds: one-sided Clopper-Pearson at the stated confidence. Needed: further cases if none fails.")
+        lines.append("Bounds: one-sided Clopper-Pearson at the stated confidence. Needed: more cases without failure.")
     if len(verdicts) > 1 and verdicts[0].note and len({verdict.note for verdict in verdicts}) == 1:
         lines.append(verdicts[0].note)
     else:

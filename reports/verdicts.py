@@ -159,7 +159,7 @@ class Verdict:
         if self.plain_status is not None and self.plain_status is not self.status:
             text += f" Independent cases would show at least {percent(self.plain_lower)}: {self.plain_status}."
         if shared.method is ClusterMethod.TERRAIN_COUNT and self.further_cases and self.decide_by != ESTIMATE:
-            text += f" {count(self.further_cases, 'further terrain')} would do if no case fails on them."
+            text += f" {count(self.further_cases, 'additional terrain')} without a failure would decide."
         return text
 
     def _look(self) -> str:
@@ -251,7 +251,7 @@ def _confidences(
 
 
 def _cases_needed(first: int, n: int, failures: int, probability: float, confidence: float, looks: Looks) -> int:
-    """Total of cases that pass the requirement if no more fail."""
+    """Total of cases that pass the requirement without a further failure."""
     if looks.share < 1.0:
         return n + further_cases_needed(n, failures, probability, confidence_at(confidence, looks.share))
     return LaterLook(1.0 - probability, 1.0 - confidence, first).cases_needed(n, failures)

@@ -315,7 +315,7 @@ def test_shared_terrains_decide(velocity: dict[str, Any]) -> None:
     assert verdict.lower == proportion_lower(8, 8, 0.9)
     assert verdict.plain_lower == proportion_lower(400, 400, 0.9)
     assert verdict.further_cases == 297 - 8
-    for said in ("8 terrains", "not independent", "289 further terrains", "PASS"):
+    for said in ("8 terrains", "not independent", "289 additional terrains", "PASS"):
         assert said in verdict.note
     enough = _judge(_rows(460, 0).assign(terrain=np.arange(460) % 230), velocity)
     assert enough.status is Status.PASS
