@@ -18,7 +18,7 @@ from benchmarks.pictures import descent_scene
 from benchmarks.stages import Stages, profiled
 from benchmarks.timing import Figure, core_seconds
 from marsyard.sim.render.kernels.ground import height_range
-from marsyard.sim.render.kernels.strips import STRIP, Near, fetch_cells, no_cells, spline
+from marsyard.sim.render.kernels.strips import STRIP, FetchedCells, fetch_cells, no_cells, spline
 from marsyard.sim.terrain.kernels import Array, Level
 
 PICTURES, SIDE_PX = 3, 1024
@@ -57,7 +57,7 @@ def _splines() -> Callable[[], object]:
 @njit(cache=True)
 def _summed(field: Level, scale: float, x: Array, y: Array) -> float:
     """Sum of heights, slopes and albedos at positions."""
-    near: Near = no_cells()
+    near: FetchedCells = no_cells()
     which = np.arange(STRIP)
     total = 0.0
     for first in range(0, x.size, STRIP):
@@ -67,7 +67,7 @@ def _summed(field: Level, scale: float, x: Array, y: Array) -> float:
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
-def _strip(near: Near) -> float:
+def _strip(near: FetchedCells) -> float:
     total = 0.0
     for k in range(STRIP):
         height, slope_x, slope_y, albedo = spline(near[0], near[1], k)

@@ -76,7 +76,7 @@ def run(console: Console, *, as_json: bool = False) -> int:
     rows = []
     for check in checks:
         word = check.verdict.name.lower()
-        rows.append({"check": check.name, "found": check.finding, "verdict": word, "mend": check.remedy})
+        rows.append({"check": check.name, "finding": check.finding, "verdict": word, "remedy": check.remedy})
         table.add_row(Text(check.name), Text(check.finding), Text(word, check.verdict.value))
     if as_json:
         summary = {"version": version, "root": str(ROOT), "can_run": not failed, "checks": rows}

@@ -95,10 +95,10 @@ def page_context(
     crashed = [text] if whole.crashed else []
     context: dict[str, Any] = {
         "run": run,
-        "description": str(run.said("description") or ""),
+        "description": str(run.recorded("description") or ""),
         "whole": whole,
         "cautions": [*crashed, *sampling_cautions(run, metric)],
-        "interrupted": run.said("state") not in (None, "finished"),
+        "interrupted": run.recorded("state") not in (None, "finished"),
         "verdicts": [sections.verdict_row(verdict) for verdict in verdicts],
         "metric": metric,
         "bound": bound,
@@ -166,7 +166,7 @@ def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict
     twin = {
         "schema": SCHEMA,
         "campaign": run.name,
-        **{key: run.said(key) for key in ("state", "seed", "git_commit", "started_utc", "finished_utc")},
+        **{key: run.recorded(key) for key in ("state", "seed", "git_commit", "started_utc", "finished_utc")},
         "cases": len(run.whole),
         "crashed": whole.crashed,
         "sites": _kinds(run.frame, "site"),

@@ -272,16 +272,18 @@ def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[C
 
 def same_draws(first: StoredRun, second: StoredRun) -> bool:
     """Whether equal case numbers are the same case in both campaigns."""
-    return all(first.said(key) == second.said(key) for key in ("name", "scenario", "seed", "dispersions", "design"))
+    return all(
+        first.recorded(key) == second.recorded(key) for key in ("name", "scenario", "seed", "dispersions", "design")
+    )
 
 
 def have_same_terrains(first: StoredRun, second: StoredRun) -> bool:
     """Whether equal terrain numbers are the same terrain: all parameters but the algorithm's are equal."""
     worlds = [
-        {name: value for name, value in table(run.said("parameters")).items() if name != "algorithm"}
+        {name: value for name, value in table(run.recorded("parameters")).items() if name != "algorithm"}
         for run in (first, second)
     ]
-    return worlds[0] == worlds[1] and first.said("scenario") == second.said("scenario")
+    return worlds[0] == worlds[1] and first.recorded("scenario") == second.recorded("scenario")
 
 
 def campaign_diff_grid(names: Sequence[str], found: Sequence[Contrast]) -> Grid:

@@ -112,8 +112,8 @@ def sampled(configuration: Mapping[str, Any]) -> SamplingDesign:
     design = table(configuration.get("design"))
     dispersions = table(configuration.get("dispersions"))
     grids = tuple(str(path) for path, one in dispersions.items() if table(one).get("distribution") == "grid")
-    most = configuration.get("max_cases")
-    max_cases = most if isinstance(most, int) and not isinstance(most, bool) and most > 0 else None
+    limit = configuration.get("max_cases")
+    max_cases = limit if isinstance(limit, int) and not isinstance(limit, bool) and limit > 0 else None
     first = configuration.get("cases") if configuration.get("appended") else None
     return SamplingDesign(
         str(design.get("kind") or RANDOM),

@@ -131,7 +131,7 @@ _HIDDEN = ("distribution", "source", "unit", "description")
 def dispersion_grid(run: StoredRun) -> Grid:
     """Dispersions, and the values applied in the rows."""
     rows = []
-    for path, value in table(run.said("dispersions")).items():
+    for path, value in table(run.recorded("dispersions")).items():
         dispersion, parts = table(value), str(path).split(".")
         # a column is named like the parameter's path, or like the end of its path
         names = [str(path), *("_".join(parts[start:]) for start in range(len(parts)))]
@@ -150,7 +150,7 @@ def dispersion_grid(run: StoredRun) -> Grid:
 
 def provenance(run: StoredRun) -> list[tuple[str, str]]:
     """Campaign, algorithms, program and machine."""
-    environment, times = table(run.said("environment")), numbers(run.frame, "cpu_time_s")
+    environment, times = table(run.recorded("environment")), numbers(run.frame, "cpu_time_s")
     times = times[np.isfinite(times)]
     algorithms: list[tuple[str, Any]] = []
     for one in algorithms_of(run.record):
@@ -159,19 +159,19 @@ def provenance(run: StoredRun) -> list[tuple[str, str]]:
         algorithms += [(f"{head}: sources", one.source_hash), (f"{head}: options", one.options_text)]
     facts = [
         ("Campaign", run.name),
-        ("Scenario", run.said("scenario")),
+        ("Scenario", run.recorded("scenario")),
         *algorithms,
-        ("State", run.said("state")),
-        ("Root seed", run.said("seed")),
+        ("State", run.recorded("state")),
+        ("Root seed", run.recorded("seed")),
         ("Sampling", sampled(run.configuration).text),
-        ("Cases asked", run.said("cases")),
+        ("Cases asked", run.recorded("cases")),
         ("Cases stored", len(run.whole)),
-        ("Started", run.said("started_utc")),
-        ("Finished", run.said("finished_utc")),
-        ("Worker processes", run.said("jobs")),
+        ("Started", run.recorded("started_utc")),
+        ("Finished", run.recorded("finished_utc")),
+        ("Worker processes", run.recorded("jobs")),
         ("Processor time of a case", f"{number(float(times.mean()))} s on average" if times.size else None),
-        ("Commit", run.said("git_commit")),
-        ("Marsyard", table(run.said("versions")).get("marsyard")),
+        ("Commit", run.recorded("git_commit")),
+        ("Marsyard", table(run.recorded("versions")).get("marsyard")),
         *((f"Machine: {name}", value) for name, value in environment.items() if value not in ({}, None)),
         ("GL backend", _only_values(run.frame, "gl_backend")),
         ("GL version", _only_values(run.frame, "gl_version")),
@@ -181,7 +181,7 @@ def provenance(run: StoredRun) -> list[tuple[str, str]]:
 
 def versions(run: StoredRun) -> list[tuple[str, str]]:
     """Packages and their versions."""
-    return [(str(name), _plain(version)) for name, version in table(run.said("versions")).items()]
+    return [(str(name), _plain(version)) for name, version in table(run.recorded("versions")).items()]
 
 
 def replay_command(run: StoredRun, case: str) -> str:
@@ -197,13 +197,13 @@ def rerun_commands(run: StoredRun) -> list[str]:
     if run.command is None:
         words = ["marsyard", "run", run.name]
         for option, key in (("-n", "cases"), ("--seed", "seed")):
-            if run.said(key) is not None:
-                words += [option, str(run.said(key))]
+            if run.recorded(key) is not None:
+                words += [option, str(run.recorded(key))]
         return [shlex.join(words)]
     folder, words = run.command[0], list(run.command[1])
     blocks = run.configuration.get("appended")
     # a campaign that stops itself appends its blocks itself
-    added = [] if run.said("max_cases") or not isinstance(blocks, list | tuple) else blocks
+    added = [] if run.recorded("max_cases") or not isinstance(blocks, list | tuple) else blocks
     target = f"runs/{run.name}-again"
     if added:
         words += ["--out", target]

@@ -51,12 +51,12 @@ class StoredRun:
     @property
     def name(self) -> str:
         """The campaign's name; the folder's if the record has none."""
-        return str(self.said("name") or self.directory.resolve().name)
+        return str(self.recorded("name") or self.directory.resolve().name)
 
     @property
     def requirements(self) -> list[Mapping[str, Any]]:
         """The requirements of the campaign."""
-        asked = self.said("requirements")
+        asked = self.recorded("requirements")
         return [item for item in asked if isinstance(item, Mapping)] if isinstance(asked, list | tuple) else []
 
     @property
@@ -68,7 +68,7 @@ class StoredRun:
             return None
         return str(stored.get("folder") or ""), tuple(str(word) for word in words)
 
-    def said(self, key: str) -> Any:
+    def recorded(self, key: str) -> Any:
         """Value of a key in the record or in its configuration; None if missing."""
         found = self.record.get(key)
         return found if found is not None else self.configuration.get(key)

@@ -146,7 +146,7 @@ def coarse_to_fine_peak(
     for small, large in reversed(pyramid[:-1]):
         a, bright = kernels.centred(np.ascontiguousarray(small, dtype=np.float32))
         b = np.ascontiguousarray(large, dtype=np.float32)
-        places, values = kernels.best_near(a, b, 2 * places, REACH_PX, _flat_energy(small, bright))
+        places, values = kernels.search_near(a, b, 2 * places, REACH_PX, _flat_energy(small, bright))
     best = int(np.argmax(values))
     row, column = (int(i) for i in places[best])
     last = (window.shape[0] - template.shape[0], window.shape[1] - template.shape[1])

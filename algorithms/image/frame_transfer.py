@@ -41,4 +41,4 @@ def remove_frame_transfer(
             f"{a} s and {b} s per row with {n} rows summed"
         )
     values = np.ascontiguousarray(signal, dtype=np.float64)
-    return np.asarray(kernels.without(values, calibration.exposure_s, own, before, n * b))
+    return np.asarray(kernels.remove_frame_transfer(values, calibration.exposure_s, own, before, n * b))

@@ -47,7 +47,7 @@ def shifted_patch(
     places = (corner - whole)[:, np.newaxis] - _TAPS
     taps = np.stack([_BASIS(places), _SLOPE(places)])
     samples = np.empty((3, *shape))
-    quintic.shifted(coefficients, int(whole[0]), int(whole[1]), taps[:, 0], taps[:, 1], samples)
+    quintic.sample_with_derivatives(coefficients, int(whole[0]), int(whole[1]), taps[:, 0], taps[:, 1], samples)
     return samples
 
 

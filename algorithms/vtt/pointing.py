@@ -78,12 +78,12 @@ def middle(camera: CameraModel) -> Float[np.ndarray, "2"]:
 
 
 def box_around(
-    pixels: Float[np.ndarray, "n 2"], margin_px: float, camera: CameraModel, beside_px: float = 0.0
+    pixels: Float[np.ndarray, "n 2"], margin_px: float, camera: CameraModel, horizontal_px: float = 0.0
 ) -> PixelBox | None:
-    """The part of the frame within the margin of all pixels, wider by `beside_px`; None if a pixel is outside."""
+    """The part of the frame within the margin of all pixels, wider by `horizontal_px`; None if a pixel is outside."""
     if not bool(np.all(camera.in_frame(pixels))):
         return None
-    margin = margin_px + np.array([beside_px, 0.0])
+    margin = margin_px + np.array([horizontal_px, 0.0])
     near = np.maximum(np.floor(pixels.min(axis=0) - margin + _SLACK_PX).astype(int), 0)
     far = np.minimum(np.ceil(pixels.max(axis=0) + margin - _SLACK_PX).astype(int) + 1, camera.size)
     return PixelBox((int(near[0]), int(near[1])), (int(far[0] - near[0]), int(far[1] - near[1])))

@@ -86,8 +86,8 @@ def _environments(checks: Sequence[Check], kept: dict[str, dict]) -> str:
         groups: dict[str, list[str]] = {}
         for name, environment in stored.items():
             groups.setdefault(environment[key], []).append(name)
-        most = max(groups, key=lambda value: len(groups[value]))
-        common.append(f"{label}{most}")
-        different += [f"{', '.join(names)}: {label}{value}" for value, names in groups.items() if value != most]
+        usual = max(groups, key=lambda value: len(groups[value]))
+        common.append(f"{label}{usual}")
+        different += [f"{', '.join(names)}: {label}{value}" for value, names in groups.items() if value != usual]
     exceptions = "".join(f" Except {one}." for one in different)
     return f"Measured on {'; '.join(common)}.{exceptions}"

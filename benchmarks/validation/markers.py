@@ -115,7 +115,7 @@ def _scattered(size: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
 
 
 def _picture_area(camera: CameraModel, ground: Ground, points: np.ndarray) -> np.ndarray:
-    """Pixels that a square metre of plan takes in the picture."""
+    """Area in the picture of a square metre of plan, pixels."""
     jacobian = camera.projection_jacobian(points)
     gradient = ground.gradient(points[..., 0], points[..., 1])
     by_plan = jacobian[..., :2] + jacobian[..., 2:] * gradient[..., None, :]

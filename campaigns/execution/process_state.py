@@ -235,7 +235,7 @@ def _name_other_children() -> list[str]:
 
 
 def seed_generators(item: int) -> None:
-    """Seed the global random generators: a case draws the same numbers from them, whatever ran before it."""
+    """Seed the global random generators, so that a case does not depend on the cases before it."""
     random.seed(item)
     np.random.seed(item % 2**32)  # noqa: NPY002 (for cases, not for the engine)
     if "cv2" in sys.modules:

@@ -79,7 +79,7 @@ def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
     Raises StoreError where the folder holds no campaign with rows, or the report cannot be written.
     """
     found = judged(directory, requirements)
-    if requirements is None and found.run.said("state") == "finished":
+    if requirements is None and found.run.recorded("state") == "finished":
         record.update(directory, {"exit_code": found.exit_code})
     with writing("the report"):
         return found, write_evaluation(found)

@@ -157,7 +157,7 @@ class Curve:
         return f"{value:.1f} {self.change['unit']}"
 
     @property
-    def least_within(self) -> float:
+    def min_fraction_within_limit(self) -> float:
         """Minimum fraction of all sizes up to the paper's limit."""
         shares = [at.tracked.share for at in self.points if abs(at.size) <= 1.001 * self.change["paper"]]
         return float(np.nanmin(shares)) if shares and not np.all(np.isnan(shares)) else math.nan
@@ -176,7 +176,7 @@ def limits_section(subject: Subject) -> Section | None:
             "Paper's limit": lambda one: f"{one.change['paper']:g} {one.change['unit']}",
             "Knee": lambda one: one.knee_text(one.knee_up, 1.0),
             "Knee, negative change": lambda one: one.knee_text(one.knee_down, -1.0),
-            "Minimum share within the paper's limit": lambda one: percent(one.least_within),
+            "Minimum share within the paper's limit": lambda one: percent(one.min_fraction_within_limit),
         },
     )
     by_size = grid_of(

@@ -21,14 +21,15 @@ from marsyard.reports.section import Block, Grid, Section, Subject, plate
 from marsyard.reports.svg import MARKERS, SERIES, in_page_style, new_axes
 from marsyard.reports.wording import NOTHING, number
 
-MEDIAN, MOST = "residual_median_px", "residual_90_percent_px"
+MEDIAN, PERCENTILE_90 = "residual_median_px", "residual_90_percent_px"
 #: Maximum number of rows of the table; further cases are counted.
 _MAX_ROWS = 60
 #: Minimum number of cases for a figure.
 _MIN_DRAWN = 3
 #: Further columns of the table where the rows have them.
 _QUANTITIES = (
-    "matches", "outlier_fraction", MEDIAN, MOST, "residual_worst_pair_px", "max_rotation_deg", "max_translation_m",
+    "matches", "outlier_fraction", MEDIAN, PERCENTILE_90, "residual_worst_pair_px", "max_rotation_deg",
+    "max_translation_m",
     "inertial_difference_m_s", "pair_discrepancy_m_s", "rotation_pose_difference_deg", "direction_pose_difference_deg",
     "baseline_pose_difference_fraction",
 )  # fmt: skip
@@ -80,12 +81,12 @@ def agreement_section(subject: Subject) -> Section | None:
 @in_page_style
 def residual_figure(frame: pd.DataFrame) -> Figure:
     """Median and 90 % residual of each case, ordered by the median."""
-    medians, most = numbers(frame, MEDIAN), numbers(frame, MOST)
+    medians, percentile_90 = numbers(frame, MEDIAN), numbers(frame, PERCENTILE_90)
     known = np.flatnonzero(np.isfinite(medians))
     order = known[np.argsort(medians[known], kind="stable")]
     places = np.arange(1, order.size + 1)
     figure, axes = new_axes(6.2, 3.2)
-    for values, name, place in ((most, "90 %", 1), (medians, "median", 0)):
+    for values, name, place in ((percentile_90, "90 %", 1), (medians, "median", 0)):
         axes.plot(places, values[order], MARKERS[place], color=SERIES[place], markersize=5.0, label=name)
     axes.set(xlabel="case, in order of the median", ylabel="residual (px)", ylim=(0.0, None))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -76,14 +76,14 @@ def _least_absolute_plane(x: Array, y: Array, z: Array, weights: Array) -> Array
     plane, before = np.empty(3), np.empty(3)
     weights[:] = 1.0
     _weighted_plane(x, y, z, weights, plane)
-    reach = max(np.abs(x).max(), np.abs(y).max())
+    extent = max(np.abs(x).max(), np.abs(y).max())
     for _ in range(MAX_ITERATIONS):
         before[:] = plane
         for i in range(x.size):
             weights[i] = 1.0 / max(abs(z[i] - plane[0] - plane[1] * x[i] - plane[2] * y[i]), SMOOTHED_M)
         _weighted_plane(x, y, z, weights, plane)
-        moved = abs(plane[0] - before[0]) + reach * (abs(plane[1] - before[1]) + abs(plane[2] - before[2]))
-        if moved < CONVERGED_M:
+        change = abs(plane[0] - before[0]) + extent * (abs(plane[1] - before[1]) + abs(plane[2] - before[2]))
+        if change < CONVERGED_M:
             break
     return plane
 
@@ -114,13 +114,13 @@ def footprints(
         for m in range(n):
             z[m] = heights[row + fitted[m, 0], column + fitted[m, 1]]
         plane = _least_absolute_plane(x, y, z, weights)
-        most, over = 0.0, 0
+        max_distance, over = 0.0, 0
         for m in range(offsets.shape[0]):
             i, j = offsets[m, 0], offsets[m, 1]
             away = abs(heights[row + i, column + j] - plane[0] - plane[1] * j * spacing - plane[2] * i * spacing)
-            most = max(most, away)
+            max_distance = max(max_distance, away)
             over += away > limit
         slopes[k] = math.atan(math.hypot(plane[1], plane[2]))
-        roughness[k] = most
+        roughness[k] = max_distance
         exceeding[k] = over * spacing * spacing
     return slopes, roughness, exceeding

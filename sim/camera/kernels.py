@@ -42,7 +42,7 @@ def radial_image(
     along_x, along_y, along_z = points
     h, v, a = image_plane
     count = along_x.size
-    columns, rows, seen = np.empty(count), np.empty(count), np.empty(count, dtype=np.bool_)
+    columns, rows, is_visible = np.empty(count), np.empty(count), np.empty(count, dtype=np.bool_)
     for n in range(count):
         x, y, z = along_x[n], along_y[n], along_z[n]
         omega = _dot(axis, x, y, z)
@@ -54,8 +54,8 @@ def radial_image(
         row += mu * (row - axis_image[1] * omega)
         depth += mu * (depth - axis_image[2] * omega)
         columns[n], rows[n] = column / depth, row / depth
-        seen[n] = omega > 0.0 and tau < tau_limit and depth > 0.0
-    return columns, rows, seen
+        is_visible[n] = omega > 0.0 and tau < tau_limit and depth > 0.0
+    return columns, rows, is_visible
 
 
 @njit(cache=True, inline="always")

@@ -150,7 +150,7 @@ def _split(position: float, size: int) -> tuple[int, np.float32]:
 
 
 @njit(cache=True)
-def _add_moved(
+def _add_shifted(
     source: Array32, shape: tuple[int, int], y: float, x: float, factor: np.float32, line: Array32, width: int
 ) -> None:
     """Add factor times a picture at row y and columns x, x + 1, ... to a line, with bilinear interpolation.
@@ -220,8 +220,8 @@ def gather_blocks(transfer: Transfer, prefix: Array32, response: Array32) -> Arr
                 by_row, by_column = velocity_at(transfer.field, transfer.step, middle - 0.5, left + 0.5 * (width - 1))
                 y, x = pad - by_row * time, pad + left - by_column * time
                 line[:] = 0.0
-                _add_moved(sums, prefix.shape, edges[block + 1] + y, x, np.float32(1.0), line, width)
-                _add_moved(sums, prefix.shape, edges[block] + y, x, np.float32(-1.0), line, width)
+                _add_shifted(sums, prefix.shape, edges[block + 1] + y, x, np.float32(1.0), line, width)
+                _add_shifted(sums, prefix.shape, edges[block] + y, x, np.float32(-1.0), line, width)
                 for c in range(width):
                     out[start, left + c] += response[block, left + c] * line[c]
     return out
@@ -238,8 +238,8 @@ def add_smear(transfer: Transfer, gathered: Array32, charge: Array32) -> None:
     columns = response.shape[1]
     seconds = np.float32(transfer.row_s)
     scene, weights, total = padded.reshape(-1), response.reshape(-1), charge.reshape(-1)
-    moved = np.empty((np.max(np.diff(edges)), TILE), dtype=np.float32)
-    own, before = np.empty(TILE, dtype=np.float32), np.empty(TILE, dtype=np.float32)
+    shifted = np.empty((np.max(np.diff(edges)), TILE), dtype=np.float32)
+    in_block, before = np.empty(TILE, dtype=np.float32), np.empty(TILE, dtype=np.float32)
     change = np.empty(TILE, dtype=np.float32)
     for block in range(len(edges) - 1):
         first, last = edges[block], edges[block + 1]
@@ -249,21 +249,21 @@ def add_smear(transfer: Transfer, gathered: Array32, charge: Array32) -> None:
             middle = 0.5 * (first + last - 1)
             by_row, by_column = velocity_at(transfer.field, transfer.step, middle, left + 0.5 * (width - 1))
             y, x = pad - by_row * time, pad + left - by_column * time
-            moved[:], own[:] = 0.0, 0.0
+            shifted[:], in_block[:] = 0.0, 0.0
             for k in range(width):
                 before[k] = gathered[block, left + k]
                 change[k] = gathered[block + 1, left + k] - before[k]
             for r in range(first, last):
-                line = moved[r - first]
-                _add_moved(scene, padded.shape, r + y, x, np.float32(1.0), line, width)
+                line = shifted[r - first]
+                _add_shifted(scene, padded.shape, r + y, x, np.float32(1.0), line, width)
                 start = np.uint64(r * columns + left)
                 for k in range(width):
                     line[k] *= weights[start + np.uint64(k)]
                     change[k] -= line[k]
             for r in range(first, last):
                 fraction = np.float32((r - first) / (last - first))
-                line = moved[r - first]
+                line = shifted[r - first]
                 start = np.uint64(r * columns + left)
                 for k in range(width):
-                    total[start + np.uint64(k)] += seconds * (before[k] + fraction * change[k] + own[k])
-                    own[k] += line[k]
+                    total[start + np.uint64(k)] += seconds * (before[k] + fraction * change[k] + in_block[k])
+                    in_block[k] += line[k]

@@ -152,7 +152,7 @@ def test_featureless_terrain_has_no_contrast() -> None:
 
 
 @pytest.mark.parametrize("wavelength_m", [45.0, 80.0])
-def test_repetitive_terrain_is_told_by_its_second_peak(wavelength_m: float) -> None:
+def test_repetitive_terrain_is_recognised_by_its_second_peak(wavelength_m: float) -> None:
     answer = ESTIMATOR.estimate(render(flown((10.0, 5.0)), waves(wavelength_m), np.random.default_rng(4)))
     assert answer.outcome is VelocityOutcome.NO_VALID_TRACK
     assert all(ValidityCheck.SECOND_PEAK in track.failed for track in details_of(answer).tracks)

@@ -197,7 +197,7 @@ for number, line in enumerate(sys.stdin):
 """
 
 
-def test_a_persistent_program_answers_many_cases_and_is_started_anew(
+def test_a_persistent_program_answers_many_cases_and_is_started_again(
     measured: DescentMeasurements, tmp_path: Path
 ) -> None:
     spec = f"serve:{program(tmp_path, SERVER)}"

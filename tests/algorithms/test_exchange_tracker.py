@@ -205,10 +205,10 @@ def test_what_a_tracker_is_given_comes_back_as_it_was(tmp_path: Path) -> None:
         assert mine.size == its.size
     aim = VisualTargetTracker(VttOptions())
     aim.designate(trackers.designation(), trackers.pose(0.0))
-    told = aim.aim(trackers.pose(0.0), mast)
-    assert told is not None
+    reported = aim.aim(trackers.pose(0.0), mast)
+    assert reported is not None
     turned = RigidTransform.from_components([1.0, 2.0, 3.0], Rotation.from_rotvec([0.1, -0.2, 0.3]))
-    stop = replace(trackers.take_pictures(told, trackers.pose(0.0)), world_from_rover=turned)
+    stop = replace(trackers.take_pictures(reported, trackers.pose(0.0)), world_from_rover=turned)
     write_stop(tmp_path, stop)
     back = read_stop(tmp_path, known)
     np.testing.assert_array_equal(back.left.counts, stop.left.counts)
@@ -232,6 +232,6 @@ def test_what_a_tracker_is_given_comes_back_as_it_was(tmp_path: Path) -> None:
         SiteTarget(np.array([1.0, 2.0, -3.0])),
     ],
 )
-def test_targets_are_told_in_each_of_the_three_ways(target: TargetDesignation) -> None:
+def test_targets_are_reported_in_each_of_the_three_ways(target: TargetDesignation) -> None:
     assert encode_target(read_target(encode_target(target))) == encode_target(target)
     assert type(read_target(encode_target(target))) is type(target)

@@ -151,13 +151,13 @@ def test_the_ground_before_the_mast_is_not_mapped_until_two_metres_were_driven()
 
 def test_paths_keep_to_mapped_ground() -> None:
     terrain = _is_mapped(-2.6, (90.0,), ())
-    beside = navigate(terrain, _pose(0.0, 0.0), np.array([2.2, 2.2]), 0.5, OPTIONS)
-    assert beside.outcome is NavigationOutcome.NO_PATH
+    adjacent = navigate(terrain, _pose(0.0, 0.0), np.array([2.2, 2.2]), 0.5, OPTIONS)
+    assert adjacent.outcome is NavigationOutcome.NO_PATH
 
 
 def test_only_rocks_in_a_wedge_are_seen_and_twice_is_once() -> None:
-    ahead, beside = _rock(5.0, 0.0, name="ahead"), _rock(0.0, 5.0, name="beside")
-    terrain = _is_mapped(0.0, (90.0,), (ahead, beside))
+    ahead, adjacent = _rock(5.0, 0.0, name="ahead"), _rock(0.0, 5.0, name="adjacent")
+    terrain = _is_mapped(0.0, (90.0,), (ahead, adjacent))
     assert [rock.name for rock in terrain.obstacles] == ["ahead"]
     moved = _rock(5.2, 0.1, name="ahead")
     again = terrain.sensed(terrain.wedges[0], (moved,))

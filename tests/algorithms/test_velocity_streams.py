@@ -98,7 +98,7 @@ def test_an_estimator_of_three_takes_no_more() -> None:
 
 
 @pytest.mark.parametrize(
-    ("span", "said"),
+    ("span", "message"),
     [
         ((1.0, 2.5), r"span_s is \(1.0, 2.5\); allowed: within the pictures' tags, 0.0 to 2.0 s"),
         ((-0.1, 1.0), "within the pictures' tags"),
@@ -108,10 +108,10 @@ def test_an_estimator_of_three_takes_no_more() -> None:
         ((0.0, "1"), "a tuple of two time tags, or None"),
     ],
 )
-def test_spans_that_are_none(span: object, said: str) -> None:
+def test_spans_that_are_none(span: object, message: str) -> None:
     answer = valid()
     object.__setattr__(answer, "span_s", span)
-    with pytest.raises(AlgorithmError, match=said) as caught:
+    with pytest.raises(AlgorithmError, match=message) as caught:
         check_velocity(answer, (0.0, 1.0, 2.0))
     assert caught.value.fault is Fault.BAD_ANSWER
 

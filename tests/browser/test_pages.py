@@ -63,7 +63,7 @@ def _violations(page: Page) -> list[str]:
     return [f"{one['id']}: {node['html']}" for one in found for node in one["nodes"]]
 
 
-def test_the_verdict_is_the_first_thing_to_see(campaigns: Path, open_page: Open) -> None:
+def test_the_verdict_is_the_first_item_to_see(campaigns: Path, open_page: Open) -> None:
     page, seen = open_page(_report(campaigns))
     headline = page.locator(".headline")
     assert headline.is_visible()
@@ -85,9 +85,9 @@ def test_hovering_shows_a_case_and_a_click_opens_it(campaigns: Path, open_page: 
     tip = page.locator(".explorer-tip")
     assert tip.is_visible()
     assert tip.inner_text().startswith("Case ")
-    told = tip.inner_text().split(":")[0]
+    reported = tip.inner_text().split(":")[0]
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    assert page.locator(".explorer-detail h3").inner_text().startswith(told)
+    assert page.locator(".explorer-detail h3").inner_text().startswith(reported)
     assert "marsyard replay" in page.locator(".explorer-detail").inner_text()
     assert seen.complaints == []
 

@@ -12,7 +12,7 @@ from urllib.parse import unquote, urlsplit
 import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
-LEAST_PAGES = 40
+MIN_PAGES = 40
 
 
 class Page(HTMLParser):
@@ -43,7 +43,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Page]:
     done = subprocess.run([*command, str(DOCS), str(out / "html")], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     pages = {path: Page(path.read_text(encoding="utf-8")) for path in (out / "html").rglob("*.html")}
-    assert len(pages) >= LEAST_PAGES
+    assert len(pages) >= MIN_PAGES
     return pages
 
 

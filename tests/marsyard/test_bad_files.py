@@ -68,7 +68,7 @@ DETECTOR = '[parameters.detector]\nfile = "{}"'
 
 
 @pytest.mark.parametrize(
-    ("table", "name", "write", "said"),
+    ("table", "name", "write", "message"),
     [
         (TERRAIN, "projection.tif", lambda path: dtm(path, crs=DEGREES), "is in degrees; project it to metres"),
         (TERRAIN, "nodata.tif", lambda path: dtm(path, nodata=None), "states no nodata value"),
@@ -91,31 +91,31 @@ DETECTOR = '[parameters.detector]\nfile = "{}"'
     ],
     ids=lambda value: value if isinstance(value, str) and "." in value and "\n" not in value else "",
 )
-def test_a_campaign_that_names_it_is_refused(tmp_path: Path, table: str, name: str, write: Write, said: str) -> None:
+def test_a_campaign_that_names_it_is_refused(tmp_path: Path, table: str, name: str, write: Write, message: str) -> None:
     write(tmp_path / name)
     campaign = tmp_path / "campaign.toml"
     campaign.write_text(f'name = "bad"\nscenario = "descent"\ncases = 1\n{table.format(tmp_path / name)}\n')
-    refused(["run", str(campaign), "--out", str(tmp_path / "run")], tmp_path / name, said)
+    refused(["run", str(campaign), "--out", str(tmp_path / "run")], tmp_path / name, message)
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
-    ("write", "said"),
+    ("write", "message"),
     [
         (lambda path: gigabyte(path, b"P5 32768 32768 255\n"), "has 32768 x 32768 pixels; its camera has 1024 x 256"),
         (lambda path: gigabyte(path, b"PDS_VERSION_ID = PDS3\r\n"), "END: missing in the first"),
         (empty, "is empty (0 bytes)"),
     ],
 )
-def test_a_picture_is_refused(tmp_path: Path, write: Write, said: str) -> None:
+def test_a_picture_is_refused(tmp_path: Path, write: Write, message: str) -> None:
     folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write(folder / "drop-1.png")
-    refused(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "drop-1.png", said)
+    refused(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "drop-1.png", message)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
-    ("cells", "said"),
+    ("cells", "message"),
     [
         ({"qx": "nan"}, "line 3: qx is 'nan'; allowed: a finite number"),
         ({"time_s": "0.0"}, "line 3: time goes from 100 to 0 s"),
@@ -123,16 +123,16 @@ def test_a_picture_is_refused(tmp_path: Path, write: Write, said: str) -> None:
         ({"qx": "1", "qy": "0", "qz": "0", "qw": "0"}, "line 3: the camera looks up, 90.0 deg"),
     ],
 )
-def test_a_table_is_refused(tmp_path: Path, cells: dict[str, str], said: str) -> None:
+def test_a_table_is_refused(tmp_path: Path, cells: dict[str, str], message: str) -> None:
     folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write_texts(folder, [row | cells if place == 1 else row for place, row in enumerate(read_rows(folder))])
-    refused(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "pictures.csv", said)
+    refused(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "pictures.csv", message)
 
 
-def refused(words: list[str], path: Path, said: str) -> None:
+def refused(words: list[str], path: Path, message: str) -> None:
     ended = CliRunner().invoke(app, words)
     assert (ended.exit_code, type(ended.exception)) == (2, SystemExit)
-    message = ended.output
-    assert message.startswith("error: ")
-    assert str(path) in message
-    assert said in message
+    output = ended.output
+    assert output.startswith("error: ")
+    assert str(path) in output
+    assert message in output

@@ -147,10 +147,12 @@ def test_a_killed_campaign_is_reported_and_resumed(tmp_path: Path, marsyard: Com
     before = (tmp_path / "run" / "campaign.json").read_bytes()
     reported = marsyard("report", tmp_path / "run")
     assert (reported.status, reported.err) == (3, "")
-    said = re.search(r"INCOMPLETE: (\d+) of 40 cases; it was killed; to continue: marsyard resume (\S+)", reported.out)
-    assert said
-    assert said[2] == str(tmp_path / "run")
-    assert 0 < int(said[1]) == len(pd.read_parquet(tmp_path / "run" / "cases.parquet")) < 40
+    message = re.search(
+        r"INCOMPLETE: (\d+) of 40 cases; it was killed; to continue: marsyard resume (\S+)", reported.out
+    )
+    assert message
+    assert message[2] == str(tmp_path / "run")
+    assert 0 < int(message[1]) == len(pd.read_parquet(tmp_path / "run" / "cases.parquet")) < 40
     assert (tmp_path / "run" / "campaign.json").read_bytes() == before
     refused = marsyard("append", tmp_path / "run", 2)
     assert (refused.status, "is not finished (running): marsyard resume" in refused.err) == (2, True)
@@ -211,7 +213,7 @@ def test_what_is_wrong_goes_before_what_failed(tmp_path: Path, marsyard: Command
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["run", "dimes-smok"], "unknown campaign 'dimes-smok'"),
         (["run", "{folder}/none.toml"], "none.toml: no such file"),
@@ -248,13 +250,13 @@ def test_what_is_wrong_goes_before_what_failed(tmp_path: Path, marsyard: Command
         (["replay", "{run}", "0", "--out", "{file}/x"], "cannot be written"),
     ],
 )
-def test_bad_input(finished: Path, tmp_path: Path, marsyard: Command, arguments: list[str], said: str) -> None:
+def test_bad_input(finished: Path, tmp_path: Path, marsyard: Command, arguments: list[str], message: str) -> None:
     file = write_campaign(tmp_path)
     ended = marsyard(*(part.format(file=file, run=finished, folder=tmp_path) for part in arguments))
     # The usage errors of the command line's own library are set in a box: what is said may be broken into lines.
     text = re.sub(r"[\s│]+", " ", ended.err)
     assert ended.status == 2
-    assert re.sub(r"\s+", " ", said) in text
+    assert re.sub(r"\s+", " ", message) in text
     assert "Traceback" not in ended.err
     assert ended.out == ""
     assert not (tmp_path / "runs").exists()

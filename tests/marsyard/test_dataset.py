@@ -68,13 +68,13 @@ def test_only_terrains_of_the_cases_are_built(tmp_path: Path, monkeypatch: pytes
     assert len(list((tmp_path / "cache" / "terrain").iterdir())) == len(used)
 
 
-def points_of(told: dict[str, Any], camera_file: Path, distance: np.ndarray) -> np.ndarray:
+def points_of(reported: dict[str, Any], camera_file: Path, distance: np.ndarray) -> np.ndarray:
     """World points of a sample's pixels, from its pose, camera and ranges."""
     camera = read_cahvor(camera_file)
     origins, directions = camera.rays(camera.pixel_grid())
-    turn = Rotation.from_quat(told["world_from_body_xyzw"])
+    turn = Rotation.from_quat(reported["world_from_body_xyzw"])
     seen = (origins + distance[..., None] * directions).reshape(-1, 3)
-    return (np.array(told["position_m"]) + turn.apply(seen)).reshape(*distance.shape, 3)
+    return (np.array(reported["position_m"]) + turn.apply(seen)).reshape(*distance.shape, 3)
 
 
 def test_samples_hold_the_truth_of_their_pixels_and_are_gone_on_with(tmp_path: Path) -> None:
@@ -85,7 +85,7 @@ def test_samples_hold_the_truth_of_their_pixels_and_are_gone_on_with(tmp_path: P
     files = contents(shards[1])
     assert {name.partition(".")[0] for name in files} == {"0000001-0", "0000001-1"}
 
-    told = json.loads(files["0000001-0.json"])
+    reported = json.loads(files["0000001-0.json"])
     image, rocks, hazard = (
         np.asarray(cv2.imdecode(np.frombuffer(files[f"0000001-0.{name}.png"], np.uint8), cv2.IMREAD_UNCHANGED))
         for name in ("image", "rocks", "hazard")
@@ -101,7 +101,7 @@ def test_samples_hold_the_truth_of_their_pixels_and_are_gone_on_with(tmp_path: P
     # pose, camera and range give world points; of flat parts the height changes as the normals say
     path = tmp_path / "camera.cahvor"
     path.write_bytes(files["0000001-0.cahvor"])
-    points = points_of(told, path, distance)
+    points = points_of(reported, path, distance)
     bare = rocks[:-1, :-1] + rocks[1:, :-1] + rocks[:-1, 1:] == 0
     across, along = points[:-1, 1:] - points[:-1, :-1], points[1:, :-1] - points[:-1, :-1]
     fitted = np.cross(along, across)
@@ -110,7 +110,7 @@ def test_samples_hold_the_truth_of_their_pixels_and_are_gone_on_with(tmp_path: P
     assert np.median(cosine) > 0.99
 
     # the drawn values are the campaign's, and an interrupted set is gone on with, byte for byte
-    assert 0.0 <= told["drawn"]["location.east_m"] <= 20.0
+    assert 0.0 <= reported["drawn"]["location.east_m"] <= 20.0
     before = [path.read_bytes() for path in shards]
     shards[0].unlink()
     assert made(tmp_path)[0] == 0
@@ -137,16 +137,16 @@ def test_descents_give_their_three_pictures(tmp_path: Path) -> None:
     surface = World.of(parameters).surface
     path = tmp_path / "camera.cahvor"
     for number in range(3):
-        told = json.loads(files[f"0000000-{number}.json"])
+        reported = json.loads(files[f"0000000-{number}.json"])
         path.write_bytes(files[f"0000000-{number}.cahvor"])
         distance = np.load(io.BytesIO(files[f"0000000-{number}.range.npy"]))
-        points = points_of(told, path, distance)
+        points = points_of(reported, path, distance)
         seen = np.isfinite(distance)
         assert seen.mean() > 0.9
         x, y, z = points[seen].T
         # within what a pixel's level of detail smooths of the ground: its own size, some 2 m at 2000 m
         assert np.median(abs(z - surface.height(x, y))) < 0.2
-        assert told["velocity_m_s"][2] < -60.0
+        assert reported["velocity_m_s"][2] < -60.0
 
 
 def test_scenarios_without_samples_are_refused(tmp_path: Path) -> None:

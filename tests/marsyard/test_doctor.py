@@ -52,10 +52,10 @@ def test_only_failures_count(one_check: Callable[[Check], None], verdict: Verdic
     assert "three [left]" in text
     assert "teeth: see a dentist" in text
     got, text = examined(as_json=True)
-    told = json.loads(text)
-    assert (got, told["can_run"]) == (status, status == 0)
-    assert told["checks"] == [
-        {"check": "teeth", "found": "three [left]", "verdict": verdict.name.lower(), "mend": "see a dentist"}
+    reported = json.loads(text)
+    assert (got, reported["can_run"]) == (status, status == 0)
+    assert reported["checks"] == [
+        {"check": "teeth", "finding": "three [left]", "verdict": verdict.name.lower(), "remedy": "see a dentist"}
     ]
 
 
@@ -74,7 +74,7 @@ def test_a_backend_that_does_not_exist_has_a_reason() -> None:
 
 
 @pytest.mark.parametrize(
-    ("osmesa", "egl", "wanted", "verdict", "mend"),
+    ("osmesa", "egl", "wanted", "verdict", "remedy"),
     [
         (SOUND, SOUND, "osmesa", Verdict.OK, ""),
         (SOUND, ABSENT, "osmesa", Verdict.OK, ""),
@@ -85,12 +85,12 @@ def test_a_backend_that_does_not_exist_has_a_reason() -> None:
     ],
 )
 def test_the_backend_in_use(
-    monkeypatch: pytest.MonkeyPatch, osmesa: Probe, egl: Probe, wanted: str, verdict: Verdict, mend: str
+    monkeypatch: pytest.MonkeyPatch, osmesa: Probe, egl: Probe, wanted: str, verdict: Verdict, remedy: str
 ) -> None:
     monkeypatch.setenv("MARSYARD_GL", wanted)
     *_, last = doctor.check_rendering({"osmesa": osmesa, "egl": egl})
     assert last.verdict is verdict
-    assert mend in last.remedy
+    assert remedy in last.remedy
 
 
 def test_a_wrong_picture_is_not_a_working_backend() -> None:

@@ -52,7 +52,7 @@ def test_every_site_and_every_kind_of_camera_is_shown(plates: list[SvgFigure]) -
         assert site.descent is None or any(p.shot.scale == "descent" for p in plates if p.shot.site == site.name)
 
 
-def test_page_needs_only_the_pictures_beside_it(plates: list[SvgFigure], tmp_path: Path) -> None:
+def test_page_needs_only_the_pictures_next_to_it(plates: list[SvgFigure], tmp_path: Path) -> None:
     page = write_gallery(plates, tmp_path / "new" / "gallery")
     links = _Links()
     text = page.read_text()

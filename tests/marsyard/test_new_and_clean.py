@@ -31,7 +31,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def told(*words: str) -> tuple[int, str]:
+def reported(*words: str) -> tuple[int, str]:
     result = CliRunner().invoke(app, list(words))
     return result.exit_code, result.output
 
@@ -41,7 +41,7 @@ def told(*words: str) -> tuple[int, str]:
     [("velocity", "descent", 4.0), ("landing", "landing", 0.95), ("tracking", "rover", 0.05)],
 )
 def test_a_new_campaign_is_one(here: Path, system: str, scenario: str, bound: float) -> None:
-    status, output = told("new", "mine", "--system", system, "--bound", str(bound), "-n", "30")
+    status, output = reported("new", "mine", "--system", system, "--bound", str(bound), "-n", "30")
     assert status == 0, output
     configuration = load_campaign("mine.toml").configuration
     assert (configuration.name, configuration.scenario, configuration.cases) == ("mine", scenario, 30)
@@ -57,7 +57,7 @@ def test_a_new_campaign_is_one(here: Path, system: str, scenario: str, bound: fl
 @pytest.mark.parametrize("system", ["velocity", "landing", "tracking"])
 def test_each_case_of_a_new_campaign_has_a_terrain_of_its_own(here: Path, system: str) -> None:
     """A bank of 2 terrains kept the verdict of any number of cases INSUFFICIENT."""
-    status, output = told("new", "mine", "--system", system, "-n", "1000")
+    status, output = reported("new", "mine", "--system", system, "-n", "1000")
     assert (status, "note:" in output) == (0, False), output
     campaign = load_campaign("mine.toml")
     path = "world.terrain" if system == "tracking" else "location.terrain"
@@ -66,7 +66,7 @@ def test_each_case_of_a_new_campaign_has_a_terrain_of_its_own(here: Path, system
 
 def test_a_new_campaign_without_failures_passes(here: Path) -> None:
     """230 cases show 99 % at 90 % confidence, on the terrains that the campaign draws."""
-    assert told("new", "mine", "--system", "velocity", "--site", "gusev", "-n", "230")[0] == 0
+    assert reported("new", "mine", "--system", "velocity", "--site", "gusev", "-n", "230")[0] == 0
     campaign = load_campaign("mine.toml")
     terrains = [campaign.draws(case)["location.terrain"] for case in range(230)]
     frame = pd.DataFrame({"case": range(230), "terrain": terrains, "answered": True, "velocity_error_m_s": 1.0})
@@ -77,7 +77,7 @@ def test_a_new_campaign_without_failures_passes(here: Path) -> None:
 
 def test_what_limits_the_evidence_is_printed_before_a_run(here: Path) -> None:
     """`new` and `--dry-run` name too few cases, too few terrains, and designs that are no random draws."""
-    assert "takes at least 230 cases without a failure, and 24 are asked for" in told("new", "few")[1]
+    assert "takes at least 230 cases without a failure, and 24 are asked for" in reported("new", "few")[1]
     assert evidence_limits(load_campaign("few.toml", cases=230)) == []
     cases, terrains = evidence_limits(load_campaign("dimes-smoke"))
     assert cases.startswith("DIMES-VEL: 99 % at 90 % confidence takes at least 230 cases")
@@ -94,7 +94,7 @@ def test_what_limits_the_evidence_is_printed_before_a_run(here: Path) -> None:
 
 def test_own_files_are_named_in_it(here: Path) -> None:
     (here / "cam.yaml").write_text(EUROC)
-    status, output = told("new", "mine", "--system", "velocity", "--camera", "cam.yaml")
+    status, output = reported("new", "mine", "--system", "velocity", "--camera", "cam.yaml")
     assert status == 0, output
     tables = tomllib.loads((here / "mine.toml").read_text())
     assert tables["parameters"]["camera"]["model"] == "cam.yaml"
@@ -104,7 +104,7 @@ def test_own_files_are_named_in_it(here: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("--system", "velocity", "--site", "venus"), "venus"),
         (
@@ -116,10 +116,10 @@ def test_own_files_are_named_in_it(here: Path) -> None:
         (("--system", "landing", "--flight", "flight.csv"), "only descents fly"),
     ],
 )
-def test_what_cannot_run_is_not_written(here: Path, words: tuple[str, ...], said: str) -> None:
-    status, output = told("new", "mine", *words)
+def test_what_cannot_run_is_not_written(here: Path, words: tuple[str, ...], message: str) -> None:
+    status, output = reported("new", "mine", *words)
     assert status == 2
-    assert said in output
+    assert message in output
     assert not (here / "mine.toml").exists()
 
 
@@ -129,7 +129,7 @@ def test_answers_of_the_dialogue_are_refused_at_once(here: Path, monkeypatch: py
     result = CliRunner().invoke(app, ["new", "mine"], input="\n".join(answers) + "\n")
     assert result.exit_code == 0, result.output
     text = " ".join(result.output.split())
-    for said in (
+    for message in (
         "unknown answer 'velocty' (did you mean 'velocity'?); allowed: landing, tracking, velocity",
         "unknown answer 'venus'; allowed: ",
         "absent.yaml",
@@ -137,16 +137,16 @@ def test_answers_of_the_dialogue_are_refused_at_once(here: Path, monkeypatch: py
         "'-3' is not allowed; allowed: a number above 0",
         "'many' is not allowed",
     ):
-        assert said in text
+        assert message in text
     assert load_campaign("mine.toml").configuration.requirements[0].bound == 4.0
 
 
 def test_files_that_are_there_stay(here: Path) -> None:
     (here / "mine.toml").write_text("precious")
-    status, output = told("new", "mine", "--system", "tracking")
+    status, output = reported("new", "mine", "--system", "tracking")
     assert status == 2
     assert "mine.toml: there already; --overwrite" in output
-    assert told("new", "mine", "--system", "tracking", "--site", "venus", "--overwrite")[0] == 2
+    assert reported("new", "mine", "--system", "tracking", "--site", "venus", "--overwrite")[0] == 2
     assert (here / "mine.toml").read_text() == "precious"
 
 
@@ -157,25 +157,25 @@ def test_clean_shows_and_then_removes(here: Path, monkeypatch: pytest.MonkeyPatc
     folder.mkdir(parents=True)
     (folder / "one.npy").write_bytes(b"\0" * 3000)
     (folder / "half.part").write_bytes(b"\0" * 500)
-    status, output = told("clean")
+    status, output = reported("clean")
     assert status == 0
     assert "3.5 kB" in output
     assert "2 GB" in output, "the limit of the cache"
     assert "nothing was removed" in output
     assert (folder / "one.npy").exists()
-    status, output = told("clean", "terrain", "--yes", "--json")
+    status, output = reported("clean", "terrain", "--yes", "--json")
     assert json.loads(output)["removed_bytes"] == 3000
     assert not (folder / "one.npy").exists()
     # what another process writes just now stays
     assert (folder / "half.part").exists()
-    status, output = told("clean", "terrains")
+    status, output = reported("clean", "terrains")
     assert status == 2
     assert "did you mean 'terrain'" in output
 
 
 def test_lists_as_json() -> None:
-    campaigns = {one["name"]: one for one in json.loads(told("list", "--json")[1])}
+    campaigns = {one["name"]: one for one in json.loads(reported("list", "--json")[1])}
     assert campaigns["dimes-smoke"]["cases"] == 24
-    sites = {one["name"]: one for one in json.loads(told("terrain", "list", "--json")[1])}
+    sites = {one["name"]: one for one in json.loads(reported("terrain", "list", "--json")[1])}
     assert sites["gusev"]["planet"] == "Mars"
     assert "descent" in sites["gusev"]["terrain"]

@@ -113,7 +113,7 @@ def test_the_shipped_plan_names_campaigns_that_are_there() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "campaigns"),
         ("not toml", "not valid TOML"),
@@ -121,8 +121,8 @@ def test_the_shipped_plan_names_campaigns_that_are_there() -> None:
         ('[[campaigns]]\ncampaign = "a"\n[[campaigns]]\ncampaign = "a"\n', "twice"),
     ],
 )
-def test_a_plan_that_is_none_is_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_a_plan_that_is_none_is_refused(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "plan.toml").write_text(text)
     with pytest.raises(ConfigurationError) as raised:
         read_plan(tmp_path / "plan.toml")
-    assert said in str(raised.value)
+    assert message in str(raised.value)

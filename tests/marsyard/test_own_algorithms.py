@@ -91,18 +91,18 @@ def test_the_suite_ends_and_finds_what_an_algorithm_changes_in_its_process(
 def test_the_suite_for_programs() -> None:
     ended = CliRunner().invoke(app, ["conformance", "phase-correlation", "--json"])
     assert ended.exit_code == 0
-    told = json.loads(ended.output)
-    assert (told["algorithm"], told["task"], told["passed"], len(told["checks"])) == (
+    reported = json.loads(ended.output)
+    assert (reported["algorithm"], reported["task"], reported["passed"], len(reported["checks"])) == (
         "phase-correlation",
         "velocity",
         True,
         9,
     )
-    assert all(check["passed"] and check["asked"] for check in told["checks"])
+    assert all(check["passed"] and check["asked"] for check in reported["checks"])
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["vt"], "unknown algorithm 'vt'"),
         (["vtt", "--task", "flying"], "--task flying: unknown; allowed: velocity, tracking, landing"),
@@ -111,10 +111,10 @@ def test_the_suite_for_programs() -> None:
         (["exec:./nothing"], "is not there, or may not be run"),
     ],
 )
-def test_what_is_no_algorithm_is_told(arguments: list[str], said: str) -> None:
+def test_what_is_no_algorithm_is_reported(arguments: list[str], message: str) -> None:
     ended = CliRunner().invoke(app, ["conformance", *arguments])
     assert ended.exit_code == 2
-    assert said in ended.output
+    assert message in ended.output
 
 
 def test_cases_are_exported_answered_and_scored(tmp_path: Path) -> None:

@@ -41,9 +41,9 @@ def _check_picture(prefix: Path, size: tuple[int, int], multiple: int) -> None:
     assert picture.shape == (rows, columns)
     assert (picture % multiple == 0).all()
     assert picture.std() > 0.0
-    said = json.loads(Path(f"{prefix}.json").read_text())
+    message = json.loads(Path(f"{prefix}.json").read_text())
     assert "# Frame: body" in Path(f"{prefix}.cahvor").read_text()
-    camera = read_cahvor(f"{prefix}.cahvor").moved(RigidTransform.from_matrix(said["world_from_body"]))
+    camera = read_cahvor(f"{prefix}.cahvor").moved(RigidTransform.from_matrix(message["world_from_body"]))
     assert camera.size == size
     with np.load(f"{prefix}.npz") as truth:
         seen = np.isfinite(truth["range_m"])
@@ -52,7 +52,7 @@ def _check_picture(prefix: Path, size: tuple[int, int], multiple: int) -> None:
         np.testing.assert_allclose(camera.project(points)[0], camera.pixel_grid()[seen], atol=2e-3)
         np.testing.assert_allclose(np.linalg.norm(points - camera.c, axis=1), truth["range_m"][seen], rtol=1e-6)
         np.testing.assert_allclose(np.linalg.norm(truth["normal"][seen], axis=1), 1.0, atol=1e-4)
-        to_sun = np.array(said["sun_direction"])
+        to_sun = np.array(message["sun_direction"])
         to_eye = (camera.c - points) / truth["range_m"][seen][:, None]
         np.testing.assert_allclose(np.cos(np.radians(truth["phase_deg"][seen])), to_eye @ to_sun, atol=1e-5)
         assert ((truth["object"] == -2) == ~seen).all()
@@ -60,13 +60,13 @@ def _check_picture(prefix: Path, size: tuple[int, int], multiple: int) -> None:
         assert 0.0 < truth["shadow"][seen].mean() < 0.5
         # faces turned away from the sun have no direct light
         assert truth["shadow"][seen][truth["normal"][seen] @ to_sun < -1e-3].all()
-        np.testing.assert_allclose(truth["world_from_body"], said["world_from_body"])
+        np.testing.assert_allclose(truth["world_from_body"], message["world_from_body"])
 
 
 def test_detector_picture_from_above(marsyard: Command, tmp_path: Path) -> None:
     prefix = tmp_path / "hover"
-    status, said = marsyard("render", "heli-hazardous", "--camera", "xc-55", "--out", prefix, "--azimuth", 30)
-    assert status == 0, said
+    status, message = marsyard("render", "heli-hazardous", "--camera", "xc-55", "--out", prefix, "--azimuth", 30)
+    assert status == 0, message
     _check_picture(prefix, (640, 480), multiple=256)  # 8 bits in 16
     made_from = json.loads(Path(f"{prefix}.json").read_text())
     assert made_from["shot"]["altitude_m"] == 10.0
@@ -76,8 +76,8 @@ def test_detector_picture_from_above(marsyard: Command, tmp_path: Path) -> None:
 def test_stereo_pair_as_radiance(marsyard: Command, tmp_path: Path) -> None:
     prefix = tmp_path / "pair"
     options = ("--radiance", "--sun-elevation", 25, "--east", 12, "--north", -7)
-    status, said = marsyard("render", "heli-hazardous", "--camera", "research-navcam", "--out", prefix, *options)
-    assert status == 0, said
+    status, message = marsyard("render", "heli-hazardous", "--camera", "research-navcam", "--out", prefix, *options)
+    assert status == 0, message
     for eye in ("left", "right"):
         _check_picture(tmp_path / f"pair-{eye}", (1024, 768), multiple=1)
     left, right = (read_cahvor(f"{prefix}-{eye}.cahvor") for eye in ("left", "right"))
@@ -90,7 +90,7 @@ def test_stereo_pair_as_radiance(marsyard: Command, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("site", "camera", "options", "said"),
+    ("site", "camera", "options", "message"),
     [
         ("gusef", "mer-navcam", (), "did you mean gusev?"),
         ("gusev", "navcam", (), "did you mean mer-navcam?"),
@@ -106,13 +106,13 @@ def test_stereo_pair_as_radiance(marsyard: Command, tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_is_named(
-    marsyard: Command, tmp_path: Path, site: str, camera: str, options: tuple[str, ...], said: str
+    marsyard: Command, tmp_path: Path, site: str, camera: str, options: tuple[str, ...], message: str
 ) -> None:
     status, error = marsyard("render", site, "--camera", camera, "--out", tmp_path / "x", *options)
     assert status == 2
     assert error.startswith("error: ")
     assert error.count("\n") == 1
-    assert said in error
+    assert message in error
     assert not list(tmp_path.iterdir())
 
 
@@ -139,12 +139,12 @@ def test_a_terrain_model_is_rendered_with_its_holes_marked(marsyard: Command, tm
     dtm, prefix = tmp_path / "site.npz", tmp_path / "view"
     np.savez(dtm, dem=heights, dem_gsd=1.0)
     command = ("render", dtm, "--camera", "xc-55", "--altitude", 150, "--radiance", "--out", prefix)
-    status, said = marsyard(*command)
+    status, message = marsyard(*command)
     assert status == 2
-    assert "25.0% of its posts have no height; allowed: up to 5.0%" in said
-    status, said = marsyard(*command, "--max-holes", 0.3)
-    assert status == 0, said
-    assert "see filled holes of the DTM" in said
+    assert "25.0% of its posts have no height; allowed: up to 5.0%" in message
+    status, message = marsyard(*command, "--max-holes", 0.3)
+    assert status == 0, message
+    assert "see filled holes of the DTM" in message
     with np.load(f"{prefix}.npz") as truth:
         filled, points = truth["filled"], truth["point_m"]
         assert filled.any()

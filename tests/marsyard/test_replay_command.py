@@ -44,7 +44,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "run"
 
 
-def told(*words: object) -> tuple[int, str]:
+def reported(*words: object) -> tuple[int, str]:
     result = CliRunner().invoke(app, list(map(str, words)))
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result.exit_code, result.output
@@ -62,7 +62,7 @@ def test_a_scenario_that_is_not_found_is_one_message_and_changes_nothing(
     monkeypatch.delitem(sys.modules, "my_scenario", raising=False)
     before = _content(stored)
     for command in (("replay", stored, 0), ("resume", stored, "--allow-changed")):
-        status, output = told(*command)
+        status, output = reported(*command)
         assert status == 2
         assert "no scenario at 'my_scenario:Mine': No module named 'my_scenario'" in output
         assert "Traceback" not in output
@@ -85,7 +85,7 @@ def test_an_algorithm_that_is_not_found_is_one_message(tmp_path: Path, monkeypat
     identity = identity_of(configuration)
     record.begin(folder, configuration.model_copy(update={"parameters": parameters}), identity, "nobody")
     before = _content(folder)
-    status, output = told("replay", folder, 0)
+    status, output = reported("replay", folder, 0)
     assert status == 2
     assert "no algorithm at 'my_absent_module:Estimator'" in output
     assert _content(folder) == before
@@ -101,13 +101,13 @@ def test_products_are_kept_where_the_case_fails_this_time(
     changed = json.loads(text)
     changed["configuration"]["parameters"]["raising_cases"] = [0]
     (copy / "campaign.json").write_text(json.dumps(changed))
-    status, output = told("replay", copy, 0)
+    status, output = reported("replay", copy, 0)
     assert status == 1
     assert "case 0: CRASHED" in output
     assert "keeps the products that it had" in output
     assert _content(copy / "cases") == before
     (copy / "campaign.json").write_text(text)
-    assert told("replay", copy, 0)[0] == 0
+    assert reported("replay", copy, 0)[0] == 0
 
 
 def test_a_folder_that_cannot_be_written_to_is_replayed_into_another(
@@ -133,7 +133,7 @@ def test_a_folder_that_cannot_be_written_to_is_replayed_into_another(
         return connection
 
     monkeypatch.setattr(connect, record_open)
-    status, output = told("replay", copy, 1, "--out", tmp_path / "out")
+    status, output = reported("replay", copy, 1, "--out", tmp_path / "out")
     assert (status, "the row equals the stored one" in output) == (0, True), output
     assert opened
     assert not any(str(copy) in name for name in opened)

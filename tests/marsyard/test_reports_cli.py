@@ -79,7 +79,7 @@ def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
     return command
 
 
-def test_stored_rows_are_judged_anew(make_run: MakeRun, marsyard: Command, tmp_path: Path) -> None:
+def test_stored_rows_are_judged_again(make_run: MakeRun, marsyard: Command, tmp_path: Path) -> None:
     directory, asked = make_run("run"), tmp_path / "asked.toml"
     asked.write_text(ASKED)
     status, out, _ = marsyard("report", directory, "--requirements", asked, "--csv")
@@ -113,9 +113,9 @@ def test_two_campaigns_side_by_side(make_run: MakeRun, marsyard: Command) -> Non
     assert (status, err) == (0, "")
     assert "came to an end" in out
     assert "draws of their own" in out
-    told = json.loads(marsyard("compare", *both, "--json")[1])
-    assert (told["second"], told["paired"]) == (str(both[1]), False)
-    figures = {one["name"]: one for one in told["figures"]}
+    reported = json.loads(marsyard("compare", *both, "--json")[1])
+    assert (reported["second"], reported["paired"]) == (str(both[1]), False)
+    figures = {one["name"]: one for one in reported["figures"]}
     assert figures["came to an end"]["first"] == {"rate": 1.0, "cases": 40}
 
 

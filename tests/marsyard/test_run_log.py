@@ -33,13 +33,13 @@ def lines(folder: Path) -> list[str]:
 
 
 def test_a_session_is_written_down_and_passed_on(tmp_path: Path) -> None:
-    told = Told()
-    with RunLog(tmp_path, told) as log:
+    reported = Told()
+    with RunLog(tmp_path, reported) as log:
         log.begin("cases", 2)
         log.step()
         log.note("two\nlines")
         log.step()
-    assert told.heard == ["cases 2", "step", "two\nlines", "step"]
+    assert reported.heard == ["cases 2", "step", "two\nlines", "step"]
     session, versions, *rest, last = lines(tmp_path)
     assert session.startswith("session: marsyard")
     assert versions.startswith("marsyard 0.")
@@ -58,9 +58,9 @@ def test_what_stopped_it_is_said_and_the_next_session_added(tmp_path: Path) -> N
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
             _interrupted(tmp_path)
-    said = lines(tmp_path)
-    assert sum(line.startswith("session: ") for line in said) == 2
-    assert re.fullmatch(r"stopped after \d+\.\d s, cases: 1/5: KeyboardInterrupt: SIGINT", said[-1])
+    message = lines(tmp_path)
+    assert sum(line.startswith("session: ") for line in message) == 2
+    assert re.fullmatch(r"stopped after \d+\.\d s, cases: 1/5: KeyboardInterrupt: SIGINT", message[-1])
 
 
 def test_no_campaign_is_stopped_by_its_log(tmp_path: Path) -> None:

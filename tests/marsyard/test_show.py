@@ -92,7 +92,7 @@ def campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_every_dispersion_is_told(campaign: Path) -> None:
+def test_every_dispersion_is_reported(campaign: Path) -> None:
     shown = marsyard("show", campaign)
     assert (shown.status, shown.err) == (0, "")
     for text in (
@@ -111,12 +111,12 @@ def test_every_dispersion_is_told(campaign: Path) -> None:
 
 
 def test_units_and_descriptions_come_from_the_scenario() -> None:
-    told = json.loads(marsyard("show", "dimes-gusev", "--json").out)
-    of_each = {one["parameter"]: one for one in told["dispersions"]}
+    reported = json.loads(marsyard("show", "dimes-gusev", "--json").out)
+    of_each = {one["parameter"]: one for one in reported["dispersions"]}
     sun = of_each["sun.elevation_deg"]
     assert (sun["unit"], sun["description"], sun["bounds"]) == ("deg", "above the horizon", [30.0, 60.0])
-    assert all(one["source"] for one in told["dispersions"])
-    assert all(one["description"] for one in told["dispersions"])
+    assert all(one["source"] for one in reported["dispersions"])
+    assert all(one["description"] for one in reported["dispersions"])
 
 
 def test_draws_as_table_json_and_figure(campaign: Path, tmp_path: Path) -> None:
@@ -127,10 +127,10 @@ def test_draws_as_table_json_and_figure(campaign: Path, tmp_path: Path) -> None:
     assert "nominal" in shown.out
     assert f"figure: {figure}" in shown.out
     assert "<svg" in figure.read_text()
-    told = json.loads(marsyard("show", campaign, "--draw", 25, "--json").out)
-    assert [one["case"] for one in told["draws"]] == list(range(25))
-    assert told["draws"][0]["values"]["wind.east_m_s"] == 1.0
-    values = [one["values"] for one in told["draws"]]
+    reported = json.loads(marsyard("show", campaign, "--draw", 25, "--json").out)
+    assert [one["case"] for one in reported["draws"]] == list(range(25))
+    assert reported["draws"][0]["values"]["wind.east_m_s"] == 1.0
+    values = [one["values"] for one in reported["draws"]]
     assert all(one["lowest_altitude_m"] == pytest.approx(one["altitude_m"] - 100.0) for one in values)
     assert [one["error_scale"] for one in values[1:4]] == [0.5, 1.0, 1.5]
     assert f"{min(one['altitude_m'] for one in values[1:]):.5g}" in shown.out
@@ -138,7 +138,7 @@ def test_draws_as_table_json_and_figure(campaign: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["--draw", "0"], "--draw 0: the campaign has 25 cases; allowed: 1 to 25"),
         (["--draw", "26"], "allowed: 1 to 25"),
@@ -149,11 +149,11 @@ def test_draws_as_table_json_and_figure(campaign: Path, tmp_path: Path) -> None:
         (["--set", "cases=26"], "--set cases=26: cases: 25 cases behind the nominal one cannot be laid out: the grid"),
     ],
 )
-def test_what_cannot_be_shown(campaign: Path, arguments: list[str], said: str) -> None:
+def test_what_cannot_be_shown(campaign: Path, arguments: list[str], message: str) -> None:
     shown = marsyard("show", campaign, *arguments)
     assert (shown.status, shown.out) == (2, "")
     assert "Traceback" not in shown.err
-    assert said in shown.err
+    assert message in shown.err
 
 
 def _paths(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:

@@ -34,7 +34,7 @@ def test_list_names_every_site() -> None:
         assert name in printed
 
 
-def test_stats_of_a_site_stand_beside_the_papers() -> None:
+def test_stats_of_a_site_stand_next_to_the_papers() -> None:
     status, printed = invoke("stats", "meridiani", "--json")
     assert status == 0
     record = json.loads(printed)
@@ -47,10 +47,10 @@ def test_stats_of_a_site_stand_beside_the_papers() -> None:
 def test_stats_of_a_file_say_what_is_real_and_what_was_filled(tile: str) -> None:
     status, printed = invoke("stats", tile)
     assert status == 0
-    said = " ".join(printed.split())
-    assert "Filled: 1 posts without height" in said
-    assert "mean slope over 30 m, deg" in said
-    assert "synthetic around it" in said
+    message = " ".join(printed.split())
+    assert "Filled: 1 posts without height" in message
+    assert "mean slope over 30 m, deg" in message
+    assert "synthetic around it" in message
     assert json.loads(invoke("stats", tile, "--json")[1])["real"]["posting_m"] == 2.0
 
 

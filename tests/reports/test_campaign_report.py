@@ -123,7 +123,7 @@ def test_small_report_says_what_a_board_asks(
     text, page, twin = _read(directory)
     _check(text, page)
     plain = " ".join(re.sub(r"<[^>]+>", " ", text).split())
-    for said in (
+    for message in (
         "INSUFFICIENT",
         "DIMES-VEL",
         "share 4 terrains",
@@ -136,7 +136,7 @@ def test_small_report_says_what_a_board_asks(
         "landing season",
         "+14.10 m/s east",
     ):
-        assert said in plain, said
+        assert message in plain, message
     assert "case-3" in page.ids
     assert page.tags.count("svg") > 8
     assert twin["exit_code"] == 1

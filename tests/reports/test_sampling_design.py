@@ -39,9 +39,9 @@ def test_what_states_no_design_is_drawn_independently(odd: dict[str, Any]) -> No
     assert INDEPENDENT.no_probability == ""
 
 
-@pytest.mark.parametrize(("configuration", "said"), DESIGNED)
+@pytest.mark.parametrize(("configuration", "message"), DESIGNED)
 def test_designs_tell_rates_and_decide_nothing_at_a_confidence(
-    make_rows: Rows, velocity: dict[str, Any], configuration: dict[str, Any], said: str
+    make_rows: Rows, velocity: dict[str, Any], configuration: dict[str, Any], message: str
 ) -> None:
     frame, how = make_rows(2000), sampled(configuration)
     asked = [{**velocity, "probability": probability} for probability in (0.5, velocity["probability"])]
@@ -51,10 +51,10 @@ def test_designs_tell_rates_and_decide_nothing_at_a_confidence(
         assert math.isnan(verdict.lower)
         assert math.isnan(verdict.upper)
         assert verdict.further_cases is None
-        assert said in verdict.note
+        assert message in verdict.note
     verdicts = judge_campaign(frame, asked, how)
     whole = overall(verdicts, frame, how)
-    assert (whole.word, said in whole.sentence) == ("INSUFFICIENT", True)
+    assert (whole.word, message in whole.sentence) == ("INSUFFICIENT", True)
     assert exit_code(verdicts, crashed=False) == 3
     assert exit_code(verdicts, crashed=True) == 1
     printed = io.StringIO()
@@ -63,9 +63,9 @@ def test_designs_tell_rates_and_decide_nothing_at_a_confidence(
     assert "Clopper" not in printed.getvalue()
 
 
-@pytest.mark.parametrize(("configuration", "said"), DESIGNED)
+@pytest.mark.parametrize(("configuration", "message"), DESIGNED)
 def test_the_rate_of_a_design_decides_where_the_estimate_is_to(
-    make_rows: Rows, velocity: dict[str, Any], configuration: dict[str, Any], said: str
+    make_rows: Rows, velocity: dict[str, Any], configuration: dict[str, Any], message: str
 ) -> None:
     """Of 1,000 cases a rate of 0.98 meets 0.98 but not 0.99; no bounds are told, and the verdict says what it is."""
     frame, how = make_rows(1000), sampled(configuration)
@@ -76,7 +76,7 @@ def test_the_rate_of_a_design_decides_where_the_estimate_is_to(
     assert (met.n, met.failures, met.estimate) == (1000, 20, 0.98)
     assert math.isnan(met.lower)
     assert met.note.startswith("Decided by the rate of these cases. No probability statement: ")
-    assert said in met.note
+    assert message in met.note
     assert exit_code([met], crashed=False) == 3
     assert exit_code([met, missed], crashed=False) == 1
     whole = overall([met, missed], frame, how)

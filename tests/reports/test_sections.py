@@ -41,7 +41,7 @@ def errors(frame: pd.DataFrame, parts: np.ndarray) -> pd.DataFrame:
     )
 
 
-def test_answers_are_told_by_their_share_and_harm() -> None:
+def test_answers_are_reported_by_their_share_and_harm() -> None:
     n = 200
     answered, room = np.arange(n) >= 30, np.arange(n) >= 20
     magnitude = np.where(np.arange(n) == 100, 7.0, 1.0)

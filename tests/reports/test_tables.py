@@ -39,8 +39,8 @@ def test_verdict_table_holds_everything_at_any_width(make_rows: Rows, velocity: 
     verdicts = judge_campaign(make_rows(24), [velocity, {**velocity, "id": "DIMES-AVAIL", "population": "all"}])
     text = _printed(verdict_table(verdicts), width)
     assert max(len(line) for line in text.splitlines()) <= width
-    for said in ("DIMES-VEL", "DIMES-AVAIL", "INSUFFICIENT", "4 terrains", "Clopper-Pearson"):
-        assert said in " ".join(text.split())
+    for message in ("DIMES-VEL", "DIMES-AVAIL", "INSUFFICIENT", "4 terrains", "Clopper-Pearson"):
+        assert message in " ".join(text.split())
     # The column of numbers must not be cut.
     assert "…" not in text
 

@@ -17,7 +17,7 @@ Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
 
 
-def test_the_schema_beside_the_layout_is_its_own() -> None:
+def test_the_schema_next_to_the_layout_is_its_own() -> None:
     # To renew it: json.dump(Twin.model_json_schema(), file, indent=1), with a newline behind.
     kept = SCHEMA_FILE.read_text()
     assert json.loads(kept) == Twin.model_json_schema()

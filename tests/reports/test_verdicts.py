@@ -123,7 +123,7 @@ def test_no_rows_at_all(velocity: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"metric": "velocity_eror_m_s"}, "velocity_eror_m_s"),
         ({"population": "everyone"}, "everyone"),
@@ -133,10 +133,10 @@ def test_no_rows_at_all(velocity: dict[str, Any]) -> None:
         ({"bound": [5]}, "bound"),
     ],
 )
-def test_what_cannot_be_judged_is_said(velocity: dict[str, Any], changes: dict[str, Any], said: str) -> None:
+def test_what_cannot_be_judged_is_said(velocity: dict[str, Any], changes: dict[str, Any], message: str) -> None:
     verdict = _judge(_rows(500, 0), velocity, **changes)
     assert verdict.status is Status.INSUFFICIENT
-    assert said in verdict.note
+    assert message in verdict.note
 
 
 def test_a_share_is_asked_of_a_column_of_true_and_false() -> None:
@@ -291,7 +291,7 @@ def test_terrains_appended_after_a_verdict_pay_for_the_first_look(velocity: dict
     assert later.status is Status.INSUFFICIENT
 
 
-def test_consumers_risk_is_what_the_confidence_leaves_at_the_least_cases_that_pass(velocity: dict[str, Any]) -> None:
+def test_consumers_risk_is_what_the_confidence_leaves_at_the_minimum_cases_that_pass(velocity: dict[str, Any]) -> None:
     # 0.99 ** 230 = 0.0991: the least n of the design's table for 99 % at 90 %.
     assert _judge(_rows(230, 0), velocity).consumer_risk == pytest.approx(0.99**230)
     # ten cases on each of 230 terrains are worth no more
@@ -315,8 +315,8 @@ def test_shared_terrains_decide(velocity: dict[str, Any]) -> None:
     assert verdict.lower == proportion_lower(8, 8, 0.9)
     assert verdict.plain_lower == proportion_lower(400, 400, 0.9)
     assert verdict.further_cases == 297 - 8
-    for said in ("8 terrains", "not independent", "289 additional terrains", "PASS"):
-        assert said in verdict.note
+    for message in ("8 terrains", "not independent", "289 additional terrains", "PASS"):
+        assert message in verdict.note
     enough = _judge(_rows(460, 0).assign(terrain=np.arange(460) % 230), velocity)
     assert enough.status is Status.PASS
 
@@ -350,12 +350,12 @@ def test_the_advice_names_the_terrains_that_limit_a_verdict(velocity: dict[str, 
     how = _drawn_from(8, distribution="integer", low=0, high="location.bank - 1")
     (verdict,) = judge_campaign(frame, [velocity], how)
     assert (verdict.status, verdict.further_cases) == (Status.INSUFFICIENT, None)
-    said = (
+    message = (
         "The campaign draws from 8 terrains (location.bank = 8); 99 % at 90 % confidence takes at least 230 terrains: "
         "run the campaign again with --set location.bank=2300 -n 254."
     )
-    assert said in verdict.note
-    assert said in overall([verdict], frame).sentence
+    assert message in verdict.note
+    assert message in overall([verdict], frame).sentence
     assert "would do" not in overall([verdict], frame).sentence
     # what is advised is enough: so many cases draw 230 different terrains, in more than 99 of 100 campaigns
     rng = np.random.default_rng(3)

@@ -218,7 +218,7 @@ def test_state_left_behind_is_found_by_the_process(
     assert first.next_step
 
 
-def test_the_task_is_told_by_name_and_methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_task_is_recognised_by_name_and_methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert [determine_task(name) for name in ("homography", "semi-global", "pure-ncc", "exec:cat")] == [
         "velocity",
         "landing",

@@ -31,7 +31,7 @@ def test_an_algorithm_in_the_current_folder(tmp_path: Path, monkeypatch: pytest.
         TRACKING.check("lying_here:Mine")
 
 
-def test_a_module_that_raises_is_told_and_not_a_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_module_that_raises_is_reported_and_not_a_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "broken_here.py").write_text("1 / 0\n")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match="no algorithm at 'broken_here:Mine': ZeroDivisionError"):
@@ -109,7 +109,7 @@ def test_an_error_in_units_of_its_covariance() -> None:
 STREAM = "class Mine:\n    def start(self): ...\n    def picture(self, frame): ...\n"
 
 
-def test_streams_are_told_from_estimators_of_three(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_streams_are_reported_from_estimators_of_three(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     finish = "    def finish(self): ...\n"
     (tmp_path / "streams_here.py").write_text(f"{STREAM}{finish}\ndef made():\n    return Mine()\n")
     (tmp_path / "streams_half.py").write_text(STREAM)

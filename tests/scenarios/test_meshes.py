@@ -70,7 +70,7 @@ def test_the_terrain_repeats_them_nearest_to_the_eye(tmp_path: Path, surface: Su
     assert np.allclose((corners.min(axis=0) + corners.max(axis=0))[:2] / 2.0, [66.0, -4.0])
 
 
-def test_landers_are_told_not_to_stand_on_them(tmp_path: Path, surface: Surface) -> None:
+def test_landers_are_reported_not_to_stand_on_them(tmp_path: Path, surface: Surface) -> None:
     ground = SiteGround(site("heli-benign"), TerrainParameters(samples=64), surface, None)
     # its edges between the points of the grid
     one = MeshParameters(file=box(tmp_path), east_m=20.02, north_m=30.02)

@@ -42,7 +42,7 @@ def test_answers_of_velocity(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "it is empty"),
         ("case,velocity_east_m_s\n", "the column 'velocity_north_m_s' is missing"),
@@ -63,14 +63,14 @@ def test_answers_of_velocity(tmp_path: Path) -> None:
         (f"{HEAD.strip()},{COVARIANCE}\n1,,2,3,1,2,1\n", "covariance_m2_s2 is not positive definite"),
     ],
 )
-def test_tables_that_are_none(tmp_path: Path, text: str, said: str) -> None:
+def test_tables_that_are_none(tmp_path: Path, text: str, message: str) -> None:
     path = table(tmp_path, text)
     with pytest.raises(ValueError, match=r"answers\.csv") as caught:
         read_answers(path, VELOCITY_FORM)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
-def test_all_that_is_wrong_is_told_but_not_without_end(tmp_path: Path) -> None:
+def test_all_that_is_wrong_is_reported_but_not_without_end(tmp_path: Path) -> None:
     path = table(tmp_path, HEAD + "".join(f"{case},VALID,x,1\n" for case in range(30)))
     with pytest.raises(ValueError, match=r"(?s)line 2:.*line 21:.*\.\.\. and 10 more"):
         read_answers(path, VELOCITY_FORM)

@@ -200,7 +200,7 @@ def test_a_named_pipe_is_refused_at_once(tmp_path: Path, name: str) -> None:
         check_source(RealTerrain(dtm=tmp_path / name))
 
 
-def test_missing_nodata_is_told_by_impossible_heights(tmp_path: Path) -> None:
+def test_missing_nodata_is_recognised_by_impossible_heights(tmp_path: Path) -> None:
     values = np.full((50, 40), -4450.0, dtype=np.float32)
     values[10, 10] = -32767.0
     with pytest.raises(TerrainFileError, match=r"holds heights of -32767 m; .*it states no nodata value"):

@@ -53,7 +53,7 @@ def test_site_without_this_scale_is_refused() -> None:
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
 @pytest.mark.parametrize(("azimuth", "elevation"), [(0.0, -90.0), (70.0, -40.0), (200.0, -10.0)])
-def test_camera_looks_where_it_is_told(ground: SiteGround, name: str, azimuth: float, elevation: float) -> None:
+def test_camera_looks_where_it_is_reported(ground: SiteGround, name: str, azimuth: float, elevation: float) -> None:
     design = preset(name).design
     pose = camera_pose(ground.surface, design, 3.0, 4.0, 5.0, azimuth, elevation)
     axes = [camera.moved(pose).a for camera in preset(name).cameras()]

@@ -25,7 +25,7 @@ def _left(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_what_was_used_least_recently_makes_room(folder: Path) -> None:
+def test_what_was_used_the_minimum_recently_makes_room(folder: Path) -> None:
     evict_files(folder, 150)
     assert _left(folder) == {"2", "3", "4"}
 

@@ -26,7 +26,7 @@ def _folder(sources: Path, cache: Path, **environment: str) -> str:
 
 
 @pytest.mark.parametrize("kernels", ["sim/terrain/kernels.py", "algorithms/hda/kernels/motion.py"])
-def test_a_changed_kernel_is_compiled_anew_with_all_that_call_it(kernels: str, tmp_path: Path) -> None:
+def test_a_changed_kernel_is_compiled_again_with_all_that_call_it(kernels: str, tmp_path: Path) -> None:
     sources = tmp_path / "sources"
     shutil.copytree(ROOT / "marsyard", sources / "marsyard", ignore=shutil.ignore_patterns("__pycache__"))
     before = _folder(sources, tmp_path / "cache")

@@ -88,7 +88,7 @@ def test_a_change_of_what_it_is_made_from_installs_again(checkout: Path, changed
     assert lines(checkout.parent / "pip.log") == 2 * installed
 
 
-def test_what_was_interrupted_is_built_anew(checkout: Path) -> None:
+def test_what_was_interrupted_is_built_again(checkout: Path) -> None:
     assert setup(checkout, PIP_STATUS="1").returncode != 0
     leftover = checkout / ".venv" / "leftover"
     leftover.touch()
@@ -96,7 +96,7 @@ def test_what_was_interrupted_is_built_anew(checkout: Path) -> None:
     assert not leftover.exists()
 
 
-def test_a_moved_checkout_is_set_up_anew(checkout: Path) -> None:
+def test_a_moved_checkout_is_set_up_again(checkout: Path) -> None:
     setup(checkout)
     (checkout / ".venv" / "leftover").touch()
     moved = checkout.rename(checkout.with_name("moved"))

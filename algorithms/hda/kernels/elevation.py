@@ -122,12 +122,12 @@ def robust_plane(x: Array, y: Array, z: Array, triples: Array, refine: bool) -> 
 
 @njit(cache=True)
 def footprint_planes(
-    elevation: Array, first_rows: NDArray[np.int64], first_columns: NDArray[np.int64], side: int, least: int,
+    elevation: Array, first_rows: NDArray[np.int64], first_columns: NDArray[np.int64], side: int, min_cells: int,
     triples: Array, refine: bool,
 ) -> Array:  # fmt: skip
     """Planes of the squares of `side` cells at first rows and columns, shape (rows, columns, 3).
 
-    Value at the square's middle, slopes per column and per row; NaN where fewer than `least` cells are known.
+    Value at the square's middle, slopes per column and per row; NaN where fewer than `min_cells` cells are known.
     """
     planes = np.full((first_rows.size, first_columns.size, 3), np.nan)
     x, y, z = np.empty(side * side), np.empty(side * side), np.empty(side * side)
@@ -141,7 +141,7 @@ def footprint_planes(
                     if not math.isnan(value):
                         x[n], y[n], z[n] = j - middle, i - middle, value
                         n += 1
-            if n < least:
+            if n < min_cells:
                 continue
             value, by_x, by_y = robust_plane(x[:n], y[:n], z[:n], triples, refine)
             shift = 0.5 * (side - 1) - middle
@@ -154,32 +154,34 @@ def footprint_planes(
 @njit(cache=True)
 def under_lander(
     elevation: Array, rows: NDArray[np.int64], columns: NDArray[np.int64], offsets: NDArray[np.int64],
-    fitted: NDArray[np.int64], least: int, triples: Array, refine: bool,
+    fitted: NDArray[np.int64], min_cells: int, triples: Array, refine: bool,
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Slope per cell of the robust plane through a footprint about each cell, and the farthest that a cell is off it.
+    """Slope per cell of the robust plane through each footprint, and the maximum distance of a cell from it.
 
-    `offsets` are a footprint's cells from its middle (row, column), `fitted` those that the plane is laid through. NaN
-    where fewer than `least` of the latter are known.
+    `offsets` are a footprint's cells from its middle (row, column), `fitted` those that the plane is fitted to. NaN
+    where fewer than `min_cells` of the latter are known.
     """
     count = rows.size
     slopes, roughness = np.full(count, np.nan), np.full(count, np.nan)
     n = fitted.shape[0]
     x, y, z = np.empty(n), np.empty(n), np.empty(n)
     for k in range(count):
-        known = 0
+        count_known = 0
         for m in range(n):
             i, j = rows[k] + fitted[m, 0], columns[k] + fitted[m, 1]
             if 0 <= i < elevation.shape[0] and 0 <= j < elevation.shape[1] and not math.isnan(elevation[i, j]):
-                x[known], y[known], z[known] = fitted[m, 1], fitted[m, 0], elevation[i, j]
-                known += 1
-        if known < least:
+                x[count_known], y[count_known], z[count_known] = fitted[m, 1], fitted[m, 0], elevation[i, j]
+                count_known += 1
+        if count_known < min_cells:
             continue
-        value, by_x, by_y = robust_plane(x[:known], y[:known], z[:known], triples, refine)
-        most = 0.0
+        value, by_x, by_y = robust_plane(x[:count_known], y[:count_known], z[:count_known], triples, refine)
+        max_distance = 0.0
         for m in range(offsets.shape[0]):
             i, j = rows[k] + offsets[m, 0], columns[k] + offsets[m, 1]
             if 0 <= i < elevation.shape[0] and 0 <= j < elevation.shape[1] and not math.isnan(elevation[i, j]):
-                most = max(most, abs(elevation[i, j] - value - by_x * offsets[m, 1] - by_y * offsets[m, 0]))
+                max_distance = max(
+                    max_distance, abs(elevation[i, j] - value - by_x * offsets[m, 1] - by_y * offsets[m, 0])
+                )
         slopes[k] = math.hypot(by_x, by_y)
-        roughness[k] = most
+        roughness[k] = max_distance
     return slopes, roughness

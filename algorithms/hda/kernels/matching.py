@@ -65,19 +65,19 @@ def biquadratic_top(z: Array) -> tuple[float, float, float]:
 
 
 @njit(cache=True)
-def inside(image: Image, row: int, column: int, reach: int) -> bool:
-    """Whether the square of this reach about a pixel lies in the picture."""
-    return bool(reach <= row < image.shape[0] - reach and reach <= column < image.shape[1] - reach)
+def inside(image: Image, row: int, column: int, radius: int) -> bool:
+    """Whether the square of this radius about a pixel lies in the picture."""
+    return bool(radius <= row < image.shape[0] - radius and radius <= column < image.shape[1] - radius)
 
 
 @njit(cache=True)
 def search(
-    first: Image, second: Image, r1: int, c1: int, row: int, column: int, half: int, reach: int
+    first: Image, second: Image, r1: int, c1: int, row: int, column: int, half: int, radius: int
 ) -> tuple[int, int, float]:
-    """The place of highest correlation within `reach` pixels of (row, column); -2 for its value where none has room."""
+    """Position and value of highest correlation within `radius` pixels of (row, column); -2 where no window fits."""
     best_row, best_column, best = row, column, -2.0
-    for i in range(row - reach, row + reach + 1):
-        for j in range(column - reach, column + reach + 1):
+    for i in range(row - radius, row + radius + 1):
+        for j in range(column - radius, column + radius + 1):
             if inside(second, i, j, half):
                 value = correlation(first, second, r1, c1, i, j, half)
                 if value > best:
@@ -87,28 +87,28 @@ def search(
 
 @njit(cache=True)
 def search_level(
-    first: Image, second: Image, places: NDArray[np.int64], shifts: NDArray[np.int64], half: int, reach: int
+    first: Image, second: Image, positions: NDArray[np.int64], shifts: NDArray[np.int64], half: int, radius: int
 ) -> tuple[NDArray[np.int64], Array]:
-    """The best shift of every place (row, column) within `reach` of the one given, and Eq. 3 there.
+    """Best shift of every position (row, column) within `radius` of the initial shift, and Eq. 3 there.
 
-    -2 where a template has no room.
+    -2 where a template does not fit.
     """
-    found = shifts.copy()
-    values = np.full(places.shape[0], -2.0)
-    for k in range(places.shape[0]):
-        r, c = places[k, 0], places[k, 1]
+    best_shifts = shifts.copy()
+    values = np.full(positions.shape[0], -2.0)
+    for k in range(positions.shape[0]):
+        r, c = positions[k, 0], positions[k, 1]
         if not inside(first, r, c, half):
             continue
-        i, j, values[k] = search(first, second, r, c, r + shifts[k, 0], c + shifts[k, 1], half, reach)
-        found[k, 0], found[k, 1] = i - r, j - c
-    return found, values
+        i, j, values[k] = search(first, second, r, c, r + shifts[k, 0], c + shifts[k, 1], half, radius)
+        best_shifts[k, 0], best_shifts[k, 1] = i - r, j - c
+    return best_shifts, values
 
 
 @njit(cache=True)
 def refine(first: Image, second: Image, r1: int, c1: int, r2: int, c2: int, half: int) -> tuple[float, float, float]:
-    """Row and column of the biquadratic's top over the 3 x 3 places about (r2, c2), and the correlation there.
+    """Row and column of the biquadratic's top over the 3 x 3 positions about (r2, c2), and the correlation there.
 
-    NaN without room.
+    NaN where a window does not fit.
     """
     if not inside(second, r2, c2, half + 1):
         return math.nan, math.nan, math.nan
@@ -123,13 +123,13 @@ def refine(first: Image, second: Image, r1: int, c1: int, r2: int, c2: int, half
 
 @njit(cache=True)
 def refine_shifts(
-    first: Image, second: Image, places: NDArray[np.int64], shifts: NDArray[np.int64], half: int
+    first: Image, second: Image, positions: NDArray[np.int64], shifts: NDArray[np.int64], half: int
 ) -> tuple[Array, Array]:
-    """Sub-pixel places (u, v) in the second picture and the correlation there; NaN without room."""
-    pixels = np.empty((places.shape[0], 2))
-    values = np.empty(places.shape[0])
-    for k in range(places.shape[0]):
-        r, c = places[k, 0], places[k, 1]
+    """Sub-pixel positions (u, v) in the second picture and the correlation there; NaN where a window does not fit."""
+    pixels = np.empty((positions.shape[0], 2))
+    values = np.empty(positions.shape[0])
+    for k in range(positions.shape[0]):
+        r, c = positions[k, 0], positions[k, 1]
         row, column, values[k] = refine(first, second, r, c, r + shifts[k, 0], c + shifts[k, 1], half)
         pixels[k, 0], pixels[k, 1] = column, row
     return pixels, values
@@ -137,9 +137,9 @@ def refine_shifts(
 
 @njit(cache=True)
 def absolute_differences(
-    first: NDArray[np.uint16], second: NDArray[np.uint16], r1: int, c1: int, r2: int, c2: int, half: int, most: int
+    first: NDArray[np.uint16], second: NDArray[np.uint16], r1: int, c1: int, r2: int, c2: int, half: int, max_sum: int
 ) -> int:
-    """Eq. 9 of the windows about two pixels; left off, at some value above, once it exceeds `most`."""
+    """Eq. 9 of the windows about two pixels; the summation ends once it exceeds `max_sum`."""
     width = 2 * half + 1
     total = 0
     for i in range(-half, half + 1):
@@ -149,7 +149,7 @@ def absolute_differences(
         for j in range(width):
             row += int(abs(np.int32(a[j]) - np.int32(b[j])))
         total += row
-        if total > most:
+        if total > max_sum:
             break
     return total
 
@@ -163,11 +163,11 @@ def search_segments(
     ends: Array,
     half: int,
 ) -> NDArray[np.int64]:
-    """For every pixel (u, v) of the first picture the one on its segment in the second with the least Eq. 9.
+    """For every pixel (u, v) of the first picture the one on its segment in the second with the minimum of Eq. 9.
 
-    A segment is walked in steps of one pixel along its longer axis, at whole pixels nearest to it. Windows have room.
+    Samples are one pixel apart along the longer axis, rounded to whole pixels. All windows must lie in the picture.
     """
-    found = np.empty_like(pixels)
+    best_shifts = np.empty_like(pixels)
     for k in range(pixels.shape[0]):
         du, dv = ends[k, 0] - starts[k, 0], ends[k, 1] - starts[k, 1]
         steps = max(math.ceil(max(abs(du), abs(dv))), 1)
@@ -178,5 +178,5 @@ def search_segments(
             value = absolute_differences(first, second, pixels[k, 1], pixels[k, 0], v, u, half, best)
             if value < best:
                 best = value
-                found[k, 0], found[k, 1] = u, v
-    return found
+                best_shifts[k, 0], best_shifts[k, 1] = u, v
+    return best_shifts

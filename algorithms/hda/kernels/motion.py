@@ -47,8 +47,8 @@ def rotation_matrix(q: Array) -> Array:
 
 
 @njit(cache=True)
-def turned(q: Array, step: Array) -> Array:
-    """The quaternion turned further by a small rotation vector, and of unit length again."""
+def rotate_quaternion(q: Array, step: Array) -> Array:
+    """Rotate a quaternion by a small rotation vector and normalise it."""
     p = np.array([1.0, 0.5 * step[0], 0.5 * step[1], 0.5 * step[2]])
     result = np.array(
         [
@@ -92,25 +92,25 @@ def cauchy_cost(r: Array, scale: float) -> float:
 
 @njit(cache=True)
 def _jacobian(x: float, y: float, rho: float, focal: float, R: Array, t: Array, Jm: Array, Jd: Array) -> None:
-    """Derivatives of one residual by rotation (turned from the left) and translation, and by inverse depth."""
+    """Derivatives of one residual by rotation (applied from the left) and translation, and by inverse depth."""
     ax = R[0, 0] * x + R[0, 1] * y + R[0, 2]
     ay = R[1, 0] * x + R[1, 1] * y + R[1, 2]
     az = R[2, 0] * x + R[2, 1] * y + R[2, 2]
     pz = az + rho * t[2]
     gain = focal / pz
-    place = ((ax + rho * t[0]) / pz, (ay + rho * t[1]) / pz)
+    image_point = ((ax + rho * t[0]) / pz, (ay + rho * t[1]) / pz)
     # d(step x a) = (sy az - sz ay, sz ax - sx az, sx ay - sy ax)
-    Jm[0, 0] = -gain * place[0] * ay
-    Jm[0, 1] = gain * (az + place[0] * ax)
+    Jm[0, 0] = -gain * image_point[0] * ay
+    Jm[0, 1] = gain * (az + image_point[0] * ax)
     Jm[0, 2] = -gain * ay
-    Jm[1, 0] = -gain * (az + place[1] * ay)
-    Jm[1, 1] = gain * place[1] * ax
+    Jm[1, 0] = -gain * (az + image_point[1] * ay)
+    Jm[1, 1] = gain * image_point[1] * ax
     Jm[1, 2] = gain * ax
     for k in range(2):
         Jm[k, 3] = Jm[k, 4] = 0.0
         Jm[k, 3 + k] = gain * rho
-        Jm[k, 5] = -gain * place[k] * rho
-        Jd[k] = gain * (t[k] - place[k] * t[2])
+        Jm[k, 5] = -gain * image_point[k] * rho
+        Jd[k] = gain * (t[k] - image_point[k] * t[2])
 
 
 @njit(cache=True)
@@ -165,7 +165,7 @@ def solve(
     damping = 1e-3
     for iteration in range(iterations):
         step, depth_steps = _compute_step(matches, r, motion, damping, with_depths)
-        tried = Motion(turned(motion.q, step[:3]), motion.t + step[3:], motion.inverse_depths + depth_steps)
+        tried = Motion(rotate_quaternion(motion.q, step[:3]), motion.t + step[3:], motion.inverse_depths + depth_steps)
         new_r = residuals(matches, tried)
         new_cost = cauchy_cost(new_r, matches.scale)
         size = math.sqrt(np.sum(step * step))

@@ -107,26 +107,26 @@ def _add_row(sums: Array, squares: Array, row: Image, sign: float) -> None:
 
 
 @njit(cache=True)
-def best_near(
-    template: Image, window: Image, places: NDArray[np.int64], reach: int, floor: float
+def search_near(
+    template: Image, window: Image, positions: NDArray[np.int64], radius: int, floor: float
 ) -> tuple[NDArray[np.int64], Array]:
-    """For each place (row, column) the best one within `reach` rows and columns of it, and Eq. 11 there.
+    """For each position (row, column) the best one within `radius` rows and columns of it, and Eq. 11 there.
 
-    Places outside the window are moved to its border. The template is given less its mean, the window as it is: all
+    Positions outside the window are moved to its border. The template is given less its mean, the window as it is: all
     sums are float64 here.
     """
     n, m = template.shape
     last_row, last_column = window.shape[0] - n, window.shape[1] - m
     energy_a = energy(template)
     count = n * m
-    best = np.empty_like(places)
-    values = np.empty(places.shape[0])
-    for k in range(places.shape[0]):
-        row = min(max(places[k, 0], 0), last_row)
-        column = min(max(places[k, 1], 0), last_column)
+    best = np.empty_like(positions)
+    values = np.empty(positions.shape[0])
+    for k in range(positions.shape[0]):
+        row = min(max(positions[k, 0], 0), last_row)
+        column = min(max(positions[k, 1], 0), last_column)
         values[k] = -2.0
-        for i in range(max(row - reach, 0), min(row + reach, last_row) + 1):
-            for j in range(max(column - reach, 0), min(column + reach, last_column) + 1):
+        for i in range(max(row - radius, 0), min(row + radius, last_row) + 1):
+            for j in range(max(column - radius, 0), min(column + radius, last_column) + 1):
                 cross, total, squares = 0.0, 0.0, 0.0
                 for r in range(n):
                     ours = template[r]

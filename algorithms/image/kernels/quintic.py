@@ -124,21 +124,23 @@ def sample_shifted(coefficients: Array, side: int, row: float, column: float, va
 
 
 @njit(cache=True)
-def shifted(coefficients: Array, row: int, column: int, down: Array, across: Array, taken: Array) -> None:
+def sample_with_derivatives(
+    coefficients: Array, row: int, column: int, down: Array, across: Array, output: Array
+) -> None:
     """A patch of the spline with its upper left pixel at (row, column) and a fraction, and its two derivatives.
 
     `down` and `across` are the six taps along rows and columns, first of values, then of slopes, shape (2, 6), from two
-    pixels before it on. `taken`, shape (3, rows, columns), gets values, derivatives by row and derivatives by column.
+    pixels before it on. `output`, shape (3, rows, columns), gets values, derivatives by row and derivatives by column.
     """
-    _, height, width = taken.shape
+    _, height, width = output.shape
     values, slopes = np.empty(width + 5), np.empty(width + 5)
     for i in range(height):
         for j in range(width + 5):
             value, slope = 0.0, 0.0
             for k in range(6):
-                place = coefficients[row + i + k - 2, column + j - 2]
-                value += down[0, k] * place
-                slope += down[1, k] * place
+                coefficient = coefficients[row + i + k - 2, column + j - 2]
+                value += down[0, k] * coefficient
+                slope += down[1, k] * coefficient
             values[j], slopes[j] = value, slope
         for j in range(width):
             value, by_row, by_column = 0.0, 0.0, 0.0
@@ -146,4 +148,4 @@ def shifted(coefficients: Array, row: int, column: int, down: Array, across: Arr
                 value += across[0, k] * values[j + k]
                 by_row += across[0, k] * slopes[j + k]
                 by_column += across[1, k] * values[j + k]
-            taken[0, i, j], taken[1, i, j], taken[2, i, j] = value, by_row, by_column
+            output[0, i, j], output[1, i, j], output[2, i, j] = value, by_row, by_column

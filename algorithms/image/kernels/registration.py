@@ -123,12 +123,12 @@ def unwarp(warp: Array, change: Array) -> bool:
 
 @njit(cache=True)
 def strength(warp: Array, half: float) -> float:
-    """Largest share by which a warp, less the identity, displaces what is `half` away from the middle."""
-    most: float = max(abs(warp[0, 0] - 1.0), abs(warp[0, 1]), abs(warp[1, 0]), abs(warp[1, 1] - 1.0))
+    """Largest fraction by which a warp, less the identity, displaces what is `half` away from the middle."""
+    largest: float = max(abs(warp[0, 0] - 1.0), abs(warp[0, 1]), abs(warp[1, 0]), abs(warp[1, 1] - 1.0))
     for i in range(2):
         for k in range(2, 5):
-            most = max(most, abs(warp[i, k]) * half)
-    return most
+            largest = max(largest, abs(warp[i, k]) * half)
+    return largest
 
 
 @njit(cache=True)
@@ -161,7 +161,7 @@ def register(
     if not cholesky(lower, singular):
         return failed
     values = np.empty(side * side)
-    found = np.empty(unknowns)
+    solution = np.empty(unknowns)
     warp, change = np.eye(2, 5), np.zeros((2, 5))
     v, u, score = row, column, 0.0
     for step in range(limits[2]):
@@ -172,35 +172,35 @@ def register(
         if not inside:
             return failed
         values -= values.mean()
-        projected(rows, values, found)
+        projected(rows, values, solution)
         spread = math.sqrt(np.sum(values * values))
-        if not (found[0] > 0.0 and spread > 0.0):
+        if not (solution[0] > 0.0 and spread > 0.0):
             return failed
-        score = found[0] / spread
-        solve(lower, found)
+        score = solution[0] / spread
+        solve(lower, solution)
         for p in range(unknowns):
-            found[p] /= scales[p]
-        gain = found[0]
+            solution[p] /= scales[p]
+        gain = solution[0]
         if not gain > 0.0:
             return failed
-        turn = 0.0
+        warp_change = 0.0
         if order > 0:
             # the template was warped by this: undo it before (composition with the inverse)
             for i in range(2):
-                change[i, 0], change[i, 1] = found[4 + 2 * i] / gain, found[5 + 2 * i] / gain
+                change[i, 0], change[i, 1] = solution[4 + 2 * i] / gain, solution[5 + 2 * i] / gain
                 if order > 1:
                     for k in range(3):
-                        change[i, 2 + k] = found[8 + 3 * i + k] / gain
+                        change[i, 2 + k] = solution[8 + 3 * i + k] / gain
             if not unwarp(warp, change):
                 return failed
             change[0, 0] += 1.0
             change[1, 1] += 1.0
-            turn = strength(change, half)
-        dv = (warp[0, 0] * found[2] + warp[0, 1] * found[3]) / gain
-        du = (warp[1, 0] * found[2] + warp[1, 1] * found[3]) / gain
+            warp_change = strength(change, half)
+        dv = (warp[0, 0] * solution[2] + warp[0, 1] * solution[3]) / gain
+        du = (warp[1, 0] * solution[2] + warp[1, 1] * solution[3]) / gain
         v, u = v - dv, u - du
         if math.hypot(v - row, u - column) > limits[0] or strength(warp, half) > limits[1]:
             return failed
-        if math.hypot(dv, du) < tolerance and turn * side < 20.0 * tolerance:
+        if math.hypot(dv, du) < tolerance and warp_change * side < 20.0 * tolerance:
             return True, v, u, score
     return failed

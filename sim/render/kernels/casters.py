@@ -162,11 +162,11 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
         tops[k] = bounds[items[k], 4]
     # one grid over all bodies
     sides = np.array([_cells_per_side(float(bodies))])
-    whole = np.array([[0.0, 0.0, 1.0, 1.0, 0.0]])
+    joint = np.array([[0.0, 0.0, 1.0, 1.0, 0.0]])
     if bodies > 0:
-        whole[0] = _outline(_joint_bounds(rects, 0, bodies), sides[0])
-    first_items, bodies_listed = _list_in_cells(rects, np.array([0, bodies]), whole, sides, np.zeros(1, dtype=np.int64))
-    grid: Grid = (whole[0, :4].copy(), sides, first_items, bodies_listed)
+        joint[0] = _outline(_joint_bounds(rects, 0, bodies), sides[0])
+    first_items, bodies_listed = _list_in_cells(rects, np.array([0, bodies]), joint, sides, np.zeros(1, dtype=np.int64))
+    grid: Grid = (joint[0, :4].copy(), sides, first_items, bodies_listed)
     return linear, axes, grid, (outlines, shapes, starts, items, tops)
 
 

@@ -125,21 +125,21 @@ def _bracketed_crossing(level: GroundLevel, ray: Ray, above: Clearance, below: C
     middle = below
     for iteration in range(MAX_ITERATIONS):
         fraction = above_height / (above_height - below_height)
-        kept = 0.5
+        weight = 0.5
         if iteration < CUBIC_ITERATIONS:
             fraction = _cubic_crossing(
                 above_height, above_rate * (t - before), below_height, below_rate * (t - before), fraction
             )
-            kept = 1.0
+            weight = 1.0
         middle = clearance_at(field, per_metre, ray, before + (t - before) * fraction)
         if abs(middle.height) < 1e-3 * spacing * max(-ray.dz, 1e-3) or t - before <= 0.01 * spacing:
             break
         if middle.height < 0.0:
             t, below_height, below_rate = middle.t, middle.height, middle.rate
-            above_height *= kept
+            above_height *= weight
         else:
             before, above_height, above_rate = middle.t, middle.height, middle.rate
-            below_height *= kept
+            below_height *= weight
     polished = middle.t - middle.height / middle.rate if middle.rate < CLOSING else middle.t
     return polished if before < polished < t else middle.t
 

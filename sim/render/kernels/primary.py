@@ -13,8 +13,8 @@ from marsyard.sim.render.kernels.hierarchy import Hierarchy, TriangleHit, nearer
 from marsyard.sim.render.kernels.strips import (
     ROW,
     STRIP,
+    FetchedCells,
     Matrix,
-    Near,
     fetch_levels,
     no_cells,
     rotate,
@@ -74,13 +74,13 @@ def _nearest_depth(depth: Array32, ids: Ints, shown: int, face: int, i: int, j: 
     `shown` is 0 where none of them shows a triangle.
     """
     nearest = 0.0
-    least = math.inf
+    min_offset = math.inf
     for di in range(2):
         for dj in range(2):
             value = depth[face, i + di, j + dj]
             far = abs(fv - di) + abs(fu - dj)
-            if value > 0.0 and far < least and (shown == 0 or ids[face, i + di, j + dj] == 0):
-                least, nearest = far, value
+            if value > 0.0 and far < min_offset and (shown == 0 or ids[face, i + di, j + dj] == 0):
+                min_offset, nearest = far, value
     return nearest
 
 
@@ -160,10 +160,10 @@ def _interpolate_guesses(pixel_angles: Array32, width: int, work: Array) -> None
 
 
 @njit(cache=True, error_model="numpy")
-def _take_newton_step(near: Near, width: int, work: Array) -> None:
+def _take_newton_step(fetched: FetchedCells, width: int, work: Array) -> None:
     """Newton step of the followed rays; `ACTIVE` is 1 for those that continue, else 0."""
     for k in range(min(width, STRIP)):
-        height, slope_x, slope_y, _albedo = spline(near[0], near[1], k)
+        height, slope_x, slope_y, _albedo = spline(fetched[0], fetched[1], k)
         t, start, scale, dz = work[MET + k], work[START + k], work[SCALE + k], work[DZ + k]
         miss = work[Z0 + k] + t * dz - height
         closing = dz - slope_x * scale * work[DX + k] - slope_y * scale * work[DY + k]
@@ -185,13 +185,13 @@ def _refine_on_ground(
     count: int,
     width: int,
     work: Array,
-    near: Near,
+    fetched: FetchedCells,
 ) -> None:
     """Bring rays of a strip from their first guess, `MET`, onto the ground by Newton's method; where it fails they
     stay.
 
     All rays take a step before any takes the next, so that the processor works on several at once. `active` holds the
-    numbers of the `count` followed rays; it is overwritten. `near` is a buffer for control values.
+    numbers of the `count` followed rays; it is overwritten. `fetched` is a buffer for control values.
     """
     for k in range(width):
         work[START + k] = work[MET + k]
@@ -205,8 +205,8 @@ def _refine_on_ground(
         for k in range(min(width, STRIP)):
             work[X + k] = work[X0 + k] + work[MET + k] * work[DX + k]
             work[Y + k] = work[Y0 + k] + work[MET + k] * work[DY + k]
-        fetch_levels(levels, inverse_spacing, level_of, active, count, work[X : X + ROW], work[Y : Y + ROW], near)
-        _take_newton_step(near, width, work)
+        fetch_levels(levels, inverse_spacing, level_of, active, count, work[X : X + ROW], work[Y : Y + ROW], fetched)
+        _take_newton_step(fetched, width, work)
         remaining = 0
         for m in range(count):
             k = active[m]
@@ -303,7 +303,7 @@ def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tre
     centre = (pose.position[0], pose.position[1], pose.position[2])
     origins, directions = rays.origins.reshape(-1), rays.directions.reshape(-1)
     levels, ceilings, top_level, spacing, extent = ground
-    near = no_cells()
+    fetched = no_cells()
     work, pixels = np.empty(ROWS * ROW), rays.directions.shape[0]
     longs = np.empty((4, STRIP), dtype=np.int64)
     level_of, refined = longs[2], longs[3]
@@ -326,5 +326,5 @@ def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tre
             # a grazing ray that dips below the ground is already there; Newton's method refines the others
             refined[count] = k
             count += work[MET + k] == work[GUESS + k]
-        _refine_on_ground(levels, 1.0 / spacing, level_of, refined, count, width, work, near)
+        _refine_on_ground(levels, 1.0 / spacing, level_of, refined, count, width, work, fetched)
         _write_hits(views, tree, first, width, strip, hits)

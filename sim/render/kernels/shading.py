@@ -14,8 +14,8 @@ from marsyard.sim.render.kernels.primary import FLATTEST
 from marsyard.sim.render.kernels.strips import (
     ROW,
     STRIP,
+    FetchedCells,
     Matrix,
-    Near,
     fetch_levels,
     no_cells,
     rotate,
@@ -126,10 +126,10 @@ def _locate_pixels(
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _evaluate_splines(near: Near, width: int, out: Array) -> None:
+def _evaluate_splines(fetched: FetchedCells, width: int, out: Array) -> None:
     """Height, slopes by sample and albedo of the terrain at the positions of a strip, a row of `out` each."""
     for k in range(min(width, STRIP)):
-        out[k], out[ROW + k], out[2 * ROW + k], out[3 * ROW + k] = spline(near[0], near[1], k)
+        out[k], out[ROW + k], out[2 * ROW + k], out[3 * ROW + k] = spline(fetched[0], fetched[1], k)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -191,19 +191,25 @@ def _select_levels(spacing: float, top_level: int, hits: Hits, strip: _Strip) ->
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _sample_ground(
-    levels: tuple[Level, ...], per_metre: float, n_ground: int, n_blended: int, width: int, strip: _Strip, near: Near
+    levels: tuple[Level, ...],
+    per_metre: float,
+    n_ground: int,
+    n_blended: int,
+    width: int,
+    strip: _Strip,
+    fetched: FetchedCells,
 ) -> None:
     """Slopes, albedo and normals of the ground in the pixels of a strip."""
     work = strip.work
     if n_ground > 0:
         x, y = work[X : X + ROW], work[Y : Y + ROW]
-        fetch_levels(levels, per_metre, strip.level, strip.ground, n_ground, x, y, near)
-        _evaluate_splines(near, width, work[HEIGHT : HEIGHT + 4 * ROW])
+        fetch_levels(levels, per_metre, strip.level, strip.ground, n_ground, x, y, fetched)
+        _evaluate_splines(fetched, width, work[HEIGHT : HEIGHT + 4 * ROW])
         if n_blended > 0:
             for m in range(n_blended):
                 strip.level[strip.blended[m]] += 1
-            fetch_levels(levels, per_metre, strip.level, strip.blended, n_blended, x, y, near)
-            _evaluate_splines(near, width, work[COARSE_HEIGHT : COARSE_HEIGHT + 4 * ROW])
+            fetch_levels(levels, per_metre, strip.level, strip.blended, n_blended, x, y, fetched)
+            _evaluate_splines(fetched, width, work[COARSE_HEIGHT : COARSE_HEIGHT + 4 * ROW])
         _blend_levels(width, work)
     for k in range(min(width, STRIP)):
         slope_x, slope_y = work[SLOPE_X + k], work[SLOPE_Y + k]
@@ -338,13 +344,13 @@ def photometric_angles(sun: tuple[float, float, float], width: int, work: Array)
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def reflect(law: tuple[float, float, float, float, float, float], width: int, work: Array, radiance: Array32) -> None:
     """Radiance factor of ground under sun and sky: Lunar-Lambert with an opposition surge."""
-    lunar, amplitude, surge_width, normalisation, sky_share, bounced = law
+    lunar, amplitude, surge_width, normalisation, sky_fraction, bounced = law
     for k in range(min(width, STRIP)):
         nz, cos_i, cos_g = work[NZ + k], work[COS_I + k], work[COS_G + k]
         tan_half = math.sqrt(max(1.0 - cos_g, 0.0) / max(1.0 + cos_g, 1e-9))
         surge = 1.0 + amplitude / (1.0 + tan_half / surge_width)
         brightness = normalisation * surge * (2.0 * lunar * cos_i / (cos_i + work[COS_E + k]) + (1.0 - lunar) * cos_i)
-        value = sky_share * 0.5 * (1.0 + nz) + bounced * 0.5 * (1.0 - nz)
+        value = sky_fraction * 0.5 * (1.0 + nz) + bounced * 0.5 * (1.0 - nz)
         value += work[LIT + k] * brightness if cos_i > 0.0 else 0.0
         radiance[k] = work[ALBEDO + k] * value
 
@@ -396,7 +402,7 @@ def shade(
     levels, spacing = ground.levels, ground.spacing
     finest = GroundLevel(levels[0], ground.ceilings[0], 1.0 / spacing)
     terrain = levels[occluders.shadow.level]
-    near = no_cells()
+    fetched = no_cells()
     work = np.empty(ROWS * ROW)
     longs = np.empty((4, STRIP), dtype=np.int64)
     strip = _Strip(work, longs[0], longs[1], longs[2], longs[3], np.empty(STRIP, dtype=np.bool_))
@@ -412,7 +418,7 @@ def shade(
         here, there = 3 * first, 3 * last
         _locate_pixels(rotation, centre, origins[here:there], directions[here:there], angles, met.distance, width, work)
         n_ground, n_blended, n_other = _select_levels(spacing, ground.top_level, met, strip)
-        _sample_ground(levels, 1.0 / spacing, n_ground, n_blended, width, strip, near)
+        _sample_ground(levels, 1.0 / spacing, n_ground, n_blended, width, strip, fetched)
         seen = _sample_objects(materials, met, angles, n_other, strip, body)
         photometric_angles(towards, width, work)
         _apply_texture(materials, width, seen, strip)

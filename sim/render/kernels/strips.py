@@ -16,7 +16,7 @@ from marsyard.sim.render.kernels.structs import Array32, Longs
 from marsyard.sim.terrain.kernels import Array, Level, bspline_weights
 
 #: Control values around the positions of a strip, their fractions of a cell, and a buffer for numbers of positions.
-Near = tuple[Array32, Array, Longs]
+FetchedCells = tuple[Array32, Array, Longs]
 #: Nine numbers of a matrix, row by row.
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
 
@@ -29,7 +29,7 @@ CELLS = 2 * 16 * ROW
 
 
 @njit(cache=True)
-def no_cells() -> Near:
+def no_cells() -> FetchedCells:
     """Allocate buffers for the control values around the positions of a strip."""
     return np.empty(CELLS, dtype=np.float32), np.empty(2 * ROW), np.empty(STRIP, dtype=np.int64)
 
@@ -63,7 +63,7 @@ def fetch_cells(
     side = field.shape[0]
     mask = side - 1
     pairs = field.reshape(-1).view(np.int64)
-    kept = cells.view(np.int64)
+    copies = cells.view(np.int64)
     for m in range(count):
         k = which[m]
         gx, gy = x[k] * scale, y[k] * scale
@@ -74,10 +74,10 @@ def fetch_cells(
         for row in range(4):
             line = ((i + row - 1) & mask) * side
             entry = np.uint64(4 * row * ROW + k)
-            kept[entry] = pairs[np.uint64(line + j0)]
-            kept[entry + np.uint64(ROW)] = pairs[np.uint64(line + j1)]
-            kept[entry + np.uint64(2 * ROW)] = pairs[np.uint64(line + j2)]
-            kept[entry + np.uint64(3 * ROW)] = pairs[np.uint64(line + j3)]
+            copies[entry] = pairs[np.uint64(line + j0)]
+            copies[entry + np.uint64(ROW)] = pairs[np.uint64(line + j1)]
+            copies[entry + np.uint64(2 * ROW)] = pairs[np.uint64(line + j2)]
+            copies[entry + np.uint64(3 * ROW)] = pairs[np.uint64(line + j3)]
 
 
 @njit(cache=True)
@@ -89,20 +89,20 @@ def fetch_levels(
     count: int,
     x: Array,
     y: Array,
-    near: Near,
+    fetched: FetchedCells,
 ) -> None:
-    """As `fetch_cells`, each position on its own level; the last array of `near` is overwritten."""
-    cells, fractions, on_level = near
+    """As `fetch_cells`, each position on its own level; the last array of `fetched` is overwritten."""
+    cells, fractions, on_level = fetched
     lowest, highest = len(levels) - 1, 0
     for m in range(count):
         lowest = min(lowest, level_of[which[m]])
         highest = max(highest, level_of[which[m]])
     for level in range(lowest, highest + 1):
-        found = 0
+        selected = 0
         for m in range(count):
-            on_level[found] = which[m]
-            found += level_of[which[m]] == level
-        fetch_cells(levels[level], inverse_spacing / (1 << level), x, y, on_level, found, cells, fractions)
+            on_level[selected] = which[m]
+            selected += level_of[which[m]] == level
+        fetch_cells(levels[level], inverse_spacing / (1 << level), x, y, on_level, selected, cells, fractions)
 
 
 @njit(cache=True, inline="always")

@@ -56,8 +56,8 @@ def sweep_shadow(height: Array32, along: float, drop: float, slip: float, reach:
     row_mask, column_mask = rows - 1, columns - 1
     shadow = np.empty_like(height)
     away = np.empty(height.shape, dtype=np.uint8)
-    whole = math.floor(slip)
-    fraction = np.float32(slip - whole)
+    whole_columns = math.floor(slip)
+    fraction = np.float32(slip - whole_columns)
     rest = np.float32(1.0) - fraction
     fall = np.float32(drop)
     before = np.full(columns, np.float32(-1e9), dtype=np.float32)
@@ -72,7 +72,7 @@ def sweep_shadow(height: Array32, along: float, drop: float, slip: float, reach:
             caster[j] = max(height[source, j], before[j])
             rows_away[j] = 0 if height[source, j] >= before[j] else rows_before[j]
         for j in range(columns):
-            a = (j + whole) & column_mask
+            a = (j + whole_columns) & column_mask
             b = (a + 1) & column_mask
             before[j] = rest * caster[a] + fraction * caster[b] - fall
             rows_before[j] = max(rows_away[a], rows_away[b]) + 1

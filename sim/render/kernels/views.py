@@ -52,10 +52,10 @@ def sum_of_vectors(directions: Array32) -> tuple[float, float, float]:
 @njit(cache=True)
 def min_component(directions: Array32, axis: Array) -> float:
     """Least component of vectors, shape (n, 3), along an axis."""
-    least = math.inf
+    lowest = math.inf
     for n in range(directions.shape[0]):
-        least = min(least, directions[n, 0] * axis[0] + directions[n, 1] * axis[1] + directions[n, 2] * axis[2])
-    return least
+        lowest = min(lowest, directions[n, 0] * axis[0] + directions[n, 1] * axis[1] + directions[n, 2] * axis[2])
+    return lowest
 
 
 @njit(cache=True, error_model="numpy")
@@ -64,30 +64,30 @@ def max_image_radius(directions: Array, view: Array) -> float:
 
     `view` holds right, down and forward of the view, one row each.
     """
-    most = 0.0
+    largest = 0.0
     for i in range(directions.shape[0]):
         for j in range(directions.shape[1]):
             x, y, z = directions[i, j, 0], directions[i, j, 1], directions[i, j, 2]
             right = view[0, 0] * x + view[0, 1] * y + view[0, 2] * z
             down = view[1, 0] * x + view[1, 1] * y + view[1, 2] * z
             forward = view[2, 0] * x + view[2, 1] * y + view[2, 2] * z
-            most = max(most, abs(right / forward), abs(down / forward))
-    return most
+            largest = max(largest, abs(right / forward), abs(down / forward))
+    return largest
 
 
 @njit(cache=True, error_model="numpy")
-def depth_in_metres(drawn: Array32, near: float, far: float) -> Array32:
+def depth_in_metres(depth_buffer: Array32, near: float, far: float) -> Array32:
     """Convert OpenGL's depths to depth along the axis, metres, 0 where nothing was drawn; reverse the order of rows.
 
-    `drawn` is 0 at `near`, 1 at `far` and where nothing is, its lowest row first.
+    `depth_buffer` is 0 at `near`, 1 at `far` and where nothing is, its lowest row first.
     """
-    rows, columns = drawn.shape
+    rows, columns = depth_buffer.shape
     depth = np.empty((rows, columns), dtype=np.float32)
     # single precision from the first to the last
     minus_two, one, nothing = np.float32(-2.0), np.float32(1.0), np.float32(0.0)
     span, both, product = np.float32(far - near), np.float32(far + near), np.float32(2.0 * near * far)
     for i in range(rows):
-        line, above = drawn[rows - 1 - i], depth[i]
+        line, above = depth_buffer[rows - 1 - i], depth[i]
         for j in range(columns):
             value = product / ((minus_two * line[j] + one) * span + both)
             above[j] = nothing if line[j] == one else value
@@ -103,7 +103,7 @@ def spans_in_hull(x: Array, y: Array, hull: Array) -> Longs:
     spans = np.empty((y.size - 1, 2), dtype=np.int64)
     for strip in range(y.size - 1):
         low, high = y[strip], y[strip + 1]
-        least, greatest = math.inf, -math.inf
+        lowest, greatest = math.inf, -math.inf
         for k in range(hull.shape[0]):
             x0, y0 = hull[k - 1, 0], hull[k - 1, 1]
             x1, y1 = hull[k, 0], hull[k, 1]
@@ -112,9 +112,9 @@ def spans_in_hull(x: Array, y: Array, hull: Array) -> Longs:
             # a side of the polygon, from where it enters the strip to where it leaves it
             for level, end in ((low, x0), (high, x1)):
                 at = end if y0 == y1 else x0 + min(max((level - y0) / (y1 - y0), 0.0), 1.0) * (x1 - x0)
-                least = min(least, at)
+                lowest = min(lowest, at)
                 greatest = max(greatest, at)
-        first = min(max(int(np.searchsorted(x, least, side="right")) - 1, 0), x.size - 1)
+        first = min(max(int(np.searchsorted(x, lowest, side="right")) - 1, 0), x.size - 1)
         spans[strip, 0] = first
         spans[strip, 1] = min(max(int(np.searchsorted(x, greatest)), first), x.size - 1)
     return spans

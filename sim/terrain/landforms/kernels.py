@@ -56,8 +56,8 @@ def add_refined(fine: Grid, coarse: Grid) -> None:
 def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reach: float) -> None:
     """Add bowls, rims and ejecta of craters to height and to the logarithm of albedo, in order.
 
-    `craters` has rows (x, y, radius, depth below the surroundings, rim height, rounding of the rim in metres, share of
-    the depth that is filled, tone of the ejecta, then three pairs of cosine and sine terms of the outline for two,
+    `craters` has rows (x, y, radius, depth below the surroundings, rim height, rounding of the rim in metres, filled
+    fraction of the depth, tone of the ejecta, then three pairs of cosine and sine terms of the outline for two,
     three and five lobes, and the phase of the rays).
     """
     mask = height.shape[0] - 1
@@ -118,11 +118,11 @@ def _arctan2(x: float, y: float) -> float:
     wide, high = abs(x), abs(y)
     larger = max(wide, high, 1e-30)
     ratio = min(wide, high) / larger
-    turned = ratio > 0.41421356237309503
-    a = (ratio - 1.0) / (ratio + 1.0) if turned else ratio
+    is_reduced = ratio > 0.41421356237309503
+    a = (ratio - 1.0) / (ratio + 1.0) if is_reduced else ratio
     b = a * a
     angle = (((8.05374449538e-2 * b - 1.38776856032e-1) * b + 1.99777106478e-1) * b - 3.33329491539e-1) * b * a + a
-    angle += 0.25 * math.pi if turned else 0.0
+    angle += 0.25 * math.pi if is_reduced else 0.0
     angle = 0.5 * math.pi - angle if high > wide else angle
     angle = math.pi - angle if x < 0.0 else angle
     return -angle if y < 0.0 else angle

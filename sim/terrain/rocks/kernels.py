@@ -45,11 +45,11 @@ def place_discs(
     placed = np.full((radii.size, 2), np.nan, dtype=np.float64)
     used, count = 0, 0
     for n in range(occupied.shape[0] + radii.size):
-        given = n < occupied.shape[0]
-        radius = occupied[n, 2] if given else radii[n - occupied.shape[0]]
+        is_existing = n < occupied.shape[0]
+        radius = occupied[n, 2] if is_existing else radii[n - occupied.shape[0]]
         x, y = 0.0, 0.0
-        free = given
-        if given:
+        free = is_existing
+        if is_existing:
             x, y = occupied[n, 0] % period, occupied[n, 1] % period
         tries = 0
         while not free and tries < max_tries:
@@ -77,7 +77,7 @@ def place_discs(
                     break
         if not free:
             continue
-        if not given:
+        if not is_existing:
             placed[n - occupied.shape[0], 0], placed[n - occupied.shape[0], 1] = x, y
         discs[count, 0], discs[count, 1], discs[count, 2] = x, y, radius
         span = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)

@@ -233,14 +233,14 @@ def test_a_second_picture_of_something_else_has_no_tracks(
     assert apriori(found, exact)
 
 
-def test_zero_baseline_is_told(exact: LandingMeasurements) -> None:
+def test_zero_baseline_is_reported(exact: LandingMeasurements) -> None:
     still = replace(repainted(exact, 1, exact.images[0].counts), poses=(exact.poses[0], exact.poses[0]))
     found = HdaEstimator(OPTIONS).estimate(still)
     assert found.outcome is SiteOutcome.NO_BASELINE
     assert apriori(found, still)
 
 
-def test_a_pure_rotation_is_told() -> None:
+def test_a_pure_rotation_is_reported() -> None:
     # About the camera's centre, or the camera would move: its place in the body is (0.3, 0, -0.1).
     first = pose(0.0, 0.0, 10.0, 5.0)
     turn = Rotation.from_euler("zyx", [3.0, 2.0, -2.0], degrees=True)

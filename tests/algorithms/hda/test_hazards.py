@@ -134,7 +134,7 @@ def test_a_map_smaller_than_the_lander_is_unknown() -> None:
     assert safe_site(maps.safety, np.zeros(2)) is None
 
 
-def test_steep_ground_is_a_hazard_beside_level_ground() -> None:
+def test_steep_ground_is_a_hazard_next_to_level_ground() -> None:
     flat = ground(80, 100)
     ramp = np.maximum(np.arange(100) - 50, 0) * CELL_M * np.tan(np.deg2rad(20.0))
     maps = hazard_maps(replace(flat, elevation_m=flat.elevation_m + ramp), OPTIONS)

@@ -103,7 +103,7 @@ def test_wrong_tracks_are_let_go_of() -> None:
     assert right >= 36
 
 
-def test_a_wrong_match_along_the_epipolar_line_is_told_by_its_depth() -> None:
+def test_a_wrong_match_along_the_epipolar_line_is_recognised_by_its_depth() -> None:
     rng = np.random.default_rng(4)
     places, depths = scene(rng, 0.02)
     moved = rigid(Rotation.identity(), np.array([1.0, 0.0, 0.0]))

@@ -29,7 +29,7 @@ def noise() -> np.ndarray:
     return np.random.default_rng(1).integers(0, 256, (120, 160)).astype(np.uint16)
 
 
-def test_interest_is_the_product_of_what_the_eigenvalues_exceed_the_least_by(noise: np.ndarray) -> None:
+def test_interest_is_the_product_of_what_the_eigenvalues_exceed_the_minimum_by(noise: np.ndarray) -> None:
     image = noise.astype(np.float32)
     p = eigenvalue_test(image, 11, 300.0)
     # Independent: gradients and sums by loops over one template.
@@ -45,7 +45,7 @@ def test_interest_is_the_product_of_what_the_eigenvalues_exceed_the_least_by(noi
         assert p[row, column] == pytest.approx(expected, rel=1e-3)
 
 
-def test_both_eigenvalues_below_the_least_are_no_feature() -> None:
+def test_both_eigenvalues_below_the_minimum_are_no_feature() -> None:
     # The product of two negative excesses is positive: only a > l tells them from two large eigenvalues.
     faint = np.random.default_rng(2).integers(0, 3, (60, 60)).astype(np.float32)
     assert not np.any(np.isfinite(eigenvalue_test(faint, 11, 50.0)))
@@ -188,7 +188,7 @@ def test_features_that_leave_the_picture_are_no_tracks() -> None:
     assert not np.any(tracks.accepted & outside)
 
 
-def test_the_search_begins_where_it_is_told() -> None:
+def test_the_search_begins_where_it_is_reported() -> None:
     scene = flown((0.0, -1.8, 10.0, 20.0))
     first, second = (picture(scene, i).counts for i in (0, 1))
     features = select_features(first, OPTIONS)

@@ -32,7 +32,7 @@ def test_parameters_come_complete_with_their_defaults(campaign_file: CampaignFil
 
 
 @pytest.mark.parametrize(
-    ("parameters", "said"),
+    ("parameters", "message"),
     [
         ("altitud_m = 3", "parameters.altitud_m: unknown key (did you mean 'altitude_m'?); allowed: aborting"),
         (
@@ -46,15 +46,15 @@ def test_parameters_come_complete_with_their_defaults(campaign_file: CampaignFil
         ("wind = 3", "parameters.wind: input should be a valid dictionary"),
     ],
 )
-def test_parameters(campaign_file: CampaignFile, parameters: str, said: str) -> None:
+def test_parameters(campaign_file: CampaignFile, parameters: str, message: str) -> None:
     path = campaign_file(parameters, dispersions="")
     text = refusal(path)
     assert text.startswith(f"{path}: ")
-    assert said in text
+    assert message in text
 
 
 @pytest.mark.parametrize(
-    ("dispersion", "said"),
+    ("dispersion", "message"),
     [
         ("altitud_m = {distribution='uniform', low=1, high=2}", "dispersions.altitud_m: unknown parameter 'altitud_m'"),
         ("wind = {distribution='uniform', low=1, high=2}", "dispersions.wind: is a table; disperse one of its values"),
@@ -100,11 +100,11 @@ def test_parameters(campaign_file: CampaignFile, parameters: str, said: str) -> 
         ),
     ],
 )
-def test_dispersions(campaign_file: CampaignFile, dispersion: str, said: str) -> None:
+def test_dispersions(campaign_file: CampaignFile, dispersion: str, message: str) -> None:
     path = campaign_file(dispersions=f"[dispersions]\n{dispersion}")
     text = refusal(path)
     assert text.startswith(f"{path}: dispersions.")
-    assert said in text
+    assert message in text
 
 
 def test_draws_that_are_refused_only_together(campaign_file: CampaignFile) -> None:
@@ -117,7 +117,7 @@ def test_draws_that_are_refused_only_together(campaign_file: CampaignFile) -> No
 
 
 @pytest.mark.parametrize(
-    ("head", "said"),
+    ("head", "message"),
     [
         (
             "name='a'\nscenario='descnt'\ncases=1",
@@ -152,15 +152,15 @@ def test_draws_that_are_refused_only_together(campaign_file: CampaignFile) -> No
         (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nx=", "not valid TOML"),
     ],
 )
-def test_the_campaign_itself(campaign_file: CampaignFile, head: str, said: str) -> None:
+def test_the_campaign_itself(campaign_file: CampaignFile, head: str, message: str) -> None:
     path = campaign_file(head=head)
     text = refusal(path)
     assert text.startswith(f"{path}: ")
-    assert said in text
+    assert message in text
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ("bound = 'x'", "requirements[0].bound: input should be a valid number, got 'x'"),
         ("bound = inf", "requirements[0].bound: input should be a finite number"),
@@ -175,12 +175,12 @@ def test_the_campaign_itself(campaign_file: CampaignFile, head: str, said: str) 
         ("accept_rate = true", 'accept_rate needs decide_by = "estimate"'),
     ],
 )
-def test_requirements(campaign_file: CampaignFile, change: str, said: str) -> None:
+def test_requirements(campaign_file: CampaignFile, change: str, message: str) -> None:
     key = change.split(" ")[0]
     base = {"id": "'a'", "metric": "'m'", "bound": "1", "probability": "0.9", "confidence": "0.9"}
     lines = [f"{name} = {value}" for name, value in base.items() if name != key]
     path = campaign_file(requirement="[[requirements]]\n" + "\n".join([*lines, change]))
-    assert said in refusal(path)
+    assert message in refusal(path)
 
 
 def test_requirements_have_distinct_ids(campaign_file: CampaignFile) -> None:
@@ -248,7 +248,7 @@ def test_overrides(campaign_file: CampaignFile) -> None:
 
 
 @pytest.mark.parametrize(
-    ("override", "said"),
+    ("override", "message"),
     [
         ("altitude_m=-3", "parameters.altitude_m: input should be greater than 0, got -3"),
         ("altitud_m=3", "parameters.altitud_m: unknown key (did you mean 'altitude_m'?)"),
@@ -263,10 +263,10 @@ def test_overrides(campaign_file: CampaignFile) -> None:
         ("dispersions.terrain.high=99", "dispersions.terrain: integer(low=0, high=99) reaches 99"),
     ],
 )
-def test_invalid_overrides_are_reported_by_option(campaign_file: CampaignFile, override: str, said: str) -> None:
+def test_invalid_overrides_are_reported_by_option(campaign_file: CampaignFile, override: str, message: str) -> None:
     text = refusal(campaign_file(), override)
     assert text.startswith(f"--set {override}: ".replace("\n", "\\n"))
-    assert said in text
+    assert message in text
 
 
 _WORDS = """

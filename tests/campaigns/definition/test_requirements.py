@@ -57,14 +57,14 @@ def test_a_campaign_may_change_population_and_confidence(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ("entry", "said"),
+    ("entry", "message"),
     [('id = "DIMES-VEE"', "did you mean 'DIMES-VEL'"), ('id = "DIMES-VEL"\nbound = 9.0', "requirements[0].bound")],
 )
-def test_unknown_requirement_names_are_reported(tmp_path: Path, entry: str, said: str) -> None:
+def test_unknown_requirement_names_are_reported(tmp_path: Path, entry: str, message: str) -> None:
     path = write_campaign(tmp_path, requirement=f"[[requirements]]\n{entry}\n")
     with pytest.raises(ConfigurationError) as raised:
         load_campaign(str(path))
-    assert said in str(raised.value)
+    assert message in str(raised.value)
 
 
 ONE = '[[requirements]]\nid = "A"\nmetric = "answered"\nprobability = 0.9\nconfidence = 0.9\ncampaigns = ["dimes-*"]\n'
@@ -79,7 +79,7 @@ def test_requirements_apply_by_patterns(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("not toml", "not valid TOML"),
         (ONE + "bounds = 3\n", "requirements[0].bounds"),
@@ -87,12 +87,12 @@ def test_requirements_apply_by_patterns(tmp_path: Path) -> None:
         ("", "requirements"),
     ],
 )
-def test_a_file_that_states_no_requirements_is_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_a_file_that_states_no_requirements_is_refused(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "asked.toml"
     path.write_text(text)
     with pytest.raises(ConfigurationError) as raised:
         read_requirements(path)
-    assert said in str(raised.value)
+    assert message in str(raised.value)
 
 
 def test_a_missing_file_is_reported(tmp_path: Path) -> None:

@@ -34,8 +34,8 @@ def test_a_cluster_gives_the_rows_of_one_machine(
 ) -> None:
     path = campaign_file("raising_cases = [3]\naborting_cases = [5]")
     rows = {}
-    for name, crew in (("cluster", ExecutorConfig(cluster="local:2")), ("machine", ExecutorConfig(1))):
-        run_campaign(load_campaign(str(path)), tmp_path / name, crew, watch)
+    for name, executor in (("cluster", ExecutorConfig(cluster="local:2")), ("machine", ExecutorConfig(1))):
+        run_campaign(load_campaign(str(path)), tmp_path / name, executor, watch)
         rows[name] = read_rows(tmp_path / name / "cases.parquet")
     assert [differing_columns(*pair) for pair in zip(*rows.values(), strict=True)] == [()] * 12
     outcomes = {row["case"]: row["outcome"] for row in rows["cluster"] if not row["answered"]}

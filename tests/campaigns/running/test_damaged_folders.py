@@ -47,7 +47,7 @@ def test_a_run_killed_before_its_record_was_written_can_be_started_again(
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "said"),
+    ("key", "value", "message"),
     [
         ("state", ["finished"], "state is not a text"),
         ("cases", "12", "cases is not a whole number"),
@@ -61,10 +61,10 @@ def test_a_run_killed_before_its_record_was_written_can_be_started_again(
         ("changes", None, "changes is not a list"),
     ],
 )
-def test_a_record_of_wrong_types_is_refused(troubled: Path, tmp_path: Path, key: str, value: Any, said: str) -> None:
+def test_a_record_of_wrong_types_is_refused(troubled: Path, tmp_path: Path, key: str, value: Any, message: str) -> None:
     stored = json.loads((troubled / "campaign.json").read_text())
     (tmp_path / "campaign.json").write_text(json.dumps({**stored, key: value}))
-    with pytest.raises(StoreError, match=said):
+    with pytest.raises(StoreError, match=message):
         record.read(tmp_path)
 
 
@@ -91,7 +91,7 @@ def test_stored_parameters_of_wrong_types_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ("UPDATE cases SET layout = 77", "unknown layout 77"),
         ("UPDATE layouts SET names = '{\"a\": 1}'", "is not a list of column names"),
@@ -101,7 +101,7 @@ def test_stored_parameters_of_wrong_types_are_refused(
         ("DROP TABLE layouts", "no such table"),
     ],
 )
-def test_an_unknown_layout_of_the_store_is_one_message(tmp_path: Path, change: str, said: str) -> None:
+def test_an_unknown_layout_of_the_store_is_one_message(tmp_path: Path, change: str, message: str) -> None:
     path = tmp_path / ROWS_FILE
     create_store(path, {})
     with RowStore(path) as store:
@@ -116,7 +116,7 @@ def test_an_unknown_layout_of_the_store_is_one_message(tmp_path: Path, change: s
             write_table(tmp_path / "table", store)
             store.row(0)
 
-    with pytest.raises(StoreError, match=said):
+    with pytest.raises(StoreError, match=message):
         read()
 
 

@@ -126,7 +126,7 @@ def test_a_metric_that_no_case_has_stops_the_campaign_early(
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ("metric='velocity_error_m_s'", "[0].metric: unknown column of true and false 'velocity_error_m_s'"),
         ("metric='answered'\nbound=1", "[0].metric: unknown column of numbers 'answered'"),
@@ -134,11 +134,11 @@ def test_a_metric_that_no_case_has_stops_the_campaign_early(
         ("metric='answered'\npopulation='valid and rom'", "[0].population: unknown column of true and false 'rom'"),
     ],
 )
-def test_requirements_need_columns_of_their_kind(campaign_file: CampaignFile, change: str, said: str) -> None:
+def test_requirements_need_columns_of_their_kind(campaign_file: CampaignFile, change: str, message: str) -> None:
     requirement = f"[[requirements]]\nid='a'\nprobability=0.9\nconfidence=0.9\n{change}"
     configuration = load_campaign(str(campaign_file(requirement=requirement))).configuration
     row = {"case": 0, "answered": True, "velocity_error_m_s": 1.0}
-    with pytest.raises(ConfigurationError, match=re.escape(said)):
+    with pytest.raises(ConfigurationError, match=re.escape(message)):
         check_metrics(configuration, row, Path("runs"))
 
 

@@ -76,13 +76,13 @@ def test_changed_programs_resume_only_if_allowed(done: Path, watch: Silence, mon
     real = read_versions()
     monkeypatch.setattr("marsyard.campaigns.definition.identity.read_versions", lambda: {**real, "numpy": "0.9"})
     before = {path: path.read_bytes() for path in done.glob("c*.*")}
-    said = rf"Changed:\n  numpy \({np.__version__}, now 0.9\)\nTo continue nevertheless.*--allow-changed"
+    message = rf"Changed:\n  numpy \({np.__version__}, now 0.9\)\nTo continue nevertheless.*--allow-changed"
     acts: tuple[Callable[[], None], ...] = (
         lambda: resume_campaign(done, ExecutorConfig(1), watch),
         lambda: append_cases(done, 2, ExecutorConfig(1), watch),
     )
     for act in acts:
-        with pytest.raises(CampaignError, match=said):
+        with pytest.raises(CampaignError, match=message):
             act()
     assert {path: path.read_bytes() for path in before} == {
         **before,

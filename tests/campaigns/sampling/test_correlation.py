@@ -140,7 +140,7 @@ def test_a_member_that_is_set_leaves_its_group(campaign_file: CampaignFile) -> N
 
 
 @pytest.mark.parametrize(
-    ("stated", "said"),
+    ("stated", "message"),
     [
         ({}, "one of covariance, correlation, rank is needed, got none"),
         ({"rank": [[1, 0], [0, 1]], "correlation": [[1, 0], [0, 1]]}, "got correlation, rank"),
@@ -154,14 +154,14 @@ def test_a_member_that_is_set_leaves_its_group(campaign_file: CampaignFile) -> N
         ({"covariance": [[1, float("nan")], [0, 1]]}, "finite number"),
     ],
 )
-def test_invalid_correlations_are_refused(stated: dict[str, object], said: str) -> None:
+def test_invalid_correlations_are_refused(stated: dict[str, object], message: str) -> None:
     with pytest.raises(ValidationError) as caught:
         Correlation.model_validate({"parameters": ["a", "b"], **stated})
-    assert said in str(caught.value)
+    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("dispersions", "said"),
+    ("dispersions", "message"),
     [
         (NORMAL.format(east=", sd=2", north="", matrix="covariance=[[4,1],[1,4]]"), "has an sd, which the covariance"),
         (NORMAL.format(east=", sd=2", north="", matrix="correlation=[[1,0],[0,1]]"), 'm_s".sd: required, but missing'),
@@ -175,7 +175,7 @@ def test_invalid_correlations_are_refused(stated: dict[str, object], said: str) 
         ("[correlations]\nx = 1", "correlations: input should be a valid tuple"),
     ],
 )
-def test_impossible_groups_are_refused(campaign_file: CampaignFile, dispersions: str, said: str) -> None:
+def test_impossible_groups_are_refused(campaign_file: CampaignFile, dispersions: str, message: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         load_campaign(str(campaign_file(dispersions=dispersions)))
-    assert said in str(caught.value)
+    assert message in str(caught.value)

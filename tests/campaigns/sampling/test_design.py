@@ -180,7 +180,7 @@ def test_the_nominal_case_draws_nothing(campaign_file: CampaignFile) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "cases", "more", "said"),
+    ("kind", "cases", "more", "message"),
     [
         ("sobol", 48, {}, "cases: 48 cases cannot be laid out: a Sobol design takes a power of 2, such as 32 or 64"),
         ("sobol", 32, {"nominal": True}, "31 cases behind the nominal one"),
@@ -193,8 +193,8 @@ def test_the_nominal_case_draws_nothing(campaign_file: CampaignFile) -> None:
     ],
 )
 def test_impossible_designs_are_refused(
-    campaign_file: CampaignFile, kind: str, cases: int, more: dict[str, object], said: str
+    campaign_file: CampaignFile, kind: str, cases: int, more: dict[str, object], message: str
 ) -> None:
     with pytest.raises(ConfigurationError) as caught:
         load(campaign_file, kind, cases, **more)  # type: ignore[arg-type]
-    assert said in str(caught.value)
+    assert message in str(caught.value)

@@ -79,7 +79,7 @@ def test_other_syntax_than_arithmetic_is_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("1 / (altitude_m - 2000)", "has no value where altitude_m = 2000: "),
         ("sqrt(wind.east_m_s)", "has no value where wind.east_m_s = -3: "),
@@ -90,8 +90,8 @@ def test_other_syntax_than_arithmetic_is_refused(text: str) -> None:
         ("on + 1", "uses on, which is True and not a number"),
     ],
 )
-def test_formulas_without_a_value_report_their_numbers(text: str, said: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(said)):
+def test_formulas_without_a_value_report_their_numbers(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
         formula(text).value(VALUES)
 
 

@@ -102,7 +102,7 @@ def _scribble(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "message"),
     [
         (lambda path: _cut(path, 0), "does not say that it is one"),
         (lambda path: _cut(path, 0.5), "damaged"),
@@ -112,13 +112,13 @@ def _scribble(path: Path) -> None:
         (lambda path: path.unlink(), "no such file"),
     ],
 )
-def test_a_damaged_store_is_refused_and_unchanged(tmp_path: Path, damage: Callable[[Path], None], said: str) -> None:
+def test_a_damaged_store_is_refused_and_unchanged(tmp_path: Path, damage: Callable[[Path], None], message: str) -> None:
     path = tmp_path / "cases.sqlite"
     with store_with(tmp_path, ({"case": case, "text": "x" * 100} for case in range(300))):
         pass
     damage(path)
     before = path.read_bytes() if path.exists() else None
-    with pytest.raises(StoreError, match=said):
+    with pytest.raises(StoreError, match=message):
         RowStore(path, thorough=True)
     assert (path.read_bytes() if path.exists() else None) == before
 
@@ -195,9 +195,9 @@ def test_records_that_are_not_ours_are_refused(tmp_path: Path) -> None:
         record.read(tmp_path / "nothing")
     with pytest.raises(StoreError, match=r"it has no campaign\.json"):
         record.read(tmp_path)
-    for text, said in (("{", "damaged"), ("[]", "damaged"), ("{}", "damaged"), ('{"schema": 99}', "has schema 99")):
+    for text, message in (("{", "damaged"), ("[]", "damaged"), ("{}", "damaged"), ('{"schema": 99}', "has schema 99")):
         (tmp_path / "campaign.json").write_text(text)
-        with pytest.raises(StoreError, match=said):
+        with pytest.raises(StoreError, match=message):
             record.read(tmp_path)
     (tmp_path / "campaign.json").write_text('{"schema": 1, "configuration": {"name": 3}}')
     with pytest.raises(StoreError, match="damaged"):

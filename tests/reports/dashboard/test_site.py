@@ -47,8 +47,8 @@ def test_every_requirement_has_a_row_and_every_campaign(make_rows: Rows, make_ru
     assert "3 stored campaigns" in text
     counted = re.search(r'<ul class="coverage".*?</ul>', text, re.DOTALL)
     assert counted is not None
-    told = " ".join(re.sub(r"<[^>]+>", " ", counted[0]).split())
-    assert told == f"INSUFFICIENT 1 NO CAMPAIGN {len(shipped_requirements()) - 1}"
+    reported = " ".join(re.sub(r"<[^>]+>", " ", counted[0]).split())
+    assert reported == f"INSUFFICIENT 1 NO CAMPAIGN {len(shipped_requirements()) - 1}"
     matrix = list(csv.DictReader(io.StringIO((tmp_path / "site" / "verification.csv").read_text())))
     verdicts = {row["requirement"]: row["verdict"] for row in matrix}
     assert (verdicts["DIMES-VEL"], verdicts["HDA-TIME"]) == ("INSUFFICIENT", "NO CAMPAIGN")
@@ -57,9 +57,9 @@ def test_every_requirement_has_a_row_and_every_campaign(make_rows: Rows, make_ru
 def test_what_came_to_its_end_stands_before_what_did_not(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
     paths = []
     for day, (name, state) in enumerate([("a", "finished"), ("b", "finished"), ("c", "interrupted")], start=1):
-        said = {"started_utc": f"2026-01-0{day}T00:00:00Z", "state": state}
+        message = {"started_utc": f"2026-01-0{day}T00:00:00Z", "state": state}
         frame = make_rows(24, seed=day)[BARE].assign(site=["east", "west"] * 12, algorithm="mine")
-        record = make_run(frame, **said) / "campaign.json"
+        record = make_run(frame, **message) / "campaign.json"
         paths.append(record.parent.rename(tmp_path / name))
         text = (tmp_path / name / "campaign.json").read_text()
         (tmp_path / name / "campaign.json").write_text(text.replace("dimes-synthetic", f"dimes-{name}"))

@@ -31,7 +31,7 @@ def field_frame(make_rows: MakeRows) -> pd.DataFrame:
     return frame
 
 
-def test_cells_stand_beside_the_papers(make_run: MakeRun, field_frame: pd.DataFrame) -> None:
+def test_cells_stand_next_to_the_papers(make_run: MakeRun, field_frame: pd.DataFrame) -> None:
     run = read_run(make_run(field_frame, requirements=[VELOCITY]))
     short, same, other = field_cells(Subject(run, "velocity_error_m_s", 5.0))
     assert (short["valid"].hits, short["paper_percent"]) == (20, 100)

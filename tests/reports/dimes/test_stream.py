@@ -40,7 +40,7 @@ def test_every_picture_and_answer_is_drawn(products: dict[str, Any]) -> None:
         np.testing.assert_allclose(np.asarray(answered.get_ydata()), products["after_true_m_s"][1:, component] + error)
 
 
-def test_a_case_is_told_picture_by_picture(products: dict[str, Any], tmp_path: Path) -> None:
+def test_a_case_is_reported_picture_by_picture(products: dict[str, Any], tmp_path: Path) -> None:
     shown = view(products, "case3")
     assert [row.succeeded for row in shown.rows] == [False, True, True, True]
     assert shown.rows[0].values[0] == "1"

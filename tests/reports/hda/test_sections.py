@@ -75,7 +75,7 @@ def test_table_1_is_scaled_to_its_sum() -> None:
     assert sum(stage["seconds"] for stage in PAPER["stages"]) < 1.0  # "less than one second"
 
 
-def test_table_2_beside_landings() -> None:
+def test_table_2_next_to_landings() -> None:
     frame = landing_frame(200)
     section = TOUCHDOWN(_subject(frame))
     assert section is not None

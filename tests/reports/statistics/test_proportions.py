@@ -88,7 +88,7 @@ def test_impossible_confidence_is_refused(confidence: float) -> None:
 
 
 @pytest.mark.parametrize("true_rate", [0.5, 0.9, 0.99])
-def test_coverage_is_exactly_at_least_nominal(true_rate: float) -> None:
+def test_coverage_is_exactly_at_the_minimum_nominal(true_rate: float) -> None:
     # Not sampled: the coverage is summed over all outcomes of 60 cases.
     n, confidence = 60, 0.9
     outcomes = np.arange(n + 1)

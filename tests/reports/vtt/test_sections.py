@@ -65,7 +65,7 @@ def _shared(skips: int = 5) -> pd.DataFrame:
     return pd.concat(frames, ignore_index=True)
 
 
-def test_steps_stand_beside_fig_8() -> None:
+def test_steps_stand_next_to_fig_8() -> None:
     frame = _shared()
     frame.loc[0, ["selectable", "tracked", "true_track"]] = False  # a target on the edge counts for nothing
     found = step_rates(subject(frame, legs=[{"motion": "approach", "step_fraction": 0.05}]))
@@ -91,7 +91,7 @@ def test_steps_around_and_in_place_are_degrees() -> None:
     assert steps_section(subject(rows(3))) is None
 
 
-def test_oblique_targets_are_told_apart_and_those_off_the_face_are_no_part_of_the_paper_s_share() -> None:
+def test_oblique_targets_are_reported_apart_and_those_off_the_face_are_no_part_of_the_paper_s_share() -> None:
     """Face-on targets are tracked, oblique ones lost: the share beside the paper's is of those on the face alone."""
     face_on = rows(6, skip=0, step=5.0, obliquity_max_deg=40.0, in_view=True, on_face=True)
     oblique = rows(4, skip=0, step=5.0, obliquity_max_deg=72.0, in_view=True, on_face=False, tracked=False)
@@ -116,7 +116,7 @@ def _with_updates(numbers: int, cases: int = 3) -> pd.DataFrame:
     return frame
 
 
-def test_table_iii_stands_beside_ours() -> None:
+def test_table_iii_stands_next_to_ours() -> None:
     frame = _with_updates(8)
     frame.loc[0, "update_8_match_score"] = 0.5
     shown = table(updates_section(subject(frame, CHECKOUT_1)))

@@ -74,9 +74,9 @@ def test_over_relief_errors_are_those_of_geometry() -> None:
         )
         errors.append(_errors(tracks, states))
         expected += [_formula(track, states, measurements, surface) for track in tracks]
-    measured, told = np.concatenate(errors), np.array(expected)
+    measured, reported = np.concatenate(errors), np.array(expected)
     assert len(measured) >= 3 * CASES
-    assert np.sqrt(np.mean(np.sum((measured - told) ** 2, axis=1))) < 0.2
+    assert np.sqrt(np.mean(np.sum((measured - reported) ** 2, axis=1))) < 0.2
     # there was something to explain
     assert np.sqrt(np.mean(np.sum(measured**2, axis=1))) > 0.4
 

@@ -128,7 +128,7 @@ def test_pictures_are_written_down_for_others(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("parts", "said"),
+    ("parts", "message"),
     [
         ({"pictures": 2}, "pictures is 2, but 'dimes' takes 3; allowed: 3 to 100"),
         ({"pictures": 1}, "greater than or equal to 2"),
@@ -140,8 +140,8 @@ def test_pictures_are_written_down_for_others(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_numbers_of_pictures_that_cannot_be(parts: dict[str, Any], said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_numbers_of_pictures_that_cannot_be(parts: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         parameters(**parts)
 
 

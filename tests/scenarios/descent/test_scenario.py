@@ -96,7 +96,7 @@ def test_with_perfect_instruments_over_flat_ground_the_velocity_is_right(wind: t
         assert row[f"firing_velocity_error_{axis}_m_s"] == pytest.approx(row[f"velocity_error_{axis}_m_s"], abs=0.01)
 
 
-def test_perfect_instruments_are_told_to_be(nominal: CaseResult) -> None:
+def test_perfect_instruments_are_reported_to_be(nominal: CaseResult) -> None:
     """Over flat ground nothing is left but the altitude's way from the radar's last reading to the picture."""
     row = run(**PERFECT, terrain=FLAT).row
     for name in ("attitude_error_common_deg", "attitude_error_independent_deg"):

@@ -41,7 +41,7 @@ def test_a_stuck_altimeter_repeats_a_range_of_a_greater_height() -> None:
     assert stuck_range_m(Faults(), 10.0) is None
 
 
-def test_lost_pictures_leave_two_at_least() -> None:
+def test_lost_pictures_leave_two_at_the_minimum() -> None:
     rng = np.random.default_rng(0)
     assert len(arrived_numbers(Faults(), 40, rng)) == 40
     some = arrived_numbers(Faults(lost_pictures=0.75), 40, rng)

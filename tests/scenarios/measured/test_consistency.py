@@ -62,9 +62,9 @@ def test_rows_tell_of_right_matches_alone() -> None:
     offsets = np.full((40, 2), [3.0, 4.0])
     right = np.arange(40) < 20
     offsets[~right] = 500.0
-    told = agreement_row([PairAgreement(PairMatches(np.zeros((2, 40, 2)), right), offsets)])
-    assert (told["matches"], told["residual_median_px"], told["residual_90_percent_px"]) == (20, 5.0, 5.0)
-    assert told["outlier_fraction"] == 0.5
+    reported = agreement_row([PairAgreement(PairMatches(np.zeros((2, 40, 2)), right), offsets)])
+    assert (reported["matches"], reported["residual_median_px"], reported["residual_90_percent_px"]) == (20, 5.0, 5.0)
+    assert reported["outlier_fraction"] == 0.5
     few = agreement_row([PairAgreement(PairMatches(np.zeros((2, 40, 2)), np.arange(40) < 10), offsets)])
     assert np.isnan(few["residual_median_px"])
     assert few["pairs_matched"] == 0

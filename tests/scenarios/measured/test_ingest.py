@@ -39,7 +39,7 @@ def without(rows: Rows, *names: str) -> Rows:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda rows: changed(rows, 1, file="lost.png"), "lost.png: No such file"),
         (lambda rows: changed(rows, 1, qx="nan"), "line 3: qx is 'nan'; allowed: a finite number"),
@@ -58,10 +58,10 @@ def without(rows: Rows, *names: str) -> Rows:
         (lambda rows: changed(rows, 0, camera="none.cahvor"), "none.cahvor: file: cannot be read"),
     ],
 )
-def test_tables_that_cannot_be_used(tmp_path: Path, change: Callable[[Rows], Rows], said: str) -> None:
+def test_tables_that_cannot_be_used(tmp_path: Path, change: Callable[[Rows], Rows], message: str) -> None:
     folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write_texts(folder, change(read_rows(folder)))
-    assert said in refused(folder, tmp_path)
+    assert message in refused(folder, tmp_path)
 
 
 def replace_by_pipe(path: Path) -> None:
@@ -70,7 +70,7 @@ def replace_by_pipe(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("write", "said"),
+    ("write", "message"),
     [
         (lambda path: cv2.imwrite(str(path), np.zeros((480, 640), np.uint16)), "has 640 x 480 pixels; its camera has"),
         (lambda path: path.write_bytes(b""), "is empty (0 bytes)"),
@@ -83,16 +83,16 @@ def replace_by_pipe(path: Path) -> None:
         (lambda path: path.write_bytes(b"P5 80000 80000 65535\n"), "has 80000 x 80000 pixels; its camera has"),
     ],
 )
-def test_pictures_that_cannot_be_used(tmp_path: Path, write: Callable[[Path], object], said: str) -> None:
+def test_pictures_that_cannot_be_used(tmp_path: Path, write: Callable[[Path], object], message: str) -> None:
     folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write(folder / "drop-1.png")
-    message = refused(folder, tmp_path)
-    assert "drop-1.png" in message
-    assert said in message
+    output = refused(folder, tmp_path)
+    assert "drop-1.png" in output
+    assert message in output
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("bits = 12", "bits = 20", "detector.bits: Input should be less than or equal to 16, got 20"),
         ("bits = 12", "", "detector.bits: required, but missing"),
@@ -103,11 +103,11 @@ def test_pictures_that_cannot_be_used(tmp_path: Path, write: Callable[[Path], ob
         ("flat.npy", "camera.cahvor", "camera.cahvor: is no picture that is read"),
     ],
 )
-def test_settings_that_cannot_be_used(tmp_path: Path, old: str, new: str, said: str) -> None:
+def test_settings_that_cannot_be_used(tmp_path: Path, old: str, new: str, message: str) -> None:
     folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     path = folder / "ingest.toml"
     path.write_text(path.read_text().replace(old, new))
-    assert said in refused(folder, tmp_path)
+    assert message in refused(folder, tmp_path)
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".pgm"])

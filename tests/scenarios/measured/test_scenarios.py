@@ -73,7 +73,7 @@ def test_descents_come_through_as_they_were_measured(tmp_path: Path, ned: bool) 
     assert row["measured_case"] == "drop"
 
 
-def test_without_truth_no_error_is_told(tmp_path: Path) -> None:
+def test_without_truth_no_error_is_reported(tmp_path: Path) -> None:
     folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     row: dict[str, Any] = dict(ran(folder, tmp_path / "out", scores=[f"{__name__}:descent_score"]).row)
     assert row["descent_score_known"] is False

@@ -142,7 +142,7 @@ def test_the_motion_of_a_case_is_its_own() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
         ("short", "flies -5 to 2.9 s; allowed: from -5 s or before to 8 s or after"),
         ("length", r"gives a quaternion of length 1\.1 \(pose 1\); allowed: 1"),
@@ -152,10 +152,10 @@ def test_the_motion_of_a_case_is_its_own() -> None:
         ("column", "reports the column height_m twice, or it is one of its options"),
     ],
 )
-def test_a_motion_that_is_none_is_told(wrong: str, said: str) -> None:
+def test_a_motion_that_is_none_is_reported(wrong: str, message: str) -> None:
     flight = {**OWN["flight"], "options": {"wrong": wrong}}
     p = parameters(terrain=FLAT, flight=flight)
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         create_flight(p, World.of(p).surface, Streams(1, "test", 0))
 
 
@@ -170,7 +170,7 @@ def test_a_motion_that_ends_early_is_followed_to_its_end(lasts_s: float) -> None
     assert Instruments.draw(p, world, flown, streams).navigation.velocity(np.array([flown.firing_s])).shape == (1, 3)
 
 
-def test_a_motion_below_the_ground_is_told() -> None:
+def test_a_motion_below_the_ground_is_reported() -> None:
     flight = {**OWN["flight"], "options": {"height_m": 500.0}}
     p = parameters(terrain=FLAT, flight=flight)
     with pytest.raises(ValueError, match=r"at picture 3 the camera is 62\.5 m below the ground"):

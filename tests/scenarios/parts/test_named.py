@@ -40,7 +40,7 @@ def problem(**parts: Any) -> tuple[str, str]:
 
 
 @pytest.mark.parametrize(
-    ("parts", "key", "said"),
+    ("parts", "key", "message"),
     [
         ({"flight": {"motion": "nowhere:X"}}, "flight", "no motion at 'nowhere:X': No module named 'nowhere'"),
         ({"flight": {"motion": "custom_parts:Glidr"}}, "flight", "has no attribute 'Glidr'"),
@@ -74,13 +74,13 @@ def problem(**parts: Any) -> tuple[str, str]:
         ({"scores": ["custom_parts:sideways"] * 2}, "scores", "the score 'custom_parts:sideways' is named twice"),
     ],
 )
-def test_what_is_wrong_is_told_where_it_stands(parts: dict[str, Any], key: str, said: str) -> None:
-    where, message = problem(**parts)
+def test_what_is_wrong_is_reported_where_it_stands(parts: dict[str, Any], key: str, message: str) -> None:
+    where, output = problem(**parts)
     assert where == key
-    assert said in message
+    assert message in output
 
 
-def test_a_module_that_raises_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_module_that_raises_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "raises_at_import.py").write_text("raise RuntimeError('no licence')\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     assert "RuntimeError: no licence" in problem(flight={"motion": "raises_at_import:Any"})[1]
@@ -133,7 +133,7 @@ def test_a_score_tells_by_its_annotation_what_it_takes(tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize(
-    ("told", "said"),
+    ("reported", "message"),
     [
         ([1.0], "gives its columns as a list; allowed: a mapping"),
         ({"a b": 1.0}, "names a column 'a b'"),
@@ -142,9 +142,9 @@ def test_a_score_tells_by_its_annotation_what_it_takes(tmp_path: Path, monkeypat
         ({"a": None}, "gives a as a NoneType"),
     ],
 )
-def test_columns_that_cannot_be(told: object, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
-        check_columns("x:y", told, texts=False)
+def test_columns_that_cannot_be(reported: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        check_columns("x:y", reported, texts=False)
 
 
 def test_the_identity_covers_the_modules_of_parts() -> None:

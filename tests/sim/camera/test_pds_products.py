@@ -68,7 +68,7 @@ def test_samples_of_all_kinds(tmp_path: Path, sample: str, pointer: str, kind: s
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"pointer": '("other.img", 3)'}, r"\^IMAGE: .*other.img cannot be read \(No such file"),
         ({"kind": "IEEE_REAL"}, "SAMPLE_TYPE, SAMPLE_BITS: IEEE_REAL, 16; allowed: integers of 8 or 16 bits"),
@@ -79,8 +79,8 @@ def test_samples_of_all_kinds(tmp_path: Path, sample: str, pointer: str, kind: s
         ({"quaternion": "(1.0, 0.0)"}, "4 numbers"),
     ],
 )
-def test_products_that_cannot_be_used(tmp_path: Path, changes: dict[str, object], said: str) -> None:
-    with pytest.raises(CameraFileError, match=said) as caught:
+def test_products_that_cannot_be_used(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    with pytest.raises(CameraFileError, match=message) as caught:
         read_pds3_product(product(tmp_path, **changes))  # type: ignore[arg-type]
     assert "made.img" in str(caught.value)
 

@@ -188,9 +188,9 @@ def test_navcam_ray_from_the_papers_equations(pinhole: Cahv) -> None:
     """The middle of CAHV's image plane looks along A, and a column to the right of it to the right by 1 / hs."""
     hc, vc = pinhole.image_centre
     hs, _ = pinhole.focal_lengths
-    straight, beside = pinhole.rays(np.array([[hc, vc], [hc + 1, vc]]))[1]
+    straight, adjacent = pinhole.rays(np.array([[hc, vc], [hc + 1, vc]]))[1]
     assert np.allclose(straight, pinhole.a, atol=1e-6)  # A is labelled to six digits
-    assert math.isclose(math.atan(1 / hs), math.acos(straight @ beside), rel_tol=1e-5)
+    assert math.isclose(math.atan(1 / hs), math.acos(straight @ adjacent), rel_tol=1e-5)
 
 
 # ----- limits -----

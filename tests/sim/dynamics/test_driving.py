@@ -29,7 +29,7 @@ def _rng() -> np.random.Generator:
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("slope_deg", [0.0, 15.0])
-def test_without_slip_the_rover_does_as_it_is_told(command: DriveCommand, slope_deg: float) -> None:
+def test_without_slip_the_rover_does_as_it_is_reported(command: DriveCommand, slope_deg: float) -> None:
     # on a plane the motion in the body's axes is the planar one, whatever the slope
     ground = uphill_east(slope_deg)
     start = settle(MER, ground, 1.0, 2.0, 0.4)

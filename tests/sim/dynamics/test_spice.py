@@ -152,7 +152,7 @@ def test_the_hash_is_that_of_all_files(kernels: Path, tmp_path: Path) -> None:
         ('world = "SITE_ENU"', "world = SITE", "Invalid value"),
     ],
 )
-def test_what_is_wrong_is_told(kernels: Path, tmp_path: Path, before: str, after: str, message: str) -> None:
+def test_what_is_wrong_is_reported(kernels: Path, tmp_path: Path, before: str, after: str, message: str) -> None:
     copy = tmp_path / "kernels"
     shutil.copytree(kernels, copy)
     path = copy / "flight.spice.toml"

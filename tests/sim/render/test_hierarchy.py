@@ -56,8 +56,8 @@ def test_a_beam_lists_all_triangles_that_its_rays_meet(thicket: Objects, axis: n
     middles = thicket.triangles.mean(axis=1) - EYE
     size = np.linalg.norm(thicket.triangles - thicket.triangles.mean(axis=1, keepdims=True), axis=2).max(axis=1)
     along = middles @ axis
-    beside = np.linalg.norm(middles - along[:, None] * axis, axis=1)
-    near = beside <= np.sqrt(2.0) * (np.tan(spread) * np.maximum(along, 0.0) + 2.0 * size)
+    adjacent = np.linalg.norm(middles - along[:, None] * axis, axis=1)
+    near = adjacent <= np.sqrt(2.0) * (np.tan(spread) * np.maximum(along, 0.0) + 2.0 * size)
     assert listed <= set(np.flatnonzero(near).tolist())
 
 

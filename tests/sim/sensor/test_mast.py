@@ -63,7 +63,7 @@ def test_the_zeros_error_is_fixed_to_a_run() -> None:
         assert np.subtract(state.readings_rad, state.true_rad) == pytest.approx(mast.zeros_rad)
 
 
-def test_encoders_read_whole_counts_and_motors_stop_beside_commands() -> None:
+def test_encoders_read_whole_counts_and_motors_stop_next_to_commands() -> None:
     mast = Mast.drawn(EXACT.model_copy(update={"count_deg": 0.05, "settling_deg": 0.2}), MER_MAST, _rng())
     states = _moved(mast, list(np.linspace(-30.0, 30.0, 400)))
     counts = np.degrees([state.readings_rad[0] for state in states]) / 0.05

@@ -92,11 +92,11 @@ def test_innovations_are_white() -> None:
     normalised: dict[int, list[float]] = {POSITION_FIX: [], VELOCITY_FIX: []}
     products: dict[int, list[float]] = {POSITION_FIX: [], VELOCITY_FIX: []}
     for seed in range(20):
-        said = _flown(seed)[2].innovations
-        assert np.mean(said.used) > 0.99
+        message = _flown(seed)[2].innovations
+        assert np.mean(message.used) > 0.99
         for kind in normalised:
             for axis in range(3):
-                one = said.normalised[(said.kinds == kind) & (said.axes == axis) & (said.times_s > -8.0)]
+                one = message.normalised[(message.kinds == kind) & (message.axes == axis) & (message.times_s > -8.0)]
                 normalised[kind].extend(one)
                 products[kind].extend(one[1:] * one[:-1])
     for kind in normalised:
@@ -151,7 +151,7 @@ def test_stuck_instruments_stop_to_count() -> None:
     assert left[2] < 4.0
 
 
-def test_it_starts_anew_where_it_was_led_astray() -> None:
+def test_it_starts_again_where_it_was_led_astray() -> None:
     """A filter that begins 20 m off: its covariance would refuse all solutions, but not for more than a second."""
     path, rng = _path(3), np.random.default_rng(4)
     span = path.span_s
@@ -163,8 +163,8 @@ def test_it_starts_anew_where_it_was_led_astray() -> None:
     start = navigation.initialize(solutions, readings)
     astray = replace(start, state=start.state + np.eye(16)[0] * 20.0, covariance=0.01 * start.covariance)
     solution = navigation.run(astray, imu.increments(path, *span, rng), solutions, readings)
-    said = solution.innovations
-    assert not said.used[(said.kinds == POSITION_FIX) & (said.axes == 0)][0]
+    message = solution.innovations
+    assert not message.used[(message.kinds == POSITION_FIX) & (message.axes == 0)][0]
     off = np.abs(solution.positions_m - path.motion(imu.boundaries(*span)).positions_m)
     assert off[80, 0] > 15.0
     assert off[200:].max() < 0.1

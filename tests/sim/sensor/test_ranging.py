@@ -179,7 +179,7 @@ def test_a_tilt_beyond_half_the_beam_lengthens_the_reading(tilt_deg: float) -> N
     assert found == pytest.approx(1500.0 / np.cos(beyond), rel=5e-4)
 
 
-def test_beside_a_cliff_the_radar_reads_its_edge() -> None:
+def test_next_to_a_cliff_the_radar_reads_its_edge() -> None:
     heights = np.zeros((SIDE, SIDE))
     edge = SIDE // 2 + 60
     heights[:, edge:] = 200.0

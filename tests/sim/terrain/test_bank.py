@@ -45,7 +45,7 @@ def test_numbers_seeds_and_parameters_tell_terrains_apart(cache: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [b"", b"not an array", None])
-def test_a_damaged_file_is_built_anew(cache: Path, damage: bytes | None) -> None:
+def test_a_damaged_file_is_built_again(cache: Path, damage: bytes | None) -> None:
     bank = TerrainBank(SMALL, seed=1)
     built = _bytes(bank, 3)
     path = next(cache.iterdir())

@@ -1,0 +1,127 @@
+"""Names, docstrings, comments and pages use the project's vocabulary (docs/glossary.md), not private language."""
+
+from __future__ import annotations
+
+import ast
+import io
+import re
+import subprocess
+import tokenize
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("sim", "algorithms", "scenarios", "campaigns", "reports", "marsyard", "benchmarks")
+#: Words of a name, split at underscores and capitals, that have a standard term.
+NAME_WORDS = {
+    "most": "max",
+    "least": "min",
+    "told": "reported",
+    "tells": "reports",
+    "said": "stated",
+    "thing": "object",
+    "things": "objects",
+    "whoever": "a noun",
+    "anew": "again",
+    "mend": "fix",
+    "beside": "next to",
+    "crew": "executor",
+}
+#: Names that are kept, with the reason.
+ALLOWED_NAMES = {
+    r"least_(squares|median|absolute|sum)": "terms of estimation",
+}
+#: Patterns of text that have a plain form.
+PHRASES = {
+    r"\banew\b": "again",
+    r"\bbeside\b": "next to",
+    r"\bwhoever\b": "name the subject",
+    r"\bwhatever\b": "name the subject",
+    r"\bmends?\b": "fix",
+    r"\btold\b": "reported, stated or given",
+    r"\btells\b": "reports or states",
+    r"\bthat which\b": "name the subject",
+    r"\bof one's own\b": "custom",
+    r"\bthings?\b": "object, body or mesh",
+    r"\bgoes? on\b": "continue",
+    r"\bcarr(?:y|ies) on\b": "continue",
+    r"\b(?:filter|state)s? takes? in\b": "update",
+}
+
+
+def python_files() -> list[Path]:
+    """Sources of the packages and benchmarks, as git lists them."""
+    listed = subprocess.run(["git", "ls-files", *PACKAGES], cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True)
+    return [ROOT / name for name in listed.stdout.split() if name.endswith(".py")]
+
+
+def names_of(tree: ast.AST) -> Iterator[tuple[str, int]]:
+    """Names that a module defines: functions, classes, arguments and variables, with their lines."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.name, node.lineno
+        elif isinstance(node, ast.arg):
+            yield node.arg, node.lineno
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id, node.lineno
+
+
+def words_of(name: str) -> list[str]:
+    return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", name)]
+
+
+def prose_of(text: str) -> Iterator[tuple[str, int]]:
+    """Docstrings and comments of a module, with their lines; quoted code is removed."""
+    for node in ast.walk(ast.parse(text)):
+        body = getattr(node, "body", None)
+        for statement in body if isinstance(body, list) else []:
+            value = getattr(statement, "value", None)
+            if isinstance(statement, ast.Expr) and isinstance(value, ast.Constant) and isinstance(value.value, str):
+                yield value.value, statement.lineno
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.string, token.start[0]
+
+
+def offences(text: str, line: int) -> Iterator[str]:
+    for number, part in enumerate(text.splitlines()):
+        plain = re.sub(r"`[^`]*`", "", part)
+        for pattern, instead in PHRASES.items():
+            if re.search(pattern, plain, re.IGNORECASE):
+                yield f"{line + number}: {part.strip()[:80]!r}: use {instead}"
+
+
+def test_names_use_the_vocabulary() -> None:
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line}: {name} ({word}: use {NAME_WORDS[word]})"
+        for path in python_files()
+        for name, line in names_of(ast.parse(path.read_text(encoding="utf-8")))
+        if not any(re.search(allowed, name) for allowed in ALLOWED_NAMES)
+        for word in words_of(name)
+        if word in NAME_WORDS
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_docstrings_and_comments_use_the_vocabulary() -> None:
+    wrong = [
+        f"{path.relative_to(ROOT)}:{found}"
+        for path in python_files()
+        for text, line in prose_of(path.read_text(encoding="utf-8"))
+        for found in offences(text, line)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+#: The generated pages repeat texts that are checked at their source.
+PAGES = sorted(path for path in (ROOT / "docs").rglob("*.md") if "generated" not in path.parts)
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *PAGES], ids=lambda page: str(page.relative_to(ROOT)))
+def test_pages_use_the_vocabulary(page: Path) -> None:
+    text = re.sub(
+        r"^```.*?^```$", lambda block: "\n" * block[0].count("\n"), page.read_text(encoding="utf-8"), flags=re.M | re.S
+    )
+    assert not list(offences(text, 1))
