@@ -17,9 +17,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import DustySky, Objects, Photometry, PixelRays, Scene, Sun, Texture
+from marsyard.sim.render.kernels.structs import MicroRelief
 from marsyard.sim.sensor import CameraDesign
 from marsyard.sim.terrain import RockField, RockMesh, Site, Surface, TerrainBank, TerrainParameters
+from marsyard.sim.terrain.microrelief import octave_heights
 from marsyard.sim.terrain.rocks.shapes import FINEST, max_pixels, rock_shapes
+from marsyard.sim.terrain.surface import ROUGHNESS, TEXTURE
 
 Scale = Literal["descent", "ground"]
 
@@ -135,6 +138,7 @@ def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
         sun,
         ground.photometry(sun),
         objects=select_rocks(ground, eye, reach),
+        relief=micro_relief(ground),
         ground_texture=Texture(ground.site.ground_texture.coarsest_m, ground.site.ground_texture.amplitudes),
         object_texture=Texture(ground.site.rock_texture.coarsest_m, ground.site.rock_texture.amplitudes),
         mesh_finest_m=finest,
@@ -142,6 +146,15 @@ def site_scene(ground: SiteGround, eye: Eye, sun: Sun) -> Scene:
         mesh_lines=2 * half + 1,
         among_objects=eye.height_m < _LOW_M,
     )
+
+
+def micro_relief(ground: SiteGround) -> MicroRelief:
+    """Relief of this ground finer than its samples, for the renderer."""
+    p, cover = ground.terrain, ground.surface.cover
+    slope = float(np.radians(p.rms_slope_deg))
+    coarsest, heights = octave_heights(p.hurst, slope, p.slope_baseline_m, p.outer_scale_m, p.spacing_m)
+    roughness, texture = (np.ascontiguousarray(cover[..., channel]) for channel in (ROUGHNESS, TEXTURE))
+    return MicroRelief(coarsest, heights, roughness, texture, len(cover) / ground.surface.period_m)
 
 
 def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Objects:

@@ -15,7 +15,7 @@ from marsyard.sim.render.clouds import CloudLayer, no_cover
 from marsyard.sim.render.kernels.casters import Casters, list_casters
 from marsyard.sim.render.kernels.ground import height_range, max_rises
 from marsyard.sim.render.kernels.shading import Occluders
-from marsyard.sim.render.kernels.structs import Bounds, Extent, Footprint, GroundShadow, Light, Materials
+from marsyard.sim.render.kernels.structs import Bounds, Extent, Footprint, GroundShadow, Light, Materials, MicroRelief
 from marsyard.sim.render.kernels.sun import heights_in_rows, sweep_shadow
 from marsyard.sim.render.objects import Objects, spheres_in_cone
 from marsyard.sim.render.photometry import Photometry, Sun, Texture
@@ -24,6 +24,7 @@ from marsyard.sim.terrain import Surface
 #: Rounding of a mean of heights in single precision, metres, at a few km.
 ROUNDING_M = 0.01
 NO_TEXTURE = Texture()
+NO_RELIEF = MicroRelief(1.0, np.empty(0), *np.ones((2, 1, 1), dtype=np.float32), 0.0)
 NO_CLOUDS = (no_cover(), np.zeros(5))
 #: A cone: apex, unit vector along its axis, and half angle in radians.
 Cone = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]
@@ -50,6 +51,7 @@ class Scene:
     """Ground, objects and light.
 
     - centre_m: world x, y around which the mesh is dense: below a camera near the ground, or the site of a descent
+    - relief: relief finer than the terrain's samples, which shading sees by its slopes; normals and range do not
     - ground_texture, object_texture: albedo finer than the terrain's samples
     - caster_diameter_m: diameter of a body at the camera that casts a shadow, as a lander seen against the sun
     - ground_shadows: whether the ground shades itself, with a penumbra; shadows of objects are hard
@@ -68,6 +70,7 @@ class Scene:
     sun: Sun
     photometry: Photometry
     objects: Objects = field(default_factory=Objects.none)
+    relief: MicroRelief = NO_RELIEF
     ground_texture: Texture = NO_TEXTURE
     object_texture: Texture = NO_TEXTURE
     caster_diameter_m: float = 0.0
@@ -154,7 +157,7 @@ class Scene:
         """Textures, normals and albedo, for kernels."""
         objects = self.objects
         textures = self.ground_texture.arrays(), self.object_texture.arrays()
-        return Materials(*textures, objects.normals, objects.body_of_triangle, objects.albedo)
+        return Materials(self.relief, *textures, objects.normals, objects.body_of_triangle, objects.albedo)
 
     def light(self, time_s: float) -> Light:
         """The light at a time, for kernels."""

@@ -13,12 +13,13 @@ import numpy as np
 
 from marsyard.sim.cache import CacheWarning, cache_directory, evict_files, load_array, save_array, touch
 from marsyard.sim.terrain.imported import blend_into_ground, detail_below_posting, embed
-from marsyard.sim.terrain.landforms.ground import Ground, Spectrum, substream
+from marsyard.sim.terrain.landforms.ground import Ground, Spectrum, refine, substream
 from marsyard.sim.terrain.landforms.kernels import pack, stamp_craters
 from marsyard.sim.terrain.landforms.relief import EJECTA_REACH_RADII, draw_craters
+from marsyard.sim.terrain.landforms.units import COVER_STEP
 from marsyard.sim.terrain.parameters import LANDFORMS, TerrainParameters
 from marsyard.sim.terrain.rocks.field import RockField
-from marsyard.sim.terrain.surface import SMALLEST_LEVEL, Surface
+from marsyard.sim.terrain.surface import ROUGHNESS, SMALLEST_LEVEL, TEXTURE, UNIFORM, Surface
 
 #: Modules that a terrain's samples do not depend on, except through its parameters.
 MODULES_WITHOUT_SAMPLES = ("rocks", "sites.py", "statistics.py")
@@ -35,9 +36,21 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
     p = parameters
     relief = Spectrum.power_law(p.samples, p.spacing_m, p.hurst, p.outer_scale_m)
     rms_slope = np.tan(np.radians(p.rms_slope_deg))
-    height = relief.field(substream(rng, "relief"), scale=rms_slope / relief.line_slope_rms(p.slope_baseline_m))
+    relief_m = rms_slope / relief.line_slope_rms(p.slope_baseline_m)
     albedo = Spectrum.power_law(p.samples, p.spacing_m, p.albedo_hurst, p.outer_scale_m)
-    ground = Ground(height, albedo.field(substream(rng, "albedo"), scale=p.albedo_contrast), p.spacing_m)
+    craters = draw_craters(p, substream(rng, "craters"))
+    cover = UNIFORM
+    if p.units is None:
+        height = relief.field(substream(rng, "relief"), relief_m)
+        tone = albedo.field(substream(rng, "albedo"), p.albedo_contrast)
+        ground = Ground(height, tone, p.spacing_m)
+    else:
+        height, rough = relief.split_field(substream(rng, "relief"), relief_m, p.fine_below_m)
+        tone, fine = albedo.split_field(substream(rng, "albedo"), p.albedo_contrast, p.fine_below_m)
+        ground = Ground(height, tone, p.spacing_m)
+        cover = p.units.apply(ground, craters, substream(rng, "units"))
+        height += rough * refine(np.ascontiguousarray(cover[..., ROUGHNESS]), ground.side)
+        tone += fine * refine(np.ascontiguousarray(cover[..., TEXTURE]), ground.side)
     real = None
     if p.source is not None:
         real = embed(p.source, ground.side, ground.spacing_m)
@@ -46,15 +59,14 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
         landform = getattr(p, name)
         if landform is not None:
             landform.apply(ground, substream(rng, name))
-    if p.craters_per_km2 > 0.0:
-        craters = draw_craters(p, substream(rng, "craters"))
+    if len(craters):
         stamp_craters(ground.height, ground.tone, ground.spacing_m, craters, EJECTA_REACH_RADII)
     if real is not None:
         blend_into_ground(ground, real, detail)
     relative = np.exp(ground.tone, out=ground.tone)
     samples = np.empty((ground.side, ground.side, 2), dtype=np.float32)
     pack(ground.height, relative, p.albedo / float(relative.mean(dtype=np.float64)), samples)
-    return Surface.from_samples(samples, ground.spacing_m)
+    return Surface.from_samples(samples, ground.spacing_m, cover)
 
 
 @cache
@@ -86,7 +98,8 @@ class TerrainBank:
         if flat is not None and flat.size == self._size():
             touch(path)
         else:
-            flat = np.concatenate([one.reshape(-1) for one in synthesise(self.parameters, self._rng(number)).levels])
+            built = synthesise(self.parameters, self._rng(number))
+            flat = np.concatenate([one.reshape(-1) for one in (*built.levels, built.cover)])
             try:
                 evict_files(path.parent, 4 * self._size(), set(_IN_USE))
                 flat = save_array(path, flat)
@@ -95,9 +108,10 @@ class TerrainBank:
                 flat.flags.writeable = False
         _IN_USE[path] = flat
         sides = self._sides()
-        parts = np.split(flat, np.cumsum([2 * side**2 for side in sides])[:-1])
+        *parts, cover = np.split(flat, np.cumsum([2 * side**2 for side in sides]))
         levels = tuple(part.reshape(side, side, 2) for part, side in zip(parts, sides, strict=True))
-        return Surface(levels, self.parameters.spacing_m)
+        side = self._cover_side()
+        return Surface(levels, self.parameters.spacing_m, cover.reshape(side, side, 3))
 
     def missing_bytes(self, number: int) -> int:
         """Return the bytes that a terrain would add on disk, except for some hundred; 0 where it is stored."""
@@ -126,5 +140,8 @@ class TerrainBank:
         return [self.parameters.samples >> level for level in range(levels)]
 
     def _size(self) -> int:
-        """Values in a terrain's file: height and albedo on every level."""
-        return 2 * sum(side**2 for side in self._sides())
+        """Values in a terrain's file: height and albedo on every level, and three factors of its cover."""
+        return 2 * sum(side**2 for side in self._sides()) + 3 * self._cover_side() ** 2
+
+    def _cover_side(self) -> int:
+        return 1 if self.parameters.units is None else self.parameters.samples // COVER_STEP

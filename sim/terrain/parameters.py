@@ -10,6 +10,7 @@ from pydantic import BaseModel, Field, ValidationError, field_validator
 from marsyard.sim.parameters import Fraction, Parameters, Positive, bounded, merge_settings
 from marsyard.sim.terrain.imported import RealTerrain
 from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell
+from marsyard.sim.terrain.landforms.units import SurfaceUnits
 from marsyard.sim.terrain.rocks.field import RockParameters
 
 
@@ -24,12 +25,23 @@ class TerrainParameters(Parameters):
     outer_scale_m: Annotated[Positive, Field(description="wavelength above which relief stops growing, m")] = 3000.0
     craters_per_km2: Annotated[float, bounded(0.0, 2.0e6, "craters above the smallest diameter per km2")] = 60.0
     crater_exponent: Annotated[Positive, Field(description="exponent of the cumulative size-frequency power law")] = 2.0
+    crater_knee_m: Annotated[Positive, Field(description="diameter above which production, not saturation, limits")] = (
+        1e4
+    )
+    crater_steep_exponent: Annotated[Positive, Field(description="exponent above that diameter")] = 3.2
+    crater_floor_contrast: Annotated[Fraction, Field(description="RMS of log albedo of floors over the ground's")] = 0.0
     crater_diameter_min_m: Annotated[Positive, Field(description="smallest crater diameter, m")] = 12.0
     crater_diameter_max_m: Annotated[Positive, Field(description="largest crater diameter, m")] = 600.0
     crater_ejecta_contrast: Annotated[Fraction, Field(description="log albedo of the freshest ejecta, + or -")] = 0.12
     albedo: Annotated[float, Field(gt=0.0, lt=1.0, description="mean albedo")] = 0.2
     albedo_contrast: Annotated[Fraction, Field(description="RMS of the fractal albedo's logarithm, all scales")] = 0.12
     albedo_hurst: Annotated[float, Field(ge=-0.5, lt=1.0, description="Hurst exponent; 0: equal in all octaves")] = 0.0
+    units: Annotated[
+        SurfaceUnits | None, Field(description="surface units; without, the ground is alike everywhere")
+    ] = None
+    fine_below_m: Annotated[Positive, Field(description="wavelength below which units scale relief and albedo, m")] = (
+        60.0
+    )
     playa: Annotated[Playa | None, Field(description="desiccation polygons")] = None
     fans: Annotated[Fans | None, Field(description="alluvial fans around a playa")] = None
     lava: Annotated[Lava | None, Field(description="pahoehoe flows and a'a")] = None

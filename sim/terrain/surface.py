@@ -7,7 +7,7 @@ differentiable, evaluated exactly with its gradient, and reproduced independentl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +18,8 @@ from marsyard.sim.terrain.kernels import block_ceilings, evaluate_field, reduce_
 HEIGHT, ALBEDO = 0, 1  #: Channels of the stored samples.
 Coordinate = Float[np.ndarray, "*batch"] | float  #: One coordinate or many, metres.
 SMALLEST_LEVEL = 16  #: Samples along each side of the coarsest level kept.
+ROUGHNESS, TEXTURE, ROCKS = 0, 1, 2  #: Channels of a cover.
+UNIFORM = np.ones((1, 1, 3), dtype=np.float32)  #: Cover of ground that is alike everywhere.
 
 
 @dataclass(frozen=True)
@@ -27,13 +29,21 @@ class Surface:
     - levels: read-only control values of height (metres) and albedo. Level l has samples every ``spacing_m * 2**l``
       metres: row i lies at y = i * spacing, column j at x = j * spacing
     - spacing_m: distance between samples at level 0
+    - cover: factors of fine relief, fine albedo contrast and rock density on a grid of the same extent; one sample of
+      ones where the ground is alike everywhere
     """
 
     levels: tuple[Float32[np.ndarray, "rows columns 2"], ...]
     spacing_m: float
+    cover: Float32[np.ndarray, "side side 3"] = field(default_factory=lambda: UNIFORM)
 
     @classmethod
-    def from_samples(cls, samples: Float32[np.ndarray, "rows columns 2"], spacing_m: float) -> Surface:
+    def from_samples(
+        cls,
+        samples: Float32[np.ndarray, "rows columns 2"],
+        spacing_m: float,
+        cover: Float32[np.ndarray, "side side 3"] = UNIFORM,
+    ) -> Surface:
         """Build the pyramid over level 0, a square whose side is a power of two of at least 16; else ValueError."""
         side = samples.shape[0]
         if samples.shape[1] != side or side < SMALLEST_LEVEL or side & (side - 1):
@@ -44,7 +54,7 @@ class Surface:
             levels.append(reduce_level(levels[-1]))
         for level in levels:
             level.setflags(write=False)
-        return cls(tuple(levels), spacing_m)
+        return cls(tuple(levels), spacing_m, cover)
 
     @property
     def period_m(self) -> float:

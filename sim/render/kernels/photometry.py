@@ -70,13 +70,12 @@ def scattered_irradiance(sun_z: float, depth: float, asymmetry: float) -> float:
 
 #: Mean square of `gradient_noise` over space.
 NOISE_VARIANCE = 0.0732
-#: Optics and pixel blur a picture as a Gaussian of half a pixel: contrast is 0.29 at Nyquist's frequency, as for flown
-#: cameras. Noise whose cells are c footprints wide, of 0.53 waves a cell in the median, keeps
-#: ``exp(-2 (0.53 pi 0.5 / c)^2)`` of its amplitude; ``(1 - FADING / c^2)^2`` is that to 0.04 down to 1.25 footprints a
-#: cell, less below, where sampling would alias, and ends where it is 0.
-FADING = 9.0 / 16.0
+#: A pixel averages over its area: waves of f cycles a footprint keep sinc(f) of their amplitude; the detector applies
+#: the blur of the optics. Noise of cells of c footprints has 0.53 waves a cell in the median, and
+#: ``(1 - FADING / c^2)^2`` is its sinc to 0.02 down to Nyquist's frequency; waves beyond it alias as in a real camera.
+FADING = 0.231
 #: Cell size, in footprints, at which an octave vanishes.
-MIN_CELLS = 0.75
+MIN_CELLS = math.sqrt(FADING)
 
 
 @njit(cache=True)
@@ -135,27 +134,42 @@ def gradient_noise(x: float, y: float, z: float, seed: int) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _add_octave(
-    x: Array, y: Array, z: Array, footprint: Array, cell: float, amplitude: float, octave: int, change: Array
+    x: Array,
+    y: Array,
+    z: Array,
+    footprint: Array,
+    cell: float,
+    octave: tuple[int, float],
+    strength: Array,
+    change: Array,
 ) -> None:
-    """Add one octave of `add_texture`."""
+    """Add one octave of `add_texture`, given by its number and amplitude."""
+    number, amplitude = octave
     for k in range(x.size):
         ratio = footprint[k] / cell
         fade = max(1.0 - FADING * ratio * ratio, 0.0)
-        seen = amplitude * (fade * fade)
-        noise = gradient_noise(x[k] / cell, y[k] / cell, z[k] / cell, octave)
+        seen = strength[k] * amplitude * (fade * fade)
+        noise = gradient_noise(x[k] / cell, y[k] / cell, z[k] / cell, number)
         change[k] += seen * noise - 0.5 * NOISE_VARIANCE * seen**2
 
 
 @njit(cache=True)
 def add_texture(
-    x: Array, y: Array, z: Array, footprint: Array, coarsest: float, amplitudes: Array, change: Array
+    x: Array,
+    y: Array,
+    z: Array,
+    footprint: Array,
+    coarsest: float,
+    amplitudes: Array,
+    strength: Array,
+    change: Array,
 ) -> None:
     """Add the logarithm of the albedo's relative change at positions, averaged over pixels' footprints, to `change`.
 
     Octave n has lattice cells of ``coarsest / 2**n``. It fades as optics and pixels blur it (`FADING`), as slowly as
     detail appears when a real camera nears a surface; faster, trackers see the texture change from picture to picture.
-    Half of each octave's variance is subtracted, so that albedo keeps its mean for any visible octaves. A footprint is
-    infinite where no texture is wanted.
+    Half of each octave's variance is subtracted, so that albedo keeps its mean for any visible octaves. `strength` is a
+    factor of the amplitudes. A footprint is infinite where no texture is wanted.
     """
     finest = math.inf
     for k in range(footprint.size):
@@ -165,5 +179,5 @@ def add_texture(
         if cell <= MIN_CELLS * finest:
             break
         if amplitudes[octave] != 0.0:
-            _add_octave(x, y, z, footprint, cell, amplitudes[octave], octave, change)
+            _add_octave(x, y, z, footprint, cell, (octave, amplitudes[octave]), strength, change)
         cell *= 0.5

@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from marsyard.sim.render.kernels.casters import Casters, sun_hidden
+from marsyard.sim.render.kernels.microrelief import add_relief_slopes, smith_shadowing
 from marsyard.sim.render.kernels.photometry import add_texture, sky_brightness
 from marsyard.sim.render.kernels.primary import FLATTEST
 from marsyard.sim.render.kernels.strips import (
@@ -34,6 +35,7 @@ from marsyard.sim.render.kernels.structs import (
     Light,
     Longs,
     Materials,
+    MicroRelief,
     Picture,
     Pose,
     Rays,
@@ -62,7 +64,9 @@ X, Y, Z, DX, DY, DZ, FOOTPRINT, HEIGHT, SLOPE_X, SLOPE_Y, ALBEDO, NX, NY, NZ, CH
 SCALE, BLEND, COARSE_HEIGHT, COARSE_SLOPE_X, COARSE_SLOPE_Y, COARSE_ALBEDO = (ROW * n for n in range(19, 25))
 #: Rows of objects alone: positions, footprints and changes of albedo.
 OBJECT_X, OBJECT_Y, OBJECT_Z, OBJECT_FOOTPRINT, OBJECT_CHANGE = (ROW * n for n in range(25, 30))
-ROWS = 30
+#: Rows of the micro-relief: slopes, resolved and unresolved variance of slope, and strength of texture.
+FINE_X, FINE_Y, RESOLVED, UNRESOLVED, STRENGTH = (ROW * n for n in range(30, 35))
+ROWS = 35
 
 
 class Occluders(NamedTuple):
@@ -250,17 +254,58 @@ def _sample_objects(
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _roughen_ground(relief: MicroRelief, width: int, strip: _Strip) -> None:
+    """Tilt the ground's normals by its micro-relief, and set the strength of its texture.
+
+    The reflectance law is that of ground with all its roughness: a slope that a pixel resolves may not darken the mean.
+    """
+    work = strip.work
+    for k in range(width):
+        work[STRENGTH + k] = 1.0
+        work[RESOLVED + k] = work[UNRESOLVED + k] = 0.0
+    if relief.heights.size == 0:
+        return
+    x, y, footprint = work[X : X + width], work[Y : Y + width], work[FOOTPRINT : FOOTPRINT + width]
+    fine_x, fine_y = work[FINE_X : FINE_X + width], work[FINE_Y : FINE_Y + width]
+    resolved, unresolved = work[RESOLVED : RESOLVED + width], work[UNRESOLVED : UNRESOLVED + width]
+    add_relief_slopes(x, y, footprint, relief, fine_x, fine_y, resolved, unresolved)
+    for k in range(width):
+        if footprint[k] == math.inf:
+            resolved[k] = unresolved[k] = 0.0
+            continue
+        factor = interpolate_bilinear(relief.roughness, relief.per_metre, x[k], y[k])[0]
+        work[STRENGTH + k] = interpolate_bilinear(relief.texture, relief.per_metre, x[k], y[k])[0]
+        resolved[k] *= factor * factor
+        unresolved[k] *= factor * factor
+        slope_x, slope_y = work[SLOPE_X + k] + factor * fine_x[k], work[SLOPE_Y + k] + factor * fine_y[k]
+        nz = 1.0 / math.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
+        work[NX + k], work[NY + k], work[NZ + k] = -slope_x * nz, -slope_y * nz, nz
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _shade_roughness(width: int, work: Array) -> None:
+    """Restore the mean of tilted normals, and darken by the shadows of relief that pixels do not resolve."""
+    for k in range(width):
+        if work[COS_I + k] > 0.0 and work[UNRESOLVED + k] + work[RESOLVED + k] > 0.0:
+            work[LIT + k] *= (1.0 + work[RESOLVED + k]) * smith_shadowing(work[COS_I + k], work[UNRESOLVED + k])
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _apply_texture(materials: Materials, width: int, seen: int, strip: _Strip) -> None:
     """Change the albedo of ground and objects by their textures."""
     work = strip.work
     coarsest, amplitudes = materials.ground_texture
     x, y, z = work[X : X + width], work[Y : Y + width], work[Z : Z + width]
-    add_texture(x, y, z, work[FOOTPRINT : FOOTPRINT + width], coarsest, amplitudes, work[CHANGE : CHANGE + width])
+    strength = work[STRENGTH : STRENGTH + width]
+    add_texture(
+        x, y, z, work[FOOTPRINT : FOOTPRINT + width], coarsest, amplitudes, strength, work[CHANGE : CHANGE + width]
+    )
     if seen > 0:
         coarsest, amplitudes = materials.object_texture
         x, y, z = work[OBJECT_X : OBJECT_X + seen], work[OBJECT_Y : OBJECT_Y + seen], work[OBJECT_Z : OBJECT_Z + seen]
-        footprint, change = OBJECT_FOOTPRINT, OBJECT_CHANGE
-        add_texture(x, y, z, work[footprint : footprint + seen], coarsest, amplitudes, work[change : change + seen])
+        footprint, change = work[OBJECT_FOOTPRINT : OBJECT_FOOTPRINT + seen], work[OBJECT_CHANGE : OBJECT_CHANGE + seen]
+        work[FINE_X : FINE_X + seen] = 1.0
+        add_texture(x, y, z, footprint, coarsest, amplitudes, work[FINE_X : FINE_X + seen], change)
         for m in range(seen):
             work[CHANGE + strip.other[m]] = work[OBJECT_CHANGE + m]
     for k in range(width):
@@ -420,13 +465,16 @@ def shade(
         n_ground, n_blended, n_other = _select_levels(spacing, ground.top_level, met, strip)
         _sample_ground(levels, 1.0 / spacing, n_ground, n_blended, width, strip, fetched)
         seen = _sample_objects(materials, met, angles, n_other, strip, body)
+        for k in range(width):
+            n = here + 3 * k
+            normals[n], normals[n + 1], normals[n + 2] = work[NX + k], work[NY + k], work[NZ + k]
+        _roughen_ground(materials.relief, width, strip)
         photometric_angles(towards, width, work)
         _apply_texture(materials, width, seen, strip)
         _cast_shadows(finest, terrain, met, angles, light, occluders, body, strip)
         if law[6] > 0.0 or light.drift[4] > 0.0:
             dim_sun(light, met.distance, work)
+        if materials.relief.heights.size > 0:
+            _shade_roughness(width, work)
         reflect(reflectance, width, work, radiance)
-        for k in range(width):
-            n = here + 3 * k
-            normals[n], normals[n + 1], normals[n + 2] = work[NX + k], work[NY + k], work[NZ + k]
         draw_sky(light, angles, body, work, radiance)

@@ -148,9 +148,26 @@ class Light(NamedTuple):
     drift: Array
 
 
-class Materials(NamedTuple):
-    """Textures (coarsest cell and amplitudes of octaves), normals at the corners of triangles, and albedo of bodies."""
+class MicroRelief(NamedTuple):
+    """Octaves of height noise on the ground, and maps of their strength; no octaves where there are no heights.
 
+    - coarsest: size of the coarsest octave's lattice cells, metres; each further octave is half as large
+    - heights: amplitude of each octave's heights, metres, coarsest first
+    - roughness, texture: factors of these heights, and of the ground's albedo texture, on a periodic grid
+    - per_metre: samples of that grid per metre
+    """
+
+    coarsest: float
+    heights: Array
+    roughness: Array32
+    texture: Array32
+    per_metre: float
+
+
+class Materials(NamedTuple):
+    """Relief and textures (coarsest cell and amplitudes of octaves), normals at triangles' corners, albedo of bodies."""
+
+    relief: MicroRelief
     ground_texture: tuple[float, Array]
     object_texture: tuple[float, Array]
     normals: Array

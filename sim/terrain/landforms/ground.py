@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
-from jaxtyping import Float32, Float64
+from jaxtyping import Complex64, Float32, Float64
 from numpy.random import Generator
 
 from marsyard.sim.streams import hash_words
@@ -122,20 +122,34 @@ class Spectrum:
     column_power: Float64[np.ndarray, "half"]
 
     @classmethod
-    def power_law(cls, samples: int, spacing_m: float, hurst: float, outer_scale_m: float) -> Spectrum:
+    def power_law(
+        cls,
+        samples: int,
+        spacing_m: float,
+        hurst: float,
+        outer_scale_m: float,
+        elongation: float = 1.0,
+        azimuth_rad: float = 0.0,
+    ) -> Spectrum:
         """Power spectral density ``(k**2 + k0**2)**-(hurst + 1)`` with k0 the wavenumber of the outer scale.
 
-        Above k0 the field is self-affine with the Hurst exponent; below it is white.
+        Above k0 the field is self-affine with the Hurst exponent; below it is white. Features are `elongation` times as
+        long along a direction (counter-clockwise from x) as across it.
         """
-        along_y = (2.0 * np.pi * scipy.fft.fftfreq(samples, spacing_m)).astype(np.float32)
-        along_x = (2.0 * np.pi * scipy.fft.rfftfreq(samples, spacing_m)).astype(np.float32)
-        squared = along_y[:, None] ** 2 + along_x[None, :] ** 2 + np.float32((2.0 * np.pi / outer_scale_m) ** 2)
+        along_y = (2.0 * np.pi * scipy.fft.fftfreq(samples, spacing_m)).astype(np.float32)[:, None]
+        along_x = (2.0 * np.pi * scipy.fft.rfftfreq(samples, spacing_m)).astype(np.float32)[None, :]
+        stretch = np.float32(np.sqrt(elongation))
+        c, s = np.float32(np.cos(azimuth_rad)), np.float32(np.sin(azimuth_rad))
+        squared = ((c * along_x + s * along_y) * stretch) ** 2 + ((c * along_y - s * along_x) / stretch) ** 2
+        squared += np.float32((2.0 * np.pi / outer_scale_m) ** 2)
         amplitude = np.exp(np.float32(-(hurst + 1.0) / 2.0) * np.log(squared))
         amplitude[0, 0] = 0.0
-        power = np.einsum("ij,ij->j", amplitude, amplitude, dtype=np.float64)
-        # a mode of the half spectrum counts for itself and its conjugate, except in the first and the last column
-        power[1:-1] *= 2.0
-        return cls(amplitude, spacing_m, power)
+        return cls(amplitude, spacing_m, _column_power(amplitude))
+
+    def low_passed(self, wavelength_m: float) -> Spectrum:
+        """Return this spectrum without waves shorter than about this length: a Gaussian filter."""
+        amplitude = self.amplitude * _low_pass(self.amplitude.shape[0], self.spacing_m, wavelength_m)
+        return Spectrum(amplitude, self.spacing_m, _column_power(amplitude))
 
     def field(self, rng: Generator, scale: float) -> Float32[np.ndarray, "samples samples"]:
         """Draw a Gaussian field of expected variance ``scale**2``: white noise shaped in the frequency domain.
@@ -143,13 +157,32 @@ class Spectrum:
         The variance is normalised by its expectation, so it varies from draw to draw. One thread, so the bytes do not
         depend on the number of threads.
         """
+        return self._transform(self._modes(rng), scale)
+
+    def split_field(
+        self, rng: Generator, scale: float, wavelength_m: float
+    ) -> tuple[Float32[np.ndarray, "samples samples"], Float32[np.ndarray, "samples samples"]]:
+        """Draw the same field as `field`, as the sum of a coarse and a fine part, divided at a wavelength."""
+        modes = self._modes(rng)
+        coarse = self._transform(modes * _low_pass(self.amplitude.shape[0], self.spacing_m, wavelength_m), scale)
+        fine = self._transform(modes, scale)
+        fine -= coarse
+        return coarse, fine
+
+    def _modes(self, rng: Generator) -> Complex64[np.ndarray, "samples half"]:
         samples, half = self.amplitude.shape
         noise = rng.standard_normal((samples, half, 2), dtype=np.float32).view(np.complex64)[..., 0]
         noise *= self.amplitude
         # irfft2 keeps the real part only of these two columns: half the power of their modes
         noise[:, 0] *= np.float32(np.sqrt(2.0))
         noise[:, -1] *= np.float32(np.sqrt(2.0))
-        field = scipy.fft.irfft2(noise, s=(samples, samples), workers=1, overwrite_x=True)
+        return noise
+
+    def _transform(
+        self, modes: Complex64[np.ndarray, "samples half"], scale: float
+    ) -> Float32[np.ndarray, "samples samples"]:
+        samples = modes.shape[0]
+        field = scipy.fft.irfft2(modes, s=(samples, samples), workers=1, overwrite_x=True)
         # complex noise has variance 2; irfft2 divides by samples**2
         field *= np.float32(scale * samples**2 / np.sqrt(2.0 * self.column_power.sum()))
         return np.asarray(field)
@@ -163,3 +196,17 @@ class Spectrum:
         # 1 - cos without cancellation
         square = np.sum(self.column_power * 4.0 * np.sin(0.5 * k * baseline_m) ** 2) / self.column_power.sum()
         return float(np.sqrt(square) / baseline_m)
+
+
+def _column_power(amplitude: Float32[np.ndarray, "samples half"]) -> Float64[np.ndarray, "half"]:
+    power = np.einsum("ij,ij->j", amplitude, amplitude, dtype=np.float64)
+    # a mode of the half spectrum counts for itself and its conjugate, except in the first and the last column
+    power[1:-1] *= 2.0
+    return power
+
+
+def _low_pass(samples: int, spacing_m: float, wavelength_m: float) -> Float32[np.ndarray, "samples half"]:
+    """Gaussian filter that keeps exp(-1/2) of the amplitude at a wavelength."""
+    along_y = scipy.fft.fftfreq(samples, spacing_m).astype(np.float32) * np.float32(wavelength_m)
+    along_x = scipy.fft.rfftfreq(samples, spacing_m).astype(np.float32) * np.float32(wavelength_m)
+    return np.exp(np.float32(-0.5) * along_y[:, None] ** 2) * np.exp(np.float32(-0.5) * along_x[None, :] ** 2)

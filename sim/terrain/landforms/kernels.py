@@ -13,6 +13,8 @@ from marsyard.sim.terrain.kernels import Array, Level, bspline_weights, collapse
 
 Grid = NDArray[np.float32]
 Line = NDArray[np.float32]
+#: Depth of the notches in a crater's rim over its height, per relative displacement of its outline.
+NOTCHES = 8.0
 
 
 class Bedforms(NamedTuple):
@@ -57,13 +59,13 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
     """Add bowls, rims and ejecta of craters to height and to the logarithm of albedo, in order.
 
     `craters` has rows (x, y, radius, depth below the surroundings, rim height, rounding of the rim in metres, filled
-    fraction of the depth, tone of the ejecta, then three pairs of cosine and sine terms of the outline for two,
-    three and five lobes, and the phase of the rays).
+    fraction of the depth, tone of the ejecta, tone of the floor, then three pairs of cosine and sine terms of the
+    outline for two, three and five lobes, and the phase of the rays). The outline's lobes also notch the rim.
     """
     mask = height.shape[0] - 1
     for n in range(craters.shape[0]):
-        x, y, radius, depth, rim, rounding, fill, bright = craters[n, :8]
-        c2, s2, c3, s3, c5, s5, phase = craters[n, 8:]
+        x, y, radius, depth, rim, rounding, fill, bright, floor = craters[n, :9]
+        c2, s2, c3, s3, c5, s5, phase = craters[n, 9:]
         extent = reach * radius * 1.1
         cos_7, sin_7 = math.cos(phase), math.sin(phase)
         cos_12, sin_12 = math.cos(2.3 * phase), math.sin(2.3 * phase)
@@ -82,12 +84,13 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
                 cc, ss = c * c - s * s, 2.0 * c * s
                 ccc, sss = cc * c - ss * s, ss * c + cc * s
                 c5t, s5t = ccc * cc - sss * ss, sss * cc + ccc * ss
-                r = d / (radius * (1.0 + c2 * cc + s2 * ss + c3 * ccc + s3 * sss + c5 * c5t + s5 * s5t))
+                lobes = c2 * cc + s2 * ss + c3 * ccc + s3 * sss + c5 * c5t + s5 * s5t
+                r = d / (radius * (1.0 + lobes))
                 if r >= reach:
                     continue
                 outside = max(r, 0.6)
                 fade = min((reach - r) / (reach - 1.0), 1.0)
-                blanket = rim / (outside * outside * outside) * fade
+                blanket = rim * max(1.0 + NOTCHES * lobes, 0.0) / (outside * outside * outside) * fade
                 rays = 0.0
                 if r > 1.0:
                     # seven and twelve rays: cosines of 7 and 12 times the azimuth, each with a phase
@@ -110,6 +113,55 @@ def stamp_craters(height: Grid, tone: Grid, spacing: float, craters: Array, reac
                 if bright != 0.0:
                     light = fade * fade * (1.0 + 0.5 * rays) if r > 1.0 else 1.0
                     tone[row, column] += bright * max(light, 0.0)
+                if floor != 0.0 and r < 1.1:
+                    # even over the floor, gone at the rim
+                    tone[row, column] += floor * min(max((1.1 - r) / 0.5, 0.0), 1.0)
+
+
+@njit(cache=True)
+def stamp_cover(factors: Grid, spacing: float, craters: Array, reach: float) -> None:
+    """Multiply a factor of fine relief by the smoothness of filled crater floors and the roughness of fresh ejecta.
+
+    `craters` has rows (x, y, radius, factor on the floor, factor on the ejecta).
+    """
+    mask = factors.shape[0] - 1
+    for n in range(craters.shape[0]):
+        x, y, radius, floor, ejecta = craters[n]
+        extent = reach * radius
+        for i in range(math.ceil((y - extent) / spacing), math.floor((y + extent) / spacing) + 1):
+            dy = i * spacing - y
+            for j in range(math.ceil((x - extent) / spacing), math.floor((x + extent) / spacing) + 1):
+                dx = j * spacing - x
+                r = math.sqrt(dx * dx + dy * dy) / radius
+                if r < 1.0:
+                    factors[i & mask, j & mask] *= floor + (ejecta - floor) * r * r * r * r
+                elif r < reach:
+                    factors[i & mask, j & mask] *= 1.0 + (ejecta - 1.0) * (reach - r) / (reach - 1.0)
+
+
+@njit(cache=True)
+def stamp_streaks(tone: Grid, spacing: float, streaks: Array) -> None:
+    """Add wind tails to the logarithm of albedo: rows (x, y, half width, length, cosine and sine downwind, tone).
+
+    A tail begins at (x, y), widens downwind and fades to its end and its sides.
+    """
+    mask = tone.shape[0] - 1
+    for n in range(streaks.shape[0]):
+        x, y, half, length, c, s, colour = streaks[n]
+        wide = 1.6 * half
+        reach_x = max(c * length, 0.0) + wide, max(-c * length, 0.0) + wide
+        reach_y = max(s * length, 0.0) + wide, max(-s * length, 0.0) + wide
+        for i in range(math.ceil((y - reach_y[1]) / spacing), math.floor((y + reach_y[0]) / spacing) + 1):
+            dy = i * spacing - y
+            for j in range(math.ceil((x - reach_x[1]) / spacing), math.floor((x + reach_x[0]) / spacing) + 1):
+                dx = j * spacing - x
+                p = (c * dx + s * dy) / length
+                if p <= 0.0 or p >= 1.0:
+                    continue
+                q = (c * dy - s * dx) / (half * (0.8 + 0.8 * p))
+                if abs(q) < 1.0:
+                    side = 1.0 - q * q
+                    tone[i & mask, j & mask] += colour * side * side * (1.0 - p) * min(p * length / half, 1.0)
 
 
 @njit(cache=True, inline="always")

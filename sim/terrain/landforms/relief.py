@@ -192,32 +192,39 @@ class Ramp(Parameters):
         np.add(ground.height, profile[None, :] if self.uphill == "east" else profile[:, None], out=ground.height)
 
 
-def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.ndarray, "craters 15"]:
+def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.ndarray, "craters 16"]:
     """Draw impact craters, the largest first, as rows of `kernels.stamp_craters`.
 
-    Their number is Poisson; diameters follow the truncated power law ``N(>D) ~ D**-exponent``. Freshness is ``u**2``,
-    u uniform: a crater is degraded for most of its life. Outlines are out of round by a few per cent.
+    Their number is Poisson. The cumulative size-frequency distribution falls as ``D**-crater_exponent`` up to
+    `crater_knee_m`, where craters are saturated (Hartmann 1984: -1.83), and as ``D**-crater_steep_exponent`` beyond, as
+    they are produced (Hartmann 2005). Freshness is ``u**2``, u uniform: a crater is degraded for most of its life.
+    Outlines are out of round by a few per cent.
     """
-    smallest, largest = parameters.crater_diameter_min_m, parameters.crater_diameter_max_m
+    p = parameters
+    smallest, largest = p.crater_diameter_min_m, p.crater_diameter_max_m
     if largest <= smallest:
         limit = f"crater_diameter_min_m, {smallest:g}"
         raise ValueError(f"crater_diameter_max_m is {largest:g}; it must be larger than {limit}")
-    period = parameters.samples * parameters.spacing_m
-    count = int(rng.poisson(parameters.craters_per_km2 * (period / 1000.0) ** 2))
-    exponent = parameters.crater_exponent
-    fraction_above = rng.uniform((largest / smallest) ** -exponent, 1.0, count)
-    diameter = np.sort(smallest * fraction_above ** (-1.0 / exponent))[::-1]
+    period = p.samples * p.spacing_m
+    count = int(rng.poisson(p.craters_per_km2 * (period / 1000.0) ** 2))
+    knee = min(max(p.crater_knee_m, smallest), largest)
+    at_knee = (knee / smallest) ** -p.crater_exponent
+    above = rng.uniform(at_knee * (largest / knee) ** -p.crater_steep_exponent, 1.0, count)
+    saturated = smallest * above ** (-1.0 / p.crater_exponent)
+    produced = knee * (above / at_knee) ** (-1.0 / p.crater_steep_exponent)
+    diameter = np.sort(np.where(above > at_knee, saturated, produced))[::-1]
     fresh = rng.uniform(0.0, 1.0, count) ** 2
     position = rng.uniform(0.0, period, (count, 2))
     rim = diameter * (DEGRADED_RIM + (FRESH_RIM - DEGRADED_RIM) * fresh)
     depth = diameter * (DEGRADED_DEPTH + (FRESH_DEPTH - DEGRADED_DEPTH) * fresh) - rim
     rounding = depth * (ROUNDEST_RIM + (SHARPEST_RIM - ROUNDEST_RIM) * fresh)
     fill = DEEPEST_FILL * (1.0 - fresh)
-    bright = parameters.crater_ejecta_contrast * np.maximum(fresh - BRIGHT_ABOVE, 0.0) / (1.0 - BRIGHT_ABOVE)
+    bright = p.crater_ejecta_contrast * np.maximum(fresh - BRIGHT_ABOVE, 0.0) / (1.0 - BRIGHT_ABOVE)
     bright *= rng.choice([-1.0, 1.0], count)
+    floor = p.crater_floor_contrast * rng.standard_normal(count)
     outline = rng.standard_normal((count, 6)) * np.repeat([0.025, 0.02, 0.012], 2)
     phase = rng.uniform(0.0, 2.0 * np.pi, count)
-    return np.column_stack([position, diameter / 2.0, depth, rim, rounding, fill, bright, outline, phase])
+    return np.column_stack([position, diameter / 2.0, depth, rim, rounding, fill, bright, floor, outline, phase])
 
 
 def draw_channels(

@@ -19,7 +19,7 @@ from marsyard.sim.terrain.landforms.ground import substream
 from marsyard.sim.terrain.rocks import shapes
 from marsyard.sim.terrain.rocks.kernels import Placements, assemble, place_discs
 from marsyard.sim.terrain.rocks.shapes import FINEST, SHAPES_OF_FORM, max_pixels, rock_shapes
-from marsyard.sim.terrain.surface import Surface
+from marsyard.sim.terrain.surface import ROCKS, Surface
 
 MAX_ROCKS = 2_000_000  #: Largest number of rocks on one terrain; more are an error of the configuration.
 CELL_OVER_DIAMETER = 3.0  #: Side of the cells in which placement searches for neighbours, over the mean diameter.
@@ -141,12 +141,13 @@ class RockField:
 
     @classmethod
     def on(cls, surface: Surface, parameters: RockParameters, rng: Generator) -> RockField:
-        """Draw rocks on this ground that do not overlap, seen along their verticals.
+        """Draw rocks on this ground that do not overlap, seen along their verticals; denser where its cover says so.
 
         Raises ValueError where a rock finds no free position, or a placed rock has no such shape.
         """
         placed = parameters.placed
-        drawn = draw_diameters(parameters, surface.period_m**2, substream(rng, "rock sizes"))
+        densest = float(surface.cover[..., ROCKS].max())
+        drawn = draw_diameters(parameters, densest * surface.period_m**2, substream(rng, "rock sizes"))
         appearance = substream(rng, "rock looks")
         ratio = parameters.height_ratio * (1.0 + parameters.height_spread * appearance.uniform(-1.0, 1.0, drawn.size))
         first = shapes.FORMS.index(parameters.form) * SHAPES_OF_FORM
@@ -165,6 +166,13 @@ class RockField:
         yaw = np.concatenate([placed_yaw, appearance.uniform(-np.pi, np.pi, drawn.size)])
         radius = rock_shapes(shapes.COARSE).reach[shape] * diameter
         xy = _draw_positions(parameters, radius, diameter, surface.period_m, substream(rng, "rock places"))
+        if surface.cover.size > 3:
+            side = len(surface.cover)
+            cells = (xy * (side / surface.period_m)).astype(int) % side
+            density = surface.cover[cells[:, 1], cells[:, 0], ROCKS]
+            kept = densest * substream(rng, "rock cover").random(len(xy)) < density
+            kept[: len(placed)] = True
+            xy, diameter, height, shape, yaw = xy[kept], diameter[kept], height[kept], shape[kept], yaw[kept]
         position = np.column_stack([xy, surface.height(xy[:, 0], xy[:, 1])])
         # the ground's slope over about the rock's own size
         level = np.clip(np.log2(np.maximum(diameter / surface.spacing_m, 1.0)).astype(int), 0, len(surface.levels) - 1)

@@ -1,0 +1,115 @@
+"""Kernels of relief finer than the terrain's samples: band-limited height noise that enters shading by its slopes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from marsyard.sim.render.kernels.structs import MicroRelief
+from marsyard.sim.terrain.kernels import Array
+
+#: As `marsyard.sim.render.kernels.photometry.FADING`, for noise of 0.61 waves a cell.
+FADING = 0.306
+MIN_CELLS = math.sqrt(FADING)
+#: Mean squares of `relief_noise` and of its derivative along one axis, and its waves per cell in the median of power.
+HEIGHT_VARIANCE, SLOPE_VARIANCE = 0.0464, 0.3886
+#: Gradients of the noise: eight unit vectors, evenly spaced.
+_LONG, _SHORT = math.cos(math.pi / 8.0), math.sin(math.pi / 8.0)
+
+
+@njit(cache=True, inline="always")
+def _lattice_gradient(i: int, j: int, seed: int) -> tuple[float, float]:
+    """One of eight gradients by a hash of a lattice point (finaliser of MurmurHash3)."""
+    h = np.uint32(i) * np.uint32(0x8DA6B343)
+    h ^= np.uint32(j) * np.uint32(0xD8163841)
+    h ^= np.uint32(seed) * np.uint32(0x9E3779B1)
+    h ^= h >> np.uint32(16)
+    h *= np.uint32(0x85EBCA6B)
+    h ^= h >> np.uint32(13)
+    h *= np.uint32(0xC2B2AE35)
+    h ^= h >> np.uint32(16)
+    first = _LONG if h & np.uint32(1) else _SHORT
+    second = _SHORT if h & np.uint32(1) else _LONG
+    return (-first if h & np.uint32(2) else first), (-second if h & np.uint32(4) else second)
+
+
+@njit(cache=True, inline="always")
+def relief_noise(x: float, y: float, seed: int) -> tuple[float, float, float]:
+    """Gradient noise in the plane (Perlin 2002), of mean zero, and its derivatives along x and y."""
+    fx, fy = math.floor(x), math.floor(y)
+    i, j = int(fx), int(fy)
+    x, y = x - fx, y - fy
+    u, v = x * x * x * (x * (x * 6.0 - 15.0) + 10.0), y * y * y * (y * (y * 6.0 - 15.0) + 10.0)
+    du, dv = 30.0 * x * x * (x - 1.0) * (x - 1.0), 30.0 * y * y * (y - 1.0) * (y - 1.0)
+    ax, ay = _lattice_gradient(i, j, seed)
+    bx, by = _lattice_gradient(i + 1, j, seed)
+    cx, cy = _lattice_gradient(i, j + 1, seed)
+    dx, dy = _lattice_gradient(i + 1, j + 1, seed)
+    a = ax * x + ay * y
+    along_x = bx * (x - 1.0) + by * y - a
+    along_y = cx * x + cy * (y - 1.0) - a
+    twist = dx * (x - 1.0) + dy * (y - 1.0) - a - along_x - along_y
+    value = a + u * along_x + v * along_y + u * v * twist
+    by_x = ax + u * (bx - ax) + v * (cx - ax) + u * v * (ax - bx - cx + dx) + du * (along_x + v * twist)
+    by_y = ay + u * (by - ay) + v * (cy - ay) + u * v * (ay - by - cy + dy) + dv * (along_y + u * twist)
+    return value, by_x, by_y
+
+
+@njit(cache=True, error_model="numpy")
+def add_relief_slopes(
+    x: Array,
+    y: Array,
+    footprint: Array,
+    relief: MicroRelief,
+    slope_x: Array,
+    slope_y: Array,
+    resolved: Array,
+    unresolved: Array,
+) -> None:
+    """Compute the slopes of the octaves that pixels resolve, for a roughness of 1.
+
+    An octave fades with its pixels' footprint as texture does (`FADING`). `resolved` and `unresolved` are the
+    variances of slope along one axis that pixels resolve and do not. A footprint is infinite where there is no ground.
+    """
+    finest = math.inf
+    for k in range(footprint.size):
+        finest = min(finest, footprint[k])
+        slope_x[k] = slope_y[k] = resolved[k] = unresolved[k] = 0.0
+    cell = relief.coarsest
+    for octave in range(relief.heights.size):
+        gain = relief.heights[octave] / cell
+        full = gain * gain * SLOPE_VARIANCE
+        if cell <= MIN_CELLS * finest:
+            for k in range(footprint.size):
+                unresolved[k] += full
+        else:
+            for k in range(footprint.size):
+                ratio = footprint[k] / cell
+                fade = max(1.0 - FADING * ratio * ratio, 0.0)
+                fade *= fade
+                _value, by_x, by_y = relief_noise(x[k] / cell, y[k] / cell, octave)
+                slope_x[k] += gain * fade * by_x
+                slope_y[k] += gain * fade * by_y
+                resolved[k] += full * fade * fade
+                unresolved[k] += full * (1.0 - fade * fade)
+        cell *= 0.5
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def smith_shadowing(cosine: float, variance: float) -> float:
+    """Fraction of facets in the light that roughness does not shade, for an incidence and a variance of slope.
+
+    Smith (1967) for Gaussian slopes, in the rational approximation of Walter et al. (2007, section 5.2); above 0.996
+    of the exact value.
+    """
+    if variance <= 0.0 or cosine >= 1.0:
+        return 1.0
+    a = cosine / math.sqrt(2.0 * variance * (1.0 - cosine * cosine))
+    if a >= 1.6:
+        return 1.0
+    if a <= 1e-6:
+        return 0.0
+    hidden = (1.0 - 1.259 * a + 0.396 * a * a) / (3.535 * a + 2.181 * a * a)
+    return 1.0 / (1.0 + hidden)

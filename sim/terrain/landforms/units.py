@@ -1,0 +1,141 @@
+"""Surface units: patches of ground with their own albedo, roughness, texture and rock density.
+
+Orbital mosaics of the Martian plains show such units with boundaries from ten to hundreds of metres: dust-mantled
+plains, soil with a lag of granules, rubble and outcrop, sand sheets (Greeley et al. 2006; Golombek et al. 2006 for
+Gusev; Sullivan et al. 2005 for Meridiani).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+from numpy.random import Generator
+from pydantic import Field
+
+from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded
+from marsyard.sim.terrain.landforms.ground import Grid, Ground, Spectrum
+from marsyard.sim.terrain.landforms.kernels import cut_channels, stamp_cover, stamp_streaks
+from marsyard.sim.terrain.landforms.relief import draw_channels
+from marsyard.sim.terrain.surface import ROCKS, ROUGHNESS
+
+#: Samples of the terrain per sample of a cover, along each side.
+COVER_STEP = 4
+#: Hurst exponent of the fields whose level lines bound the units: outlines with a fractal dimension of 1.4.
+OUTLINE_HURST = 0.6
+#: Iterations that fit the units' areas, and samples along each side on which areas are counted.
+_FIT_STEPS, _FIT_SIDE = 40, 128
+
+
+class SurfaceUnit(Parameters):
+    """One kind of ground. Factors are relative to the terrain's own values; a factor of 1 leaves them unchanged."""
+
+    fraction: Annotated[Fraction, Field(description="expected fraction of the terrain's area")]
+    tone: Annotated[float, bounded(-1.0, 1.0, "logarithm of albedo over the terrain's mean")] = 0.0
+    roughness: Annotated[NonNegative, Field(description="factor of fine relief")] = 1.0
+    texture: Annotated[NonNegative, Field(description="factor of fine albedo contrast")] = 1.0
+    rocks: Annotated[NonNegative, Field(description="factor of rock density")] = 1.0
+
+
+class SurfaceUnits(Parameters):
+    """A map of surface units: each is where its random field exceeds the others'.
+
+    The areas vary from terrain to terrain by a Dirichlet distribution around the expected fractions.
+    """
+
+    kinds: Annotated[dict[str, SurfaceUnit], Field(min_length=1, description="units by name")]
+    largest_m: Annotated[Positive, Field(description="size of the largest patches, m")] = 500.0
+    smallest_m: Annotated[Positive, Field(description="size of the smallest patches, m")] = 10.0
+    boundary: Annotated[Positive, Field(description="softness of boundaries, standard deviations of the field")] = 0.15
+    elongation: Annotated[float, Field(ge=1.0, le=10.0, description="length of patches along the wind over width")] = (
+        2.0
+    )
+    wind_from_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="mean azimuth the wind comes from")] = 0.0
+    wind_spread_deg: Annotated[NonNegative, Field(description="standard deviation of it from terrain to terrain")] = (
+        20.0
+    )
+    concentration: Annotated[Positive, Field(description="of the Dirichlet distribution: larger varies less")] = 8.0
+
+    tracks_per_km2: Annotated[NonNegative, Field(description="tracks of dust devils per km2")] = 0.0
+    track_tone: Annotated[float, bounded(-1.0, 0.0, "logarithm of albedo of a track over the ground's")] = -0.12
+    track_width_m: Annotated[Positive, Field(description="median width of a track, m")] = 25.0
+    track_length_m: Annotated[Positive, Field(description="mean length of a track, m")] = 900.0
+    streak_fraction: Annotated[Fraction, Field(description="fraction of craters with a wind tail")] = 0.0
+    streak_min_m: Annotated[Positive, Field(description="smallest diameter of craters with a tail, m")] = 20.0
+    streak_tone: Annotated[Fraction, Field(description="RMS of the logarithm of albedo of tails")] = 0.12
+
+    def apply(
+        self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], rng: Generator
+    ) -> Float32[np.ndarray, "cover cover 3"]:
+        """Add the units' tones, the tracks of dust devils and the craters' wind tails; return the cover."""
+        kinds = list(self.kinds.values())
+        expected = np.array([kind.fraction for kind in kinds])
+        areas = rng.dirichlet(self.concentration * expected / expected.sum())
+        side = ground.side // COVER_STEP
+        spacing = ground.period_m / side
+        downwind = np.radians(270.0 - self.wind_from_deg - self.wind_spread_deg * rng.standard_normal())
+        spectrum = Spectrum.power_law(side, spacing, OUTLINE_HURST, self.largest_m, self.elongation, downwind)
+        spectrum = spectrum.low_passed(self.smallest_m)
+        fields = np.stack([spectrum.field(rng, 1.0) for _ in kinds], axis=-1)
+        membership = self._membership(fields, areas)
+        values = np.array([(kind.roughness, kind.texture, kind.rocks) for kind in kinds])
+        factors = np.exp(membership @ np.log(np.maximum(values, 1e-3)).astype(np.float32))
+        tone = np.ascontiguousarray(membership @ np.array([kind.tone for kind in kinds], dtype=np.float32))
+        self._add_tracks(tone, spacing, downwind, rng)
+        ground.add(Ground(np.zeros_like(tone), tone, spacing))
+        self._add_streaks(ground, craters, downwind, rng)
+        if len(craters):
+            fill, depth, radius = craters[:, 6], craters[:, 3] + craters[:, 4], craters[:, 2]
+            freshness = np.clip(depth / radius / 0.4, 0.0, 1.0)
+            rows = np.column_stack([craters[:, :3], 1.0 - 1.6 * fill, 1.0 + freshness])
+            rough = np.ascontiguousarray(factors[..., ROUGHNESS])
+            stamp_cover(rough, spacing, rows, 2.0)
+            factors[..., ROUGHNESS] = rough
+        # the stated abundance of rocks is that of the whole terrain
+        factors[..., ROCKS] /= factors[..., ROCKS].mean(dtype=np.float64)
+        return factors
+
+    def _add_tracks(self, tone: Grid, spacing: float, downwind: float, rng: Generator) -> None:
+        period = tone.shape[0] * spacing
+        count = int(rng.poisson(self.tracks_per_km2 * (period / 1000.0) ** 2))
+        heading = downwind + 0.5 * rng.standard_normal(count)
+        width = np.maximum(self.track_width_m * np.exp(0.5 * rng.standard_normal(count)), 2.0 * spacing)
+        length = self.track_length_m * rng.exponential(1.0, count)
+        start = rng.uniform(0.0, period, (count, 2))
+        depth = -self.track_tone * rng.uniform(0.3, 1.0, count)
+        discs = draw_channels(start, heading, length, width, depth, 0.12, rng)
+        darker = np.zeros_like(tone)
+        cut_channels(darker, spacing, discs, 2.0)
+        tone -= darker
+
+    def _add_streaks(
+        self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], downwind: float, rng: Generator
+    ) -> None:
+        large = craters[craters[:, 2] > 0.5 * self.streak_min_m]
+        chosen = large[rng.uniform(size=len(large)) < self.streak_fraction]
+        radius, count = chosen[:, 2], len(chosen)
+        heading = downwind + 0.12 * rng.standard_normal(count)
+        length = 2.0 * radius * rng.uniform(2.0, 7.0, count)
+        tone = self.streak_tone * rng.standard_normal(count)
+        rows = np.column_stack([chosen[:, :2], radius, length, np.cos(heading), np.sin(heading), tone])
+        stamp_streaks(ground.tone, ground.spacing_m, rows)
+
+    def _membership(
+        self, fields: Float32[np.ndarray, "side side kinds"], areas: Float[np.ndarray, "kinds"]
+    ) -> Float32[np.ndarray, "side side kinds"]:
+        """Soft membership of each unit: a softmax of the fields, shifted until the areas are as drawn."""
+        shift = np.zeros(areas.size)
+        step = max(fields.shape[0] // _FIT_SIDE, 1)
+        for _ in range(_FIT_STEPS):
+            mean = self._softmax(fields[::step, ::step], shift).mean(axis=(0, 1))
+            shift += np.log(np.maximum(areas, 1e-3) / np.maximum(mean, 1e-6)) * 0.5
+        return self._softmax(fields, shift)
+
+    def _softmax(
+        self, fields: Float32[np.ndarray, "rows columns kinds"], shift: Float[np.ndarray, "kinds"]
+    ) -> Float32[np.ndarray, "rows columns kinds"]:
+        level = (fields + shift.astype(np.float32)) / np.float32(self.boundary)
+        level -= level.max(axis=-1, keepdims=True)
+        weights = np.exp(level, out=level)
+        return np.asarray(weights / weights.sum(axis=-1, keepdims=True), dtype=np.float32)
