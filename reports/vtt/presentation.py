@@ -8,16 +8,9 @@ from typing import Any
 from marsyard.reports.columns import label
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
 from marsyard.reports.section import plate
+from marsyard.reports.vtt import sections
 from marsyard.reports.vtt.case_figures import draw_path, draw_stops, is_vtt_case, path_of, stops_of, write_vtt_figures
 from marsyard.reports.vtt.goal import GOAL
-from marsyard.reports.vtt.sections import (
-    SINGLE_RUNS,
-    regression_section,
-    steps_section,
-    table_1_section,
-    terrains_section,
-    updates_section,
-)
 from marsyard.reports.wording import NOTHING, note_text, number
 
 #: Maximum number of stops whose pictures the page shows.
@@ -47,5 +40,5 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
 
 VTT = Presentation(
     cases=(CaseKind(is_vtt_case, view, write_vtt_figures, note_text("vtt.legend")),),
-    first=(table_1_section, SINGLE_RUNS, updates_section, steps_section, terrains_section, regression_section, GOAL),
+    first=(*sections.SECTIONS, GOAL),
 )

@@ -373,3 +373,6 @@ def regression_section(subject: Subject) -> Section | None:
         blocks.append(Block(heading="Runs that lost the target", grid=lost))
     data = {"tracked": asdict(rates.flag_share(frame, "tracked"))}
     return Section("regression", "Regression", "Regression runs on the engineering model", blocks, data)
+
+
+SECTIONS = (table_1_section, SINGLE_RUNS, updates_section, steps_section, terrains_section, regression_section)
