@@ -19,7 +19,7 @@ from marsyard.scenarios.parts.named import default_or_custom
 from marsyard.scenarios.parts.scores import CustomScores, ScoredDescent
 from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.dynamics import SwingParameters
-from marsyard.sim.parameters import Parameters, bounded
+from marsyard.sim.parameters import Parameters, bounded, merge_settings
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import (
     ApproachParameters,
@@ -174,7 +174,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
         if not isinstance(changes, Mapping):
             return stated
         of_site = site(stated["site"]).terrain("descent").model_dump()
-        return {"terrain_site": stated["site"], **stated, "terrain": _merge(of_site, changes)}
+        return {"terrain_site": stated["site"], **stated, "terrain": merge_settings(of_site, changes)}
 
     @model_validator(mode="after")
     def _check_consistency(self) -> DescentScenarioParameters:
@@ -246,11 +246,3 @@ def binned_size_for(columns: int, rows: int) -> tuple[int, int]:
 def descent_sites() -> list[str]:
     """Names of the sites with a terrain for descents."""
     return [name for name, one in sites().items() if one.descent is not None]
-
-
-def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(base)
-    for key, value in changes.items():
-        inner = merged.get(key)
-        merged[key] = _merge(inner, value) if isinstance(inner, Mapping) and isinstance(value, Mapping) else value
-    return merged
