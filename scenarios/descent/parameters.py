@@ -106,9 +106,7 @@ class CameraParameters(Parameters):
 class RenderParameters(Parameters):
     """Rendering of the pictures."""
 
-    backend: Annotated[Backend, Field(description="library that provides OpenGL's context")] = Field(
-        default_factory=default_backend
-    )
+    backend: Backend = Field(default_factory=default_backend, description="library that provides OpenGL's context")
 
 
 Flight = Annotated[

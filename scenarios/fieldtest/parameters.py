@@ -144,9 +144,7 @@ class FieldTestParameters(AlgorithmSelection, CustomScores):
         CalibrationParameters, Field(description="errors of the calibrated camera, the same in all cases")
     ] = CalibrationParameters()
     detector: DetectorChoice = Field(default_factory=lambda: preset(CAMERA).detector)
-    backend: Annotated[Backend, Field(description="library that provides OpenGL's context")] = Field(
-        default_factory=default_backend
-    )
+    backend: Backend = Field(default_factory=default_backend, description="library that provides OpenGL's context")
 
     @model_validator(mode="after")
     def _check_run_names(self) -> FieldTestParameters:

@@ -31,7 +31,7 @@ from marsyard.scenarios.user_files import (
 )
 from marsyard.sim.files import check_regular, npy_header, open_regular
 from marsyard.sim.frames import direction
-from marsyard.sim.parameters import Parameters
+from marsyard.sim.parameters import Parameters, bounded
 
 #: The two files of every folder.
 INGEST_FILE, TABLE_FILE = "ingest.toml", "pictures.csv"
@@ -75,9 +75,7 @@ class DetectorTable(Parameters):
     transfer_row_s: Annotated[
         float, Field(ge=0.0, le=1.0, description="frame transfer: time under each row while shifted out; 0: none")
     ] = 0.0
-    clear_row_s: Annotated[
-        float, Field(ge=0.0, le=1.0, description="frame transfer: time under each row while cleared; 0: none")
-    ] = 0.0
+    clear_row_s: Annotated[float, bounded(0.0, 1.0, "frame transfer: time under each row while cleared; 0: none")] = 0.0
     rows_summed: Annotated[
         int | None,
         Field(ge=1, le=64, description="physical rows in a delivered one; by default the camera's ratio of scales"),

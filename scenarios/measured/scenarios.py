@@ -82,9 +82,7 @@ class MeasuredVelocityParameters(AlgorithmSelection, CustomScores, MeasuredParam
     task = VELOCITY
     scored = ScoredVelocity
 
-    algorithm: Annotated[str, Field(description="the velocity estimator under test, whose answers are judged")] = (
-        "dimes"
-    )
+    algorithm: str = Field(default="dimes", description="the velocity estimator under test, whose answers are judged")
     dimes: Annotated[DimesOptions, Field(description="options of DIMES")] = DimesOptions()
 
     @model_validator(mode="after")

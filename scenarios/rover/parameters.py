@@ -63,9 +63,7 @@ class WorldParameters(Parameters):
     east_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
     north_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
     rocks_underfoot: bool = Field(default=False, description="whether wheels feel rocks, or the ground alone")
-    background_half_deg: Annotated[Positive, Field(le=180.0, description="half angle behind the target with rocks")] = (
-        50.0
-    )
+    background_half_deg: Positive = Field(default=50.0, le=180.0, description="half angle behind the target with rocks")
 
     @field_validator("site")
     @classmethod
@@ -140,9 +138,7 @@ class LegParameters(Parameters):
     goal_m: Positive = Field(default=2.0, description="final horizontal distance of the rover's origin from the target")
     ends_with_steps: bool = Field(default=False, description="whether it may end short of goal_m, its steps done")
     offset_right_m: float = Field(default=0.0, description="offset of the goal to the right of the target's direction")
-    shuffle_m: Annotated[NonNegative, Field(description="drive of a step with a stuck motor, and back at the next")] = (
-        0.0
-    )
+    shuffle_m: NonNegative = Field(default=0.0, description="drive of a step with a stuck motor, and back at the next")
     visual_odometry: Annotated[bool, Field(description="whether the pose is corrected by visual odometry")] = False
     visual_odometry_step_m: Positive = Field(default=0.75, description="longest drive between pictures (60 % overlap)")
     autonav: bool = Field(default=False, description="whether the navigator avoids rocks in its map")
@@ -225,9 +221,7 @@ class CustomPair(Parameters):
 class CameraParameters(Parameters):
     """The stereo pair on the mast."""
 
-    preset: Annotated[str, Field(description="key of `marsyard.sim.sensor.mast.MASTS`: pair, mast, rover")] = (
-        "mer-navcam"
-    )
+    preset: str = Field(default="mer-navcam", description="key of `marsyard.sim.sensor.mast.MASTS`: pair, mast, rover")
     custom: Annotated[CustomPair | None, Field(description="a custom pair on the preset's mast")] = None
     detector: DetectorChoice | None = Field(default=None, description="of both cameras; by default the preset's")
     detector_noise: Annotated[bool, Field(description="whether pictures have detector noise and response")] = True
