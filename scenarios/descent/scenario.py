@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from marsyard.algorithms.dimes import DimesDetails
 from marsyard.scenarios.algorithm_run import case_result
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
-from marsyard.scenarios.conditions import picture_columns
+from marsyard.scenarios.conditions import hash_images, picture_columns
 from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
 from marsyard.scenarios.descent.faults import faulty_terrain
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, picture_states, true_velocity
@@ -56,7 +56,6 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
     name = "descent"
     parameters_type = DescentScenarioParameters
     task = VELOCITY
-    algorithm_table = ()
     part_keys: Mapping[str, Kind] = {
         "flight.motion": DYNAMICS,
         "altimeter.instrument": INSTRUMENT,
@@ -161,7 +160,7 @@ class Descent:
             **conditions(self.p, self.world, self.states, self.at_firing, self.instruments),
             **instrument_errors(self.world, self.states, self.measurements),
             **self.flight.row,
-            **picture_columns(self.p.render.backend, self.pictures),
+            **picture_columns(self.p.render.backend, hash_images(self.pictures)),
         }
 
     def truth(self, span_s: Span) -> Horizontal:

@@ -10,6 +10,7 @@ from jaxtyping import Float64
 
 from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, stereo_range_error_m
 from marsyard.algorithms.vtt.stereo import disparity_px_m
+from marsyard.scenarios.conditions import sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.scores import ScoredRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
@@ -224,8 +225,7 @@ def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "pose_error_m": pose_error,
         "pose_error_fraction": pose_error / driven if driven > 0.0 else NAN,
         "duration_min": times[1] / 60.0,
-        "sun_azimuth_deg": float(np.degrees(np.arctan2(sun[0][0], sun[0][1])) % 360.0),
-        "sun_elevation_deg": float(np.degrees(np.arcsin(sun[0][2]))),
+        **sun_columns(sun[0]),
         "sun_motion_deg": float(np.degrees(np.arccos(np.clip(sun[0] @ sun[1], -1.0, 1.0)))),
         "exposure_min_s": -_max(-exposures),
         "exposure_max_s": _max(exposures),
