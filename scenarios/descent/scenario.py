@@ -101,7 +101,13 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         """Simulate one descent and score all algorithms."""
         p = self.check_parameters(parameters)
         descent = Descent.simulate(p, streams)
-        shared = descent.conditions()
+        shared = {
+            **descent.overlap,
+            **conditions(p, descent.world, descent.states, descent.at_firing, descent.instruments),
+            **instrument_errors(descent.world, descent.states, descent.measurements),
+            **descent.flight.row,
+            **picture_columns(p.render.backend, hash_images(descent.pictures)),
+        }
         return case_result(p.algorithms, lambda algorithm: _score_algorithm(descent, algorithm, shared), shared)
 
 
@@ -152,16 +158,6 @@ class Descent:
     def at_firing(self) -> State:
         """True state at the thrusters' firing."""
         return self.flight.motion.state(self.flight.firing_s)
-
-    def conditions(self) -> dict[str, Scalar]:
-        """Columns independent of the algorithm."""
-        return {
-            **self.overlap,
-            **conditions(self.p, self.world, self.states, self.at_firing, self.instruments),
-            **instrument_errors(self.world, self.states, self.measurements),
-            **self.flight.row,
-            **picture_columns(self.p.render.backend, hash_images(self.pictures)),
-        }
 
     def truth(self, span_s: Span) -> Horizontal:
         """True horizontal velocity over a span of time tags."""

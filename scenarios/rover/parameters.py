@@ -13,6 +13,7 @@ from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.parts.scores import CustomScores, ScoredRun
+from marsyard.scenarios.terrain_files import check_site
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import SlipParameters
 from marsyard.sim.frames import direction
@@ -33,7 +34,7 @@ from marsyard.sim.sensor import (
     preset,
     stereo_mast,
 )
-from marsyard.sim.terrain import site, sites
+from marsyard.sim.terrain import site
 
 #: Angles in degrees: relative, and azimuths.
 Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
@@ -51,7 +52,9 @@ class InclineParameters(Parameters):
 class WorldParameters(Parameters):
     """One terrain of a site's bank, cleared of rocks on the route."""
 
-    site: Annotated[str, Field(description="preset of terrain, rocks, texture and light")] = "mars-yard"
+    site: Annotated[
+        str, check_site("a rover", "ground"), Field(description="preset of terrain, rocks, texture and light")
+    ] = "mars-yard"
     bank: Annotated[int, Field(ge=1, le=100000, description="terrains in the bank")] = 8
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
     terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
@@ -64,14 +67,6 @@ class WorldParameters(Parameters):
     north_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
     rocks_underfoot: bool = Field(default=False, description="whether wheels feel rocks, or the ground alone")
     background_half_deg: Positive = Field(default=50.0, le=180.0, description="half angle behind the target with rocks")
-
-    @field_validator("site")
-    @classmethod
-    def _check_site(cls, name: str) -> str:
-        allowed = [one.name for one in sites().values() if one.ground is not None]
-        if name not in allowed:
-            raise ValueError(f"no site for a rover is called '{name}'; allowed: {', '.join(allowed)}")
-        return name
 
     @model_validator(mode="after")
     def _check_terrain(self) -> WorldParameters:

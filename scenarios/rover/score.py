@@ -123,8 +123,8 @@ def tracking(run: Run) -> dict[str, Scalar]:
 
 def update_figures(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
     """Figures of every update, one array each; NaN where a tracker reports no details, of a match also at the seed."""
-    figures = {name: np.full(len(run.stops), np.nan) for name in FIGURES}
-    for number, (stop, error) in enumerate(zip(run.stops, errors_px(run), strict=True)):
+    rows = []
+    for stop, error in zip(run.stops, errors_px(run), strict=True):
         azimuth, elevation = np.degrees(stop.angles_rad)
         row = {
             "range_m": stop.range_m,
@@ -147,9 +147,8 @@ def update_figures(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
             row["match_score"] = details.match.score
             if details.predicted_pixel is not None:
                 row["correction_px"] = float(np.max(np.abs(details.match.pixel - details.predicted_pixel)))
-        for name, value in row.items():
-            figures[name][number] = value
-    return figures
+        rows.append(row)
+    return {name: np.array([row.get(name, NAN) for row in rows], dtype=np.float64) for name in FIGURES}
 
 
 def stored_updates(run: Run, count: int) -> dict[str, Scalar]:
