@@ -66,7 +66,9 @@ class WorldParameters(Parameters):
     east_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
     north_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
     rocks_underfoot: bool = Field(default=False, description="whether wheels feel rocks, or the ground alone")
-    background_half_deg: Positive = Field(default=50.0, le=180.0, description="half angle behind the target with rocks")
+    background_half_deg: Annotated[Positive, Field(le=180.0, description="half angle behind the target with rocks")] = (
+        50.0
+    )
 
     @model_validator(mode="after")
     def _check_terrain(self) -> WorldParameters:
