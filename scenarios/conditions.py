@@ -33,16 +33,13 @@ def attitude_rate_deg_s(state: State) -> float:
     return float(np.degrees(np.linalg.norm(state.body_rate_rad_s)))
 
 
-def picture_columns(backend: Backend, pictures: Iterable[UInt16[np.ndarray, "rows columns"]]) -> dict[str, Scalar]:
-    """Return the columns of pictures that a backend rendered."""
-    digest = hashlib.sha256()
-    for counts in pictures:
-        digest.update(np.ascontiguousarray(counts).tobytes())
-    return picture_columns_of_hash(backend, digest.hexdigest())
+def hash_images(pictures: Iterable[UInt16[np.ndarray, "rows columns"]]) -> str:
+    """Compute the SHA-256 of the counts of pictures."""
+    return hashlib.sha256(b"".join(counts.tobytes() for counts in pictures)).hexdigest()
 
 
-def picture_columns_of_hash(backend: Backend, image_hash: str) -> dict[str, Scalar]:
-    """Return the same columns for a given hash of the pictures."""
+def picture_columns(backend: Backend, image_hash: str) -> dict[str, Scalar]:
+    """Return the columns of pictures with this hash that a backend rendered."""
     return {
         "image_hash": image_hash,
         "gl_backend": backend,

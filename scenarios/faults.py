@@ -28,17 +28,10 @@ class SizedFaults(Parameters):
     ] = 0.0
 
     @property
-    def name_and_size(self) -> tuple[str, float]:
-        """The fault and its size; "none" and 0 without a fault, "several" and NaN with more than one."""
-        present = [(name, float(size)) for name, size in self.model_dump().items() if size]
-        if len(present) > 1:
-            return "several", float("nan")
-        return present[0] if present else ("none", 0.0)
-
-    @property
     def columns(self) -> dict[str, Scalar]:
-        """The fault and its size as columns."""
-        name, size = self.name_and_size
+        """The fault and its size; "none" and 0 without a fault, "several" and NaN with more than one."""
+        present = [(name, float(size)) for name, size in self.model_dump().items() if size] or [("none", 0.0)]
+        name, size = present[0] if len(present) == 1 else ("several", float("nan"))
         return {"fault": name, "fault_size": size}
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:

@@ -21,18 +21,83 @@ from typing import cast
 
 from marsyard.scenarios.import_path import import_object
 from marsyard.scenarios.interface import Scenario
-from marsyard.scenarios.system import System
+from marsyard.scenarios.system import SCENARIOS_FOLDER, System
 
 #: Entry points of other packages' systems.
 GROUP = "marsyard.systems"
 
+#: Files that the systems of Marsyard share.
+_CATALOGUE = SCENARIOS_FOLDER / "catalogue"
+_REQUIREMENTS, _COLUMNS = SCENARIOS_FOLDER / "requirements.toml", SCENARIOS_FOLDER / "columns.toml"
+
 #: The systems of Marsyard. Recorded pictures come first: their products are also those of others.
 BUILT_IN = (
-    "marsyard.scenarios.measured.system:MEASURED",
-    "marsyard.scenarios.descent.system:DIMES",
-    "marsyard.scenarios.fieldtest.system:FIELD_TEST",
-    "marsyard.scenarios.rover.system:VTT",
-    "marsyard.scenarios.landing.system:HDA",
+    System(
+        name="measured",
+        title="Recorded pictures",
+        summary="Algorithms on real pictures, compared with the measured poses.",
+        scenarios={
+            "measured-velocity": "marsyard.scenarios.measured.scenarios:MeasuredVelocityScenario",
+            "measured-landing": "marsyard.scenarios.measured.scenarios:MeasuredLandingScenario",
+            "measured-matching": "marsyard.scenarios.measured.scenarios:MatchingScenario",
+        },
+        tasks=("marsyard.scenarios.estimators:VELOCITY", "marsyard.scenarios.estimators:LANDING"),
+        columns=_COLUMNS,
+        ingest="marsyard.scenarios.measured.ingest:ingest_campaign",
+        report="marsyard.reports.measured.presentation:MEASURED",
+    ),
+    System(
+        name="dimes",
+        title="Descent Image Motion Estimation System (DIMES)",
+        summary="Horizontal velocity of a lander under its parachute, from three pictures.",
+        scenarios={"descent": "marsyard.scenarios.descent.scenario:DescentScenario"},
+        tasks=("marsyard.scenarios.estimators:VELOCITY",),
+        catalogue=_CATALOGUE / "dimes-*.toml",
+        requirements=_REQUIREMENTS,
+        columns=_COLUMNS,
+        compiled_by={"dimes-smoke": ("terrain.samples=512",)},
+        templates={"velocity": "marsyard.scenarios.template:VELOCITY"},
+        report="marsyard.reports.dimes.presentation:DIMES",
+    ),
+    System(
+        name="fieldtest",
+        title="Field test of DIMES on a helicopter",
+        summary="Horizontal velocity of a helicopter from triples of pictures over desert ground.",
+        scenarios={"fieldtest": "marsyard.scenarios.fieldtest.scenario:FieldTestScenario"},
+        tasks=("marsyard.scenarios.estimators:VELOCITY",),
+        catalogue=_CATALOGUE / "dimes-fieldtest.toml",
+        columns=_COLUMNS,
+        report="marsyard.reports.dimes.presentation:FIELD_TEST",
+    ),
+    System(
+        name="vtt",
+        title="Visual target tracking (VTT)",
+        summary="Position of a target that a rover drives at, tracked in the pictures of its mast.",
+        scenarios={
+            "rover": "marsyard.scenarios.rover.scenario:RoverScenario",
+            "rover-drive": "marsyard.scenarios.rover.scenario:SharedDriveScenario",
+        },
+        tasks=("marsyard.scenarios.estimators:TRACKING",),
+        catalogue=_CATALOGUE / "vtt-*.toml",
+        requirements=_REQUIREMENTS,
+        columns=_COLUMNS,
+        compiled_by={"vtt-checkout-2": ("world.samples=512", "start.distance_m=2.4", "target.diameter_m=0.5")},
+        templates={"tracking": "marsyard.scenarios.template:TRACKING"},
+        report="marsyard.reports.vtt.presentation:VTT",
+    ),
+    System(
+        name="hda",
+        title="Hazard detection and avoidance (HDA)",
+        summary="A safe landing site from two pictures of a moving camera.",
+        scenarios={"landing": "marsyard.scenarios.landing.scenario:LandingScenario"},
+        tasks=("marsyard.scenarios.estimators:LANDING",),
+        catalogue=_CATALOGUE / "hda-*.toml",
+        requirements=_REQUIREMENTS,
+        columns=_COLUMNS,
+        compiled_by={"hda-benign": ("terrain.samples=512",)},
+        templates={"landing": "marsyard.scenarios.template:LANDING"},
+        report="marsyard.reports.hda.presentation:HDA",
+    ),
 )
 
 
@@ -47,7 +112,7 @@ class Registry:
 @cache
 def registry() -> Registry:
     """Read the systems of this installation, once per process."""
-    usable: list[System] = [import_object(path) for path in BUILT_IN]
+    usable = list(BUILT_IN)
     problems: list[str] = []
     for point in sorted(entry_points(group=GROUP), key=lambda one: (one.name, one.value)):
         try:

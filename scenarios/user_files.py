@@ -6,14 +6,17 @@ import csv
 import difflib
 import math
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, TypeVar, runtime_checkable
 
 from pydantic import BaseModel, Field, model_validator
 
+from marsyard.algorithms.faults import AlgorithmError
 from marsyard.sim.files import check_regular
 from marsyard.sim.parameters import Parameters
+
+Row = TypeVar("Row")
 
 #: Maximum number of problems of a file in one message.
 _MAX_PROBLEMS = 20
@@ -81,11 +84,35 @@ def format_problems(file: Path, problems: Sequence[str]) -> str:
     return "\n  ".join([f"{file}:", *problems[:_MAX_PROBLEMS], *more])
 
 
-def read_lines(path: Path, max_rows: int) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Read the column names and the non-empty lines with their numbers.
+def parse_table(
+    path: Path,
+    max_rows: int,
+    needed: Sequence[str],
+    allowed: Sequence[str],
+    hint: str,
+    parse: Callable[[int, Mapping[str, str]], Row],
+) -> tuple[list[Row], list[str]]:
+    """Parse the rows of a table by line and cells; return them, and the problems of the others by line.
 
-    Raises ValueError where the file is unreadable, is no table with commas, or has too many rows.
+    Raises ValueError where the file is unreadable, is no table with commas, has too many rows, or lacks columns or has
+    unknown ones; `hint` states the allowed ones. `parse` raises ValueError or AlgorithmError.
     """
+    header, lines = _read_lines(path, max_rows)
+    problems = list(_header_problems(header, needed, allowed, hint))
+    if problems:
+        raise ValueError(format_problems(path, problems))
+    rows: list[Row] = []
+    for line, cells in lines:
+        try:
+            if len(cells) != len(header):
+                raise ValueError(f"it has {len(cells)} cells; the first line has {len(header)}")
+            rows.append(parse(line, dict(zip(header, cells, strict=True))))
+        except (ValueError, AlgorithmError) as error:
+            problems.append(f"line {line}: {error}")
+    return rows, problems
+
+
+def _read_lines(path: Path, max_rows: int) -> tuple[list[str], list[tuple[int, list[str]]]]:
     try:
         check_regular(path)
         with path.open(newline="", encoding="utf-8-sig") as text:
@@ -104,8 +131,7 @@ def read_lines(path: Path, max_rows: int) -> tuple[list[str], list[tuple[int, li
     return header, lines
 
 
-def header_problems(header: Sequence[str], needed: Sequence[str], allowed: Sequence[str], hint: str) -> Iterator[str]:
-    """Yield missing, unknown and repeated columns; `hint` states the allowed ones."""
+def _header_problems(header: Sequence[str], needed: Sequence[str], allowed: Sequence[str], hint: str) -> Iterator[str]:
     if not header:
         yield "it is empty"
         return
@@ -119,13 +145,6 @@ def header_problems(header: Sequence[str], needed: Sequence[str], allowed: Seque
             yield f"unknown column '{name}'{suggestion}; {hint}"
         if header.count(name) > 1:
             yield f"the column '{name}' stands there twice"
-
-
-def cells_by_column(header: Sequence[str], cells: Sequence[str]) -> dict[str, str]:
-    """Return a row's cells by column. Raises ValueError for another number of cells than columns."""
-    if len(cells) != len(header):
-        raise ValueError(f"it has {len(cells)} cells; the first line has {len(header)}")
-    return dict(zip(header, cells, strict=True))
 
 
 def finite_number(name: str, text: str, otherwise: str = "") -> float:

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from marsyard.algorithms.dimes import DimesDetails
 from marsyard.scenarios.algorithm_run import case_result
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
-from marsyard.scenarios.conditions import picture_columns
+from marsyard.scenarios.conditions import hash_images, picture_columns
 from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
 from marsyard.scenarios.descent.faults import faulty_terrain
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, picture_states, true_velocity
@@ -56,7 +56,6 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
     name = "descent"
     parameters_type = DescentScenarioParameters
     task = VELOCITY
-    algorithm_table = ()
     part_keys: Mapping[str, Kind] = {
         "flight.motion": DYNAMICS,
         "altimeter.instrument": INSTRUMENT,
@@ -102,7 +101,13 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         """Simulate one descent and score all algorithms."""
         p = self.check_parameters(parameters)
         descent = Descent.simulate(p, streams)
-        shared = descent.conditions()
+        shared = {
+            **descent.overlap,
+            **conditions(p, descent.world, descent.states, descent.at_firing, descent.instruments),
+            **instrument_errors(descent.world, descent.states, descent.measurements),
+            **descent.flight.row,
+            **picture_columns(p.render.backend, hash_images(descent.pictures)),
+        }
         return case_result(p.algorithms, lambda algorithm: _score_algorithm(descent, algorithm, shared), shared)
 
 
@@ -153,16 +158,6 @@ class Descent:
     def at_firing(self) -> State:
         """True state at the thrusters' firing."""
         return self.flight.motion.state(self.flight.firing_s)
-
-    def conditions(self) -> dict[str, Scalar]:
-        """Columns independent of the algorithm."""
-        return {
-            **self.overlap,
-            **conditions(self.p, self.world, self.states, self.at_firing, self.instruments),
-            **instrument_errors(self.world, self.states, self.measurements),
-            **self.flight.row,
-            **picture_columns(self.p.render.backend, self.pictures),
-        }
 
     def truth(self, span_s: Span) -> Horizontal:
         """True horizontal velocity over a span of time tags."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -21,6 +20,7 @@ from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEst
 from marsyard.scenarios.algorithm_run import AlgorithmRun, case_result, run_algorithm_on_copy
 from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.base import BaseScenario, algorithm_result
+from marsyard.scenarios.conditions import hash_images
 from marsyard.scenarios.descent.parameters import check_binning
 from marsyard.scenarios.estimators import LANDING, VELOCITY
 from marsyard.scenarios.interface import CaseResult, Scalar, record_conditions
@@ -82,9 +82,7 @@ class MeasuredVelocityParameters(AlgorithmSelection, CustomScores, MeasuredParam
     task = VELOCITY
     scored = ScoredVelocity
 
-    algorithm: Annotated[str, Field(description="the velocity estimator under test, whose answers are judged")] = (
-        "dimes"
-    )
+    algorithm: str = Field(default="dimes", description="the velocity estimator under test, whose answers are judged")
     dimes: Annotated[DimesOptions, Field(description="options of DIMES")] = DimesOptions()
 
     @model_validator(mode="after")
@@ -264,9 +262,6 @@ def _run_algorithms(
 def _case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[str, Scalar]:
     """Return the columns of the case: name, pictures, and the largest motion of the camera between two pictures."""
     poses = [picture.pose * camera_pose(image.camera) for picture, image in zip(p.case.pictures, images, strict=True)]
-    digest = hashlib.sha256()
-    for image in images:
-        digest.update(np.ascontiguousarray(image.counts).tobytes())
     steps = [before.inv() * after for before, after in itertools.pairwise(poses)]
     has_positions = all(picture.position_m is not None for picture in p.case.pictures)
     return {
@@ -275,7 +270,7 @@ def _case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[st
         "duration_s": images[-1].time_s - images[0].time_s,
         "max_rotation_deg": max(float(np.degrees(step.rotation.magnitude())) for step in steps),
         "max_translation_m": max(float(np.linalg.norm(step.translation)) for step in steps) if has_positions else NAN,
-        "image_hash": digest.hexdigest(),
+        "image_hash": hash_images(image.counts for image in images),
     }
 
 

@@ -25,7 +25,7 @@ from marsyard.algorithms.interface import TrackingState
 from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm
 from marsyard.scenarios.base import LoadGround, TerrainScenario
-from marsyard.scenarios.conditions import picture_columns_of_hash
+from marsyard.scenarios.conditions import picture_columns
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import SCORE, Kind
@@ -206,8 +206,6 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
     name = "rover"
     parameters_type = RoverScenarioParameters
     task = TRACKING
-    algorithm_table = ()
-    part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
     def __init__(self) -> None:
         super().__init__(CACHED_GROUNDS)
@@ -326,7 +324,7 @@ def _judge(
     if judged:
         digest = hashlib.sha256(b"".join(stop.pictures.digest for stop in run.stops)).hexdigest()
         row |= {**score.stored_updates(run, p.score.stored_updates), **score.run_conditions(p, run)}
-        row |= picture_columns_of_hash(p.backend, digest)
+        row |= picture_columns(p.backend, digest)
     row |= scored(p.scores, score.scored_run(run), {*row, *known})
     return CaseResult(
         run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, score.products(p, run) if judged else {}

@@ -17,12 +17,12 @@ from marsyard.scenarios.exposure import camera_optics
 from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters
 from marsyard.scenarios.fieldtest.run import (
     Category,
-    ElevationModel,
     Run,
     RunKey,
     field_camera,
     simulate_run,
     sun_direction,
+    survey_ground,
 )
 from marsyard.scenarios.fieldtest.scenario import (
     FieldTestScenario,
@@ -78,13 +78,11 @@ def test_attitude_is_good_to_hundredths_of_a_degree_without_drift() -> None:
     """Random walk of 0.07 deg/sqrt(h) over 40 min held at both ends: 0.03 deg in the middle, a fifth of 0.15 deg."""
     run = ivanpah(drift={"change_k": 0.0})
     assert np.abs(attitude_errors_deg(run)).max() < 0.15
-    assert run.attitude_solution.residual_rad < 5e-4
 
 
 def test_fit_takes_a_constant_bias_off() -> None:
     run = ivanpah(drift={"change_k": 0.0}, imu={**IMU, "gyro_bias_deg_h": 5.0})
     assert np.abs(attitude_errors_deg(run)).max() < 0.15
-    assert np.degrees(np.linalg.norm(run.attitude_solution.bias_rad_s)) * 3600.0 > 2.0
 
 
 def test_drift_tilts_across_the_line_and_the_fit_does_not_see_it() -> None:
@@ -107,11 +105,11 @@ def test_turning_about_with_the_flight_cancels_the_drift() -> None:
 
 
 def test_elevation_model_has_the_error_of_its_class() -> None:
-    """Over flat ground the error is that of the posts, smoothed a little by interpolation, with what that adds."""
+    """Over flat ground the error is that of the posts, smoothed a little by interpolation."""
     flat = Surface.from_samples(np.zeros((64, 64, 2), dtype=np.float32), 500.0)
     places = np.random.default_rng(1).uniform(0.0, 30000.0, (4000, 2))
-    model = ElevationModel.surveyed(ElevationParameters(), flat, places, np.random.default_rng(2))
-    assert model.heights(places, np.random.default_rng(3)).std() == pytest.approx(np.hypot(6.0, 1.0), rel=0.06)
+    posts = survey_ground(ElevationParameters(), flat, places, np.random.default_rng(2))
+    assert posts(places).std() == pytest.approx(6.0, rel=0.06)
 
 
 def test_triples_are_what_their_category_says() -> None:

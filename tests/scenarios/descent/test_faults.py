@@ -60,17 +60,17 @@ def test_no_fault_changes_nothing() -> None:
     assert faulty_terrain(none, terrain) == terrain
     assert faulty_detector(none, detector) == detector
     assert faulty_times(none, [0.0, 3.75, 7.5]) == [0.0, 3.75, 7.5]
-    assert none.name_and_size == ("none", 0.0)
+    assert none.columns == {"fault": "none", "fault_size": 0.0}
 
 
 @pytest.mark.parametrize(("name", "field"), Faults.model_fields.items())
 def test_a_fault_is_named_with_its_size(name: str, field: FieldInfo) -> None:
     size = 2 if field.annotation is int else 0.25
-    assert Faults.model_validate({name: size}).name_and_size == (name, size)
+    assert Faults.model_validate({name: size}).columns == {"fault": name, "fault_size": size}
 
 
 def test_several_faults_have_no_size() -> None:
-    name, size = Faults(haze=1.0, dust_discs=3).name_and_size
+    name, size = Faults(haze=1.0, dust_discs=3).columns.values()
     assert name == "several"
     assert np.isnan(size)
 
