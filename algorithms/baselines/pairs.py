@@ -1,6 +1,6 @@
 """Image pairs rectified to a common camera that looks straight down, and the phase correlation of such pairs.
 
-The baselines see the same corrected images as DIMES, in the same geometry (`dimes.rectification.rectify_patch`),
+The baselines see the same corrected images as DIMES, in the same geometry (`dimes.binning.rectify_patch`),
 but the whole overlap of two images rather than templates. The IMU checks the change between their two velocities as in
 DIMES, with the same threshold. Only the measurement of the shift differs.
 """
@@ -15,9 +15,15 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.algorithms.dimes.binning import View, inside_frame, pixel_angle_rad, usable_views
+from marsyard.algorithms.dimes.binning import (
+    View,
+    ground_lattice,
+    inside_frame,
+    pixel_angle_rad,
+    rectify_patch,
+    usable_views,
+)
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.rectification import ground_lattice, rectify_patch
 from marsyard.algorithms.dimes.validity import combinations
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements

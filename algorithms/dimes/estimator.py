@@ -7,7 +7,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.algorithms.dimes.binning import View, pixels_from_ground, usable_views
+from marsyard.algorithms.dimes.binning import View, pixels_from_ground, rectify_patch, usable_views
 from marsyard.algorithms.dimes.details import DimesDetails, PairDetails, Track
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.overlap import (
@@ -18,7 +18,6 @@ from marsyard.algorithms.dimes.overlap import (
     template_candidates,
     zero_phase_pixel,
 )
-from marsyard.algorithms.dimes.rectification import rectify_patch
 from marsyard.algorithms.dimes.validity import combinations, failed_checks, track_metrics
 from marsyard.algorithms.image.correlation import Peak, biquadratic_offset, highest_peak, pseudo_normalized_correlation
 from marsyard.algorithms.image.registration import refine_shift

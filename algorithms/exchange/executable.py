@@ -15,11 +15,11 @@ from marsyard.algorithms.exchange.serving import (
     ProgramDetails,
     Session,
     ask_case,
-    bad_answer,
     check_keys,
     read_member,
     read_numbers,
 )
+from marsyard.algorithms.faults import bad_answer
 from marsyard.algorithms.interface import (
     MastAim,
     PixelBox,

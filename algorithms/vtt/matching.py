@@ -1,4 +1,4 @@
-"""Template extraction and matching (sections 4.3.2 and 4.3.3)."""
+"""Prediction of the target, magnification and roll (4.1, 4.3.1); template extraction and matching (4.3.2, 4.3.3)."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.image.correlation import Peak, biquadratic_offset, coarse_to_fine_peak, normalized_correlation
 from marsyard.algorithms.image.registration import SURROUND, Warp, build_spline, register_template, similarity_patch
 from marsyard.algorithms.vtt.options import VttOptions
-from marsyard.algorithms.vtt.target import bearing_rad
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.measurements import MastImage
+from marsyard.sim.frames import SITE_FROM_WORLD, compose
+from marsyard.sim.measurements import MastImage, RoverTarget, SiteTarget
 
 
 @dataclass(frozen=True)
@@ -175,3 +175,72 @@ def match_by_correlation(
             offset = biquadratic_offset(normalized_correlation(template, about), Peak(1, 1, peak.value, False))
         best = refine_match(template, image, corner, offset, peak, options)
     return Match(best.corner[::-1] + half + image.corner, best.score, template)
+
+
+def designated_position_world(
+    target: RoverTarget | SiteTarget, world_from_rover: RigidTransform
+) -> Float[np.ndarray, "3"]:
+    """World position of a target designated by position; `world_from_rover` is the pose at designation."""
+    if isinstance(target, RoverTarget):
+        return np.asarray(world_from_rover.apply(target.position_rover.copy()))
+    return np.asarray(SITE_FROM_WORLD.inv().apply(target.position_site.copy()))
+
+
+def pose_change(old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform) -> RigidTransform:
+    """The transform from the old frame into the new frame."""
+    return compose(new_world_from_frame.inv(), old_world_from_frame)
+
+
+def predicted_position(
+    position: Float[np.ndarray, "3"], old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform
+) -> Float[np.ndarray, "3"]:
+    """Position of a static point in a frame that moved (rover or mast head), from its old position there."""
+    return np.asarray(pose_change(old_world_from_frame, new_world_from_frame).apply(position.copy()))
+
+
+def bearing_rad(direction_world: Float[np.ndarray, "3"]) -> float:
+    """Azimuth of a direction, clockwise from north, radians in (-pi, pi]."""
+    return float(np.arctan2(direction_world[0], direction_world[1]))
+
+
+def magnification(
+    old_position: Float[np.ndarray, "3"],
+    old_centre: Float[np.ndarray, "3"],
+    new_position: Float[np.ndarray, "3"],
+    new_centre: Float[np.ndarray, "3"],
+) -> float:
+    """Scale factor, Eq. 6: the target's old distance from the camera over its new one.
+
+    Positions and camera centres are each in the rover frame of their own stop.
+    """
+    return float(np.linalg.norm(old_position - old_centre) / np.linalg.norm(new_position - new_centre))
+
+
+def horizontal_axis(camera: CameraModel) -> Float[np.ndarray, "3"]:
+    """Unit vector Hx along the image's x axis, Eqs. 7 to 9; A and H need not be perpendicular."""
+    hs = np.linalg.norm(np.cross(camera.a, camera.h))
+    hc = camera.a @ camera.h
+    return np.asarray((camera.h - hc * camera.a) / hs)
+
+
+def lever_pixels(
+    old_position: Float[np.ndarray, "3"],
+    old_camera: CameraModel,
+    new_camera: CameraModel,
+    new_from_old: RigidTransform,
+    lever_m: float,
+) -> Float[np.ndarray, "2 2"] | None:
+    """Pixels (u, v) in the new image of the target and of a point `lever_m` along the old image's x axis (before Eq.
+    10).
+
+    Each camera is in the frame of its own stop. None if the new camera cannot image one of the points.
+    """
+    points = np.stack([old_position, old_position + lever_m * horizontal_axis(old_camera)])
+    pixels, visible = new_camera.project(np.asarray(new_from_old.apply(points)))
+    return pixels if np.all(visible) else None
+
+
+def roll_angle(lever_px: Float[np.ndarray, "2 2"]) -> float:
+    """Clockwise roll of the target's image, radians, from `lever_pixels`: Eq. 10 and the text after it."""
+    across, down = lever_px[1] - lever_px[0]
+    return float(np.arctan2(down, across))

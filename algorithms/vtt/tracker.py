@@ -1,6 +1,6 @@
 """The visual target tracker: the loop of section 4.1 and its states.
 
-The steps are functions of `target`, `pointing`, `matching`, `stereo`, `loss` and `handoff`. The state of a track is an
+The steps are functions of `pointing`, `matching`, `stereo`, `loss` and `accuracy`. The state of a track is an
 immutable `Track`; the tracker holds the latest one.
 """
 
@@ -21,21 +21,19 @@ from marsyard.algorithms.vtt.matching import (
     Matcher,
     Sighting,
     cut_patch,
+    designated_position_world,
     has_room,
+    lever_pixels,
+    magnification,
     match_by_correlation,
+    pose_change,
+    predicted_position,
+    roll_angle,
     search_window,
 )
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position
 from marsyard.algorithms.vtt.stereo import StereoMatch, epipolar_pixels, nearest_point, point_stereo, search_ranges
-from marsyard.algorithms.vtt.target import (
-    designated_position_world,
-    lever_pixels,
-    magnification,
-    pose_change,
-    predicted_position,
-    roll_angle,
-)
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import compose
 from marsyard.sim.measurements import MastCalibration, PixelTarget, RoverMeasurements, TargetDesignation

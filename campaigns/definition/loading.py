@@ -29,7 +29,7 @@ from marsyard.campaigns.definition.configuration import (
     read_tables,
 )
 from marsyard.campaigns.definition.former_names import use_current_names
-from marsyard.campaigns.definition.identity import list_algorithms
+from marsyard.campaigns.definition.identity import find_scenario, list_algorithms
 from marsyard.campaigns.definition.requirements import fill_requirements
 from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
 from marsyard.campaigns.sampling.design import MATRICES
@@ -90,7 +90,7 @@ def load_campaign(
     """
     path = find_campaign(name_or_path)
     tables = read_tables(path)
-    selected = _known_scenario(tables)
+    selected = find_scenario(tables.get("scenario"))
     if selected is not None:
         tables = use_current_names(tables, selected)
     overridden: dict[tuple[str, ...], str] = {}
@@ -131,7 +131,7 @@ def _select_algorithms(
 ) -> dict[str, Any]:
     """Tables with other algorithms; unchanged for an unknown scenario, which is reported later."""
     options = [f"--algorithm {spec}" for spec in algorithms]
-    selected = _known_scenario(tables)
+    selected = find_scenario(tables.get("scenario"))
     if selected is None:
         return tables
     if not isinstance(selected, HasAlgorithms):
@@ -146,20 +146,6 @@ def _select_algorithms(
             inner = {part: inner}
         tables = _apply_option(tables, inner, option, overridden)
     return tables
-
-
-def _find_scenario(tables: Mapping[str, Any]) -> Scenario | None:
-    """Scenario of a campaign's tables; None where they name none. Raises UnknownScenarioError."""
-    name = tables.get("scenario")
-    return scenario(name) if isinstance(name, str) and name else None
-
-
-def _known_scenario(tables: Mapping[str, Any]) -> Scenario | None:
-    """Scenario of a campaign's tables; None for an unknown one, which is reported later."""
-    try:
-        return _find_scenario(tables)
-    except UnknownScenarioError:
-        return None
 
 
 def _apply_option(
@@ -241,7 +227,8 @@ def _validate(where: str, tables: Mapping[str, Any], overridden: Mapping[tuple[s
         raise ConfigurationError(problems)
     configuration, selected, parameters = validated(CampaignConfiguration, tables), None, None
     try:
-        selected = _find_scenario(tables)
+        if isinstance(name := tables.get("scenario"), str) and name:
+            selected = scenario(name)
     except UnknownScenarioError as error:
         note([(("scenario",), str(error))])
     stated = tables.get("parameters", {})

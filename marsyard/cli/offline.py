@@ -9,35 +9,24 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
+from marsyard.cli import options
 from marsyard.cli.campaign import default_directory, make_executor, run_and_judge, shown_progress
-from marsyard.cli.options import (
-    CampaignArgument,
-    CasesOption,
-    ClusterOption,
-    Exit,
-    JobsOption,
-    OutOption,
-    SeedOption,
-    SetOption,
-    handle_user_errors,
-    size_text,
-)
 
 TruthOption = Annotated[
     Path | None, Option("--truth", metavar="TRUTH", help="Folder of the truth; by default DIR-truth next to DIR.")
 ]
 
 
-@handle_user_errors
+@options.handle_user_errors
 def export(
-    campaign: CampaignArgument,
+    campaign: options.CampaignArgument,
     out: Annotated[Path, Option("--out", metavar="DIR", help="Folder of the cases, without truth.")],
-    cases: CasesOption = None,
-    seed: SeedOption = None,
+    cases: options.CasesOption = None,
+    seed: options.SeedOption = None,
     truth: TruthOption = None,
-    jobs: JobsOption = None,
-    cluster: ClusterOption = None,
-    override: SetOption = None,
+    jobs: options.JobsOption = None,
+    cluster: options.ClusterOption = None,
+    override: options.SetOption = None,
 ) -> None:
     """Write a campaign's pictures, measurements and cameras for external algorithms; repeat the command to continue."""
     from marsyard.campaigns.definition.loading import load_campaign
@@ -63,17 +52,17 @@ def export(
     typer.echo(f"once they are answered: marsyard score {out} ANSWERS.csv")
     if crashed:
         typer.echo(f"{count(crashed, 'case')} could not be written; why: marsyard report {exported.truth}", err=True)
-        raise typer.Exit(Exit.FAILED)
+        raise typer.Exit(options.Exit.FAILED)
 
 
-@handle_user_errors
+@options.handle_user_errors
 def score(
     directory: Annotated[Path, Argument(metavar="DIR", help="Folder written by `marsyard export`.")],
     answers: Annotated[Path, Argument(metavar="ANSWERS", help="The answers, a .csv table.")],
     truth: TruthOption = None,
-    out: OutOption = None,
-    jobs: JobsOption = None,
-    cluster: ClusterOption = None,
+    out: options.OutOption = None,
+    jobs: options.JobsOption = None,
+    cluster: options.ClusterOption = None,
 ) -> None:
     """Score external answers: the scores, verdicts and report of a run."""
     from marsyard.campaigns.running.engine import Watch, run_campaign
@@ -96,15 +85,15 @@ def score(
     run_and_judge(target, run)
 
 
-@handle_user_errors
+@options.handle_user_errors
 def dataset(
-    campaign: CampaignArgument,
+    campaign: options.CampaignArgument,
     out: Annotated[Path, Option("--out", metavar="DIR", help="Folder of the shards.")],
-    cases: CasesOption = None,
-    seed: SeedOption = None,
+    cases: options.CasesOption = None,
+    seed: options.SeedOption = None,
     shard: Annotated[int, Option("--shard", metavar="N", min=1, help="Cases in a shard.")] = 50,
     jobs: Annotated[int, Option("--jobs", metavar="J", min=1, help="Worker processes.")] = 1,
-    override: SetOption = None,
+    override: options.SetOption = None,
 ) -> None:
     """Write pictures with range, normals, rock masks, hazard maps and poses as WebDataset shards; repeat to continue.
 
@@ -115,4 +104,4 @@ def dataset(
 
     shards = write_dataset(load_campaign(campaign, override or [], cases, seed), out, shard, jobs)
     total = sum(path.stat().st_size for path in shards)
-    typer.echo(f"{len(shards)} shards, {size_text(total)}: {out}")
+    typer.echo(f"{len(shards)} shards, {options.size_text(total)}: {out}")

@@ -67,13 +67,8 @@ class Shot:
         _check_name("camera", camera, PRESETS)
         stance = STANCES[camera]
         usual = {"scale": stance.scale, "altitude_m": stance.height_m, "elevation_deg": stance.elevation_deg}
-        usual |= {
-            "east_m": 0.0,
-            "north_m": 0.0,
-            "azimuth_deg": 0.0,
-            "sun_azimuth_deg": 250.0,
-            "sun_elevation_deg": 35.0,
-        }
+        usual |= dict.fromkeys(("east_m", "north_m", "azimuth_deg"), 0.0)
+        usual |= {"sun_azimuth_deg": 250.0, "sun_elevation_deg": 35.0}
         usual |= {"seed": 1, "max_hole_fraction": MAX_HOLE_FRACTION}
         given = {name: value for name, value in settings.items() if value is not None}
         if is_terrain_file(site):  # it lies in the middle of the periodic terrain

@@ -37,10 +37,8 @@ def list_sites(as_json: JsonOption = False) -> None:
     for heading in ("site", "planet", "terrain", "description"):
         table.add_column(heading)
     for one in sites().values():
-        planet, scales = (
-            one.environment.planet,
-            [name for name in ("descent", "ground") if getattr(one, name) is not None],
-        )
+        planet = one.environment.planet
+        scales = [name for name in ("descent", "ground") if getattr(one, name) is not None]
         rows.append({"name": one.name, "planet": planet, "terrain": scales, "description": one.description})
         table.add_row(one.name, planet, ", ".join(scales), one.description)
     if as_json:
