@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from marsyard.algorithms.arrays import Vector2
 from marsyard.algorithms.dimes.binning import (
     View,
     ground_lattice,
@@ -75,7 +76,7 @@ class PairMatch:
     - valid: Whether the match is accepted
     """
 
-    shift_px: Float[np.ndarray, "2"]
+    shift_px: Vector2
     score: float
     valid: bool
 
@@ -91,9 +92,7 @@ class BaselineDetails:
 Matcher = Callable[[PairPatches], PairMatch | None]
 
 
-def find_common_square(
-    first: View, second: View, options: CommonOptions
-) -> tuple[Float[np.ndarray, "2"], int, float] | None:
+def find_common_square(first: View, second: View, options: CommonOptions) -> tuple[Vector2, int, float] | None:
     """The largest square of ground in both views at zero motion: middle, side in pixels, ground sample distance.
 
     Sides run east and north. None if it is smaller than `min_side_px`.

@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from marsyard.algorithms.arrays import Flags, Points2, Raster, Vector2, Vector3
 from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
 from marsyard.algorithms.image.kernels import cubic as kernels
 from marsyard.sim.camera import CameraModel
@@ -46,10 +47,10 @@ class View:
     - rows_summed: Physical rows in one row of `signal`, on the chip and by software together
     """
 
-    signal: Float[np.ndarray, "rows columns"]
-    flat_field: Float[np.ndarray, "rows columns"]
+    signal: Raster
+    flat_field: Raster
     camera: CameraModel
-    centre: Float[np.ndarray, "3"]
+    centre: Vector3
     time_s: float
     calibration: DetectorCalibration
     rows_summed: int
@@ -73,17 +74,13 @@ def bin_factors(shape: tuple[int, int], binned_size: tuple[int, int]) -> tuple[i
     return columns // binned_size[0], rows // binned_size[1]
 
 
-def bin_mean(
-    image: Float[np.ndarray, "rows columns"], columns: int, rows: int
-) -> Float[np.ndarray, "binned_rows binned_columns"]:
+def bin_mean(image: Raster, columns: int, rows: int) -> Float[np.ndarray, "binned_rows binned_columns"]:
     """Averages over blocks of `columns` x `rows` pixels, which divide the image."""
     size = (image.shape[1] // columns, image.shape[0] // rows)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
-def place_camera(
-    camera: CameraModel, world_from_body: Rotation, altitude_m: float
-) -> tuple[CameraModel, Float[np.ndarray, "3"]]:
+def place_camera(camera: CameraModel, world_from_body: Rotation, altitude_m: float) -> tuple[CameraModel, Vector3]:
     """A body's camera in a view's ground frame by attitude and altitude, and its position there.
 
     The altitude is that of the body's origin; the camera's height follows from its lever arm.
@@ -150,9 +147,7 @@ def usable_views(measurements: DescentMeasurements, binned_size: tuple[int, int]
     return (views[0], views[1], views[2]) if in_range else None
 
 
-def ground_from_pixels(
-    view: View, pixels: Float[np.ndarray, "n 2"], max_off_nadir_rad: float
-) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
+def ground_from_pixels(view: View, pixels: Points2, max_off_nadir_rad: float) -> tuple[Points2, Flags]:
     """Intersections of the rays of pixels (u, v) with the ground: (east, north) in the ground frame, metres.
 
     A ray further from the nadir than `max_off_nadir_rad` is bent down to that angle in its azimuth, which bounds the
@@ -195,14 +190,14 @@ def pixel_angle_rad(view: View) -> float:
     return float(np.linalg.norm(directions[[1, 3]] - directions[[0, 2]], axis=1).mean())
 
 
-def square(half_m: float, per_side: int) -> Float[np.ndarray, "n 2"]:
+def square(half_m: float, per_side: int) -> Points2:
     """A lattice of `per_side` x `per_side` points (east, north) over a square of half side `half_m`."""
     steps = np.linspace(-half_m, half_m, per_side)
     east, north = np.meshgrid(steps, steps)
     return np.column_stack([east.ravel(), north.ravel()])
 
 
-def square_outline(half_m: float, per_side: int) -> Float[np.ndarray, "n 2"]:
+def square_outline(half_m: float, per_side: int) -> Points2:
     """The points of `square` on its outline."""
     points = square(half_m, per_side)
     return np.asarray(points[np.abs(points).max(axis=1) == half_m])
@@ -222,7 +217,7 @@ def correct_patch(view: View, rows: slice, columns: slice) -> Float[np.ndarray, 
 SPLINE_MARGIN = 10
 
 
-def ground_lattice(centre: Float[np.ndarray, "2"], side_px: int, gsd_m: float) -> Float[np.ndarray, "side side 2"]:
+def ground_lattice(centre: Vector2, side_px: int, gsd_m: float) -> Float[np.ndarray, "side side 2"]:
     """Ground points (east, north) of the pixels of a square patch about `centre`, metres."""
     steps = (np.arange(side_px) - 0.5 * (side_px - 1)) * gsd_m
     lattice = np.empty((side_px, side_px, 2))
@@ -237,9 +232,7 @@ def _pixel_range(smallest: float, largest: float, size: int) -> slice:
     return slice(min(low, size - 1), max(high, 1))
 
 
-def rectify_patch(
-    view: View, centre: Float[np.ndarray, "2"], side_px: int, gsd_m: float
-) -> Float[np.ndarray, "side side"]:
+def rectify_patch(view: View, centre: Vector2, side_px: int, gsd_m: float) -> Float[np.ndarray, "side side"]:
     """The corrected patch of `side_px` pixels about the ground point `centre` (east, north), counts.
 
     Points outside the image take its border value, invisible points that of the upper left corner; candidates exclude

@@ -7,6 +7,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
+from marsyard.algorithms.arrays import Patch, Vector2, Vector3
 from marsyard.algorithms.dimes.binning import View, pixels_from_ground, rectify_patch, usable_views
 from marsyard.algorithms.dimes.details import DimesDetails, PairDetails, Track
 from marsyard.algorithms.dimes.options import DimesOptions
@@ -26,12 +27,12 @@ from marsyard.sim.measurements import DescentMeasurements
 
 
 def match_corner(
-    template: Float[np.ndarray, "n n"],
+    template: Patch,
     window: Float[np.ndarray, "w w"],
     surface: Float[np.ndarray, "s s"],
     peak: Peak,
     options: DimesOptions,
-) -> Float[np.ndarray, "2"]:
+) -> Vector2:
     """Row and column in the window of the matched template's upper left pixel, refined as the options require."""
     whole = np.array([peak.row, peak.column], dtype=np.float64)
     if not options.subpixel:
@@ -41,7 +42,7 @@ def match_corner(
     return start if aligned is None else aligned
 
 
-def camera_displacement(corner: Float[np.ndarray, "2"], geometry: SearchGeometry) -> Float[np.ndarray, "2"]:
+def camera_displacement(corner: Vector2, geometry: SearchGeometry) -> Vector2:
     """Horizontal displacement (east, north) of the camera between the images, metres.
 
     A ground point at r1 from the first nadir point and r2 from the second means a displacement of r1 - r2. The
@@ -52,9 +53,7 @@ def camera_displacement(corner: Float[np.ndarray, "2"], geometry: SearchGeometry
     return np.asarray(geometry.gsd_m * np.array([-shift[1], shift[0]]))
 
 
-def track_pair(
-    pair: int, first: View, second: View, sun_direction: Float[np.ndarray, "3"], options: DimesOptions
-) -> PairDetails:
+def track_pair(pair: int, first: View, second: View, sun_direction: Vector3, options: DimesOptions) -> PairDetails:
     """Select and track the templates of one pair of views."""
     geometry = search_geometry(first, second, options)
     candidates = template_candidates(first, second, geometry, sun_direction, options)

@@ -12,9 +12,9 @@ from dataclasses import replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.algorithms.arrays import Points2, Points3, Vector3
 from marsyard.algorithms.hda.details import Ground, HdaDetails
 from marsyard.algorithms.hda.hazards import (
     Resolution,
@@ -101,9 +101,7 @@ def _unconverged(outcome: SiteOutcome, scene: LandingScene, details: HdaDetails)
     return SiteEstimate(outcome, scene.apriori_site_world, details)
 
 
-def expected_pixels(
-    scene: LandingScene, features: Float[np.ndarray, "n 2"], options: HdaOptions
-) -> Float[np.ndarray, "n 2"]:
+def expected_pixels(scene: LandingScene, features: Points2, options: HdaOptions) -> Points2:
     """Expected pixels of the features in the second image."""
     if options.track_seed is TrackSeed.NOTHING:
         return features
@@ -147,9 +145,7 @@ def matched_structure(scene: LandingScene, motion: Motion, options: HdaOptions) 
 PLANE_TRIALS = 200
 
 
-def up_direction(
-    first: View, up_camera: Float[np.ndarray, "3"], points: Float[np.ndarray, "n 3"], options: HdaOptions
-) -> Float[np.ndarray, "3"]:
+def up_direction(first: View, up_camera: Vector3, points: Points3, options: HdaOptions) -> Vector3:
     """Unit vector upwards in the first camera's frame, from the source in the options.
 
     `up_camera` is the inclinometers' measurement, `points` are in the first camera's frame.
@@ -161,7 +157,7 @@ def up_direction(
     return plane_normal(points, options.seed)
 
 
-def plane_normal(points: Float[np.ndarray, "n 3"], seed: int) -> Float[np.ndarray, "3"]:
+def plane_normal(points: Points3, seed: int) -> Vector3:
     """Unit normal, towards the origin, of the least-median-of-squares plane through at least four points.
 
     The best of planes through random triples, refined by least squares over the points within 2.5 standard deviations
@@ -183,7 +179,7 @@ def plane_normal(points: Float[np.ndarray, "n 3"], seed: int) -> Float[np.ndarra
     return np.asarray(-np.sign(normal @ points.mean(axis=0)) * normal)
 
 
-def surface_from_camera(up_camera: Float[np.ndarray, "3"]) -> Rotation:
+def surface_from_camera(up_camera: Vector3) -> Rotation:
     """The rotation from the camera's frame to the surface frame; up must not be parallel to the columns."""
     x = np.array([1.0, 0.0, 0.0]) - up_camera[0] * up_camera
     x /= np.linalg.norm(x)
@@ -197,7 +193,7 @@ def world_from_surface(world_from_camera: Rotation, surface_from_first: Rotation
 
 
 def map_ground(
-    scene: LandingScene, points_camera: Float[np.ndarray, "n 3"], resolution: Resolution, options: HdaOptions
+    scene: LandingScene, points_camera: Points3, resolution: Resolution, options: HdaOptions
 ) -> Ground | None:
     """The maps of points in the first camera's frame, and the site; None if the points cover no area."""
     first = scene.views[0]
@@ -217,7 +213,7 @@ def map_ground(
     )
 
 
-def site_world(scene: LandingScene, ground: Ground) -> Float[np.ndarray, "3"] | None:
+def site_world(scene: LandingScene, ground: Ground) -> Vector3 | None:
     """The site in the world frame, metres, on the smooth surface; None if no cell is safe."""
     if ground.site_cell is None:
         return None

@@ -10,9 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt16
+from jaxtyping import UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.algorithms.arrays import Flags, Points2, Points3, Values, Vector3
 from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
@@ -72,23 +73,21 @@ def camera_pose(camera: CameraModel) -> RigidTransform:
     return rigid(Rotation.from_matrix(axes), np.array(camera.c))
 
 
-def undistort(camera: CameraModel, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+def undistort(camera: CameraModel, pixels: Points2) -> Points2:
     """Unit focal length coordinates of pixels; NaN without a forward ray."""
     directions = camera.rays(pixels)[1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        places: Float[np.ndarray, "n 2"] = directions[:, :2] / directions[:, 2:]
+        places: Points2 = directions[:, :2] / directions[:, 2:]
     places[~(directions[:, 2] > 0.0)] = np.nan
     return places
 
 
-def points_at_depth(places: Float[np.ndarray, "n 2"], depths: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+def points_at_depth(places: Points2, depths: Values) -> Points3:
     """Points (camera frame) of undistorted coordinates at depths (Eq. 6)."""
     return np.asarray(np.column_stack([places, np.ones(len(places))]) * depths[:, None])
 
 
-def project_points(
-    camera: CameraModel, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
+def project_points(camera: CameraModel, points: Points3) -> tuple[Points2, Flags]:
     """Pixels of points in the camera frame and whether they lie in the picture."""
     pixels, visible = camera.project(points)
     return pixels, visible & camera.in_frame(pixels)
@@ -105,8 +104,8 @@ class LandingScene:
 
     views: tuple[View, View]
     range_m: float
-    up_camera: Float[np.ndarray, "3"]
-    apriori_site_world: Float[np.ndarray, "3"]
+    up_camera: Vector3
+    apriori_site_world: Vector3
 
     @property
     def second_from_first(self) -> RigidTransform:

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float, UInt16
 from scipy.spatial.transform import RigidTransform
 
+from marsyard.algorithms.arrays import Counts, Patch, Vector2, Vector3
 from marsyard.algorithms.interface import MastAim, TargetLoss, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt.loss import Evidence, Journey, Tolerances, find_losses, next_state, tolerances
 from marsyard.algorithms.vtt.matching import (
@@ -60,17 +60,17 @@ class VttDetails:
     """
 
     seeded: bool
-    predicted_pixel: Float[np.ndarray, "2"] | None
-    window: UInt16[np.ndarray, "rows columns"] | None = None
+    predicted_pixel: Vector2 | None
+    window: Counts | None = None
     window_corner: tuple[int, int] | None = None
     change: Change | None = None
     match: Match | None = None
-    template: Float[np.ndarray, "n n"] | None = None
+    template: Patch | None = None
     stereo: StereoMatch | None = None
     distance_m: float = float("nan")
     azimuth_rad: float = float("nan")
     azimuth_change_rad: float = 0.0
-    position_world: Float[np.ndarray, "3"] | None = None
+    position_world: Vector3 | None = None
     step_m: float = 0.0
     evidence: Evidence | None = None
     allowed: Tolerances | None = None
@@ -89,12 +89,12 @@ class Track:
     - driven_m: Estimated path length of the rover since the seed
     """
 
-    designated: PixelTarget | Float[np.ndarray, "3"]
+    designated: PixelTarget | Vector3
     world_from_rover: RigidTransform
     state: TrackingState = TrackingState.NORMAL
     lost_updates: int = 0
     sighting: Sighting | None = None
-    seed_world: Float[np.ndarray, "3"] | None = None
+    seed_world: Vector3 | None = None
     seed_distance_m: float = float("nan")
     driven_m: float = 0.0
 
@@ -161,7 +161,7 @@ class Finding:
 
     losses: tuple[TargetLoss, ...]
     details: VttDetails
-    position_rover: Float[np.ndarray, "3"] | None = None
+    position_rover: Vector3 | None = None
     sighting: Sighting | None = None
 
 
@@ -190,12 +190,12 @@ class Stop:
         """The right camera."""
         return self.measurements.mast.right
 
-    def distance_m(self, position_head: Float[np.ndarray, "3"]) -> float:
+    def distance_m(self, position_head: Vector3) -> float:
         """From the left camera's centre."""
         return float(np.linalg.norm(position_head - self.left.c))
 
 
-def expected_position(track: Track, world_from_frame: RigidTransform) -> Float[np.ndarray, "3"] | None:
+def expected_position(track: Track, world_from_frame: RigidTransform) -> Vector3 | None:
     """Predicted target position in a frame of this pose (rover or head); None for a pixel target before the seed."""
     if track.sighting is not None:
         last = track.sighting
@@ -254,12 +254,7 @@ def follow_track(
 
 
 def triangulate_target(
-    stop: Stop,
-    pixel: Float[np.ndarray, "2"],
-    template: Float[np.ndarray, "n n"],
-    ranges_m: tuple[float, float],
-    details: VttDetails,
-    options: VttOptions,
+    stop: Stop, pixel: Vector2, template: Patch, ranges_m: tuple[float, float], details: VttDetails, options: VttOptions
 ) -> Finding:
     """Triangulate the target from its left pixel by point stereo over these ranges."""
     sight = stop.left.rays(pixel)

@@ -90,9 +90,9 @@ def list_campaigns(as_json: JsonOption = False) -> None:
 def show(
     campaign: CampaignArgument,
     override: SetOption = None,
-    draw: Annotated[int | None, Option("--draw", metavar="N", help="Show the draws of the first N cases.")] = None,
+    draw: Annotated[int | None, Option(metavar="N", help="Show the draws of the first N cases.")] = None,
     figure: Annotated[
-        Path | None, Option("--figure", metavar="FILE", help="With --draw: write marginals and pairs as .svg or .png.")
+        Path | None, Option(metavar="FILE", help="With --draw: write marginals and pairs as .svg or .png.")
     ] = None,
     as_json: Annotated[bool, Option("--json", help="Print JSON, with all draws.")] = False,
 ) -> None:

@@ -129,7 +129,7 @@ def replay(
     directory: options.DirectoryArgument,
     case: Annotated[int, Argument(metavar="CASE", help="Number of the case, from 0.")],
     out: Annotated[
-        Path | None, Option("--out", metavar="DIR", help="Folder of its products; by default DIR/cases/CASE.")
+        Path | None, Option(metavar="DIR", help="Folder of its products; by default DIR/cases/CASE.")
     ] = None,
     save_stages: Annotated[bool, Option("--save-stages", help="Also write each stage's product into stages/.")] = False,
 ) -> None:

@@ -30,25 +30,15 @@ class NewOptions:
     """Arguments and options of `marsyard new`."""
 
     name: Annotated[str, Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")]
-    system: Annotated[
-        str | None, Option("--system", help="System under test, such as velocity; a wrong name lists all.")
-    ] = None
-    site: Annotated[str | None, Option("--site", help="One of `marsyard terrain list`.")] = None
-    camera: Annotated[
-        str | None, Option("--camera", metavar="FILE", help="Custom camera file (docs/custom-worlds.md).")
-    ] = None
-    detector: Annotated[str | None, Option("--detector", metavar="FILE", help="Custom detector datasheet in TOML.")] = (
-        None
-    )
-    flight: Annotated[
-        str | None, Option("--flight", metavar="FILE", help="Trajectory file in place of the dynamics.")
-    ] = None
-    axes: Annotated[str, Option("--axes", help="World axes of the trajectory: enu or ned.")] = "enu"
-    bound: Annotated[
-        float | None, Option("--bound", metavar="X", help="Requirement: maximum error or minimum fraction.")
-    ] = None
+    system: Annotated[str | None, Option(help="System under test, such as velocity; a wrong name lists all.")] = None
+    site: Annotated[str | None, Option(help="One of `marsyard terrain list`.")] = None
+    camera: Annotated[str | None, Option(metavar="FILE", help="Custom camera file (docs/custom-worlds.md).")] = None
+    detector: Annotated[str | None, Option(metavar="FILE", help="Custom detector datasheet in TOML.")] = None
+    flight: Annotated[str | None, Option(metavar="FILE", help="Trajectory file in place of the dynamics.")] = None
+    axes: Annotated[str, Option(help="World axes of the trajectory: enu or ned.")] = "enu"
+    bound: Annotated[float | None, Option(metavar="X", help="Requirement: maximum error or minimum fraction.")] = None
     cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24
-    out: Annotated[Path | None, Option("--out", metavar="FILE", help="Instead of NAME.toml.")] = None
+    out: Annotated[Path | None, Option(metavar="FILE", help="Instead of NAME.toml.")] = None
     overwrite: OverwriteOption = False
 
 
@@ -164,8 +154,8 @@ def ingest(
     folder: Annotated[
         Path, Argument(metavar="FOLDER", help="ingest.toml, pictures.csv and pictures (docs/real-pictures.md).")
     ],
-    out: Annotated[Path, Option("--out", metavar="DIR", help="New folder of the cases and their campaign.")],
-    system: Annotated[str | None, Option("--system", help="System of the cases; by default real pictures.")] = None,
+    out: Annotated[Path, Option(metavar="DIR", help="New folder of the cases and their campaign.")],
+    system: Annotated[str | None, Option(help="System of the cases; by default real pictures.")] = None,
 ) -> None:
     """Make a campaign of real cases from pictures with measured attitude and altitude."""
     from marsyard.campaigns.definition.loading import load_campaign

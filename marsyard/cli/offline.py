@@ -13,14 +13,14 @@ from marsyard.cli import options
 from marsyard.cli.campaign import default_directory, make_executor, run_and_judge, shown_progress
 
 TruthOption = Annotated[
-    Path | None, Option("--truth", metavar="TRUTH", help="Folder of the truth; by default DIR-truth next to DIR.")
+    Path | None, Option(metavar="TRUTH", help="Folder of the truth; by default DIR-truth next to DIR.")
 ]
 
 
 @options.handle_user_errors
 def export(
     campaign: options.CampaignArgument,
-    out: Annotated[Path, Option("--out", metavar="DIR", help="Folder of the cases, without truth.")],
+    out: Annotated[Path, Option(metavar="DIR", help="Folder of the cases, without truth.")],
     cases: options.CasesOption = None,
     seed: options.SeedOption = None,
     truth: TruthOption = None,
@@ -88,11 +88,11 @@ def score(
 @options.handle_user_errors
 def dataset(
     campaign: options.CampaignArgument,
-    out: Annotated[Path, Option("--out", metavar="DIR", help="Folder of the shards.")],
+    out: Annotated[Path, Option(metavar="DIR", help="Folder of the shards.")],
     cases: options.CasesOption = None,
     seed: options.SeedOption = None,
-    shard: Annotated[int, Option("--shard", metavar="N", min=1, help="Cases in a shard.")] = 50,
-    jobs: Annotated[int, Option("--jobs", metavar="J", min=1, help="Worker processes.")] = 1,
+    shard: Annotated[int, Option(metavar="N", min=1, help="Cases in a shard.")] = 50,
+    jobs: Annotated[int, Option(metavar="J", min=1, help="Worker processes.")] = 1,
     override: options.SetOption = None,
 ) -> None:
     """Write pictures with range, normals, rock masks, hazard maps and poses as WebDataset shards; repeat to continue.

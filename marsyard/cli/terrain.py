@@ -50,15 +50,11 @@ def list_sites(as_json: JsonOption = False) -> None:
 @app.command()
 def stats(
     site: SiteArgument,
-    scale: Annotated[
-        str | None, Option("--scale", metavar="SCALE", help="descent or ground; by default the coarser one.")
-    ] = None,
-    seed: Annotated[int, Option("--seed", metavar="S", min=0, help="Seed of the terrain.")] = 1,
+    scale: Annotated[str | None, Option(metavar="SCALE", help="descent or ground; by default the coarser one.")] = None,
+    seed: Annotated[int, Option(metavar="S", min=0, help="Seed of the terrain.")] = 1,
     as_json: JsonOption = False,
     max_holes: MaxHolesOption = None,
-    picture: Annotated[
-        Path | None, Option("--picture", metavar="PNG", help="Write a nadir picture; filled holes are red.")
-    ] = None,
+    picture: Annotated[Path | None, Option(metavar="PNG", help="Write a nadir picture; filled holes are red.")] = None,
 ) -> None:
     """Print albedo, slopes, relief and image contrast of a site's terrain next to the paper's figures."""
     import numpy as np
