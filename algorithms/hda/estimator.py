@@ -15,15 +15,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.arrays import Points2, Points3, Vector3
+from marsyard.algorithms.hda import hazards
 from marsyard.algorithms.hda.details import Ground, HdaDetails
-from marsyard.algorithms.hda.hazards import (
-    Resolution,
-    check_footprints,
-    elevation_map,
-    hazard_maps,
-    map_resolution,
-    safe_site,
-)
 from marsyard.algorithms.hda.motion import Motion, estimate_motion, plane_depths
 from marsyard.algorithms.hda.options import HdaOptions, SurfaceFrame, TrackSeed
 from marsyard.algorithms.hda.structure import Matches, dense_structure, scale_factor
@@ -87,7 +80,7 @@ def find_site(
     details = details.ended(matches=matches)
     if len(matches.points) < options.min_points:
         return _unconverged(SiteOutcome.NO_STRUCTURE, scene, details)
-    resolution = map_resolution(motion, scene.views[0].focal_px, options)
+    resolution = hazards.map_resolution(motion, scene.views[0].focal_px, options)
     ground = map_ground(scene, matches.points, resolution, options)
     if ground is None:
         return _unconverged(SiteOutcome.NO_STRUCTURE, scene, details)
@@ -113,10 +106,8 @@ def expected_pixels(scene: LandingScene, features: Points2, options: HdaOptions)
 
 def motion_from_tracks(scene: LandingScene, tracks: Tracks, options: HdaOptions) -> Motion:
     """The motion by robust least squares: the better of the starts from the on-board poses and from rest."""
-    first, second = (
-        undistort(one.camera, pixels[tracks.accepted])
-        for one, pixels in zip(scene.views, (tracks.first, tracks.second), strict=True)
-    )
+    accepted = (tracks.first[tracks.accepted], tracks.second[tracks.accepted])
+    first, second = (undistort(one.camera, pixels) for one, pixels in zip(scene.views, accepted, strict=True))
     depths = plane_depths(first, scene.range_m, scene.up_camera)
     starts: tuple[RigidTransform, ...] = (scene.second_from_first, rigid(Rotation.identity(), np.zeros(3)))
     return estimate_motion(first, second, scene.views[1].focal_px, depths, starts, options)
@@ -193,24 +184,23 @@ def world_from_surface(world_from_camera: Rotation, surface_from_first: Rotation
 
 
 def map_ground(
-    scene: LandingScene, points_camera: Points3, resolution: Resolution, options: HdaOptions
+    scene: LandingScene, points_camera: Points3, resolution: hazards.Resolution, options: HdaOptions
 ) -> Ground | None:
     """The maps of points in the first camera's frame, and the site; None if the points cover no area."""
     first = scene.views[0]
     to_surface = surface_from_camera(up_direction(first, scene.up_camera, points_camera, options))
     points = to_surface.apply(points_camera)
-    elevation = elevation_map(points)
+    elevation = hazards.elevation_map(points)
     if elevation is None:
         return None
-    hazards = hazard_maps(elevation, options)
+    maps = hazards.hazard_maps(elevation, options)
     if options.check_footprints:
-        hazards = replace(hazards, safety=check_footprints(hazards.safety, elevation, resolution, options))
+        maps = replace(maps, safety=hazards.check_footprints(maps.safety, elevation, resolution, options))
     to_world = world_from_surface(first.world_from_camera.rotation, to_surface)
     apriori = to_world.inv().apply(scene.apriori_site_world - first.world_from_camera.translation)
     apriori_cell = elevation.cells(apriori[:2])
-    return Ground(
-        to_surface, to_world, points, elevation, hazards, apriori_cell, safe_site(hazards.safety, apriori_cell)
-    )
+    site_cell = hazards.safe_site(maps.safety, apriori_cell)
+    return Ground(to_surface, to_world, points, elevation, maps, apriori_cell, site_cell)
 
 
 def site_world(scene: LandingScene, ground: Ground) -> Vector3 | None:
