@@ -33,3 +33,8 @@ class AlgorithmError(Exception):
 
     def __reduce__(self) -> tuple[type[AlgorithmError], tuple[Fault, str, str]]:
         return type(self), (self.fault, str(self), self.stderr)
+
+
+def bad_answer(message: str) -> AlgorithmError:
+    """The error for an answer of the wrong form."""
+    return AlgorithmError(Fault.BAD_ANSWER, message)

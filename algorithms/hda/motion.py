@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.algorithms.arrays import Flags, Points2, Values, Vector3
 from marsyard.algorithms.hda.kernels import motion as kernels
 from marsyard.algorithms.hda.options import HdaOptions
 from marsyard.sim.frames import rigid
@@ -39,9 +39,9 @@ class Motion:
     """
 
     second_from_first: RigidTransform
-    depths: Float[np.ndarray, "n"]
-    residuals_px: Float[np.ndarray, "n"]
-    inliers: Bool[np.ndarray, "n"]
+    depths: Values
+    residuals_px: Values
+    inliers: Flags
     parallax_px: float
     converged: bool
 
@@ -57,9 +57,7 @@ class Motion:
         return float(depths.min()), float(depths.max())
 
 
-def plane_depths(
-    places: Float[np.ndarray, "n 2"], range_m: float, up_camera: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "n"]:
+def plane_depths(places: Points2, range_m: float, up_camera: Vector3) -> Values:
     """Depths of level ground that the optical axis meets at `range_m`; the range itself for implausible depths."""
     toward = np.column_stack([places, np.ones(len(places))]) @ up_camera
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -68,10 +66,10 @@ def plane_depths(
 
 
 def estimate_motion(
-    first: Float[np.ndarray, "n 2"],
-    second: Float[np.ndarray, "n 2"],
+    first: Points2,
+    second: Points2,
     focal_px: float,
-    depths: Float[np.ndarray, "n"],
+    depths: Values,
     starts: tuple[RigidTransform, ...],
     options: HdaOptions,
 ) -> Motion:
@@ -100,11 +98,11 @@ def estimate_motion(
 
 
 def assess_motion(
-    first: Float[np.ndarray, "n 2"],
-    second: Float[np.ndarray, "n 2"],
+    first: Points2,
+    second: Points2,
     focal_px: float,
     second_from_first: RigidTransform,
-    depths: Float[np.ndarray, "n"],
+    depths: Values,
     converged: bool,
     options: HdaOptions,
 ) -> Motion:
@@ -112,10 +110,8 @@ def assess_motion(
     quaternion = second_from_first.rotation.as_quat(scalar_first=True)
     inverse = 1.0 / depths
     unmatched = kernels.Matches(first, np.zeros_like(first), focal_px, 1.0)
-    still, moved = (
-        kernels.residuals(unmatched, kernels.Motion(quaternion, translation, inverse))
-        for translation in (np.zeros(3), np.array(second_from_first.translation))
-    )
+    shifts = (np.zeros(3), np.array(second_from_first.translation))
+    still, moved = (kernels.residuals(unmatched, kernels.Motion(quaternion, one, inverse)) for one in shifts)
     residuals = np.hypot(*(moved - focal_px * second).T)
     fitting = residuals <= options.max_residual_px
     return Motion(
@@ -128,9 +124,7 @@ def assess_motion(
     )
 
 
-def _has_plausible_depth(
-    first: Float[np.ndarray, "n 2"], inverse: Float[np.ndarray, "n"], fitting: Bool[np.ndarray, "n"]
-) -> Bool[np.ndarray, "n"]:
+def _has_plausible_depth(first: Points2, inverse: Values, fitting: Flags) -> Flags:
     """Whether an inverse depth is near that of the ground plane, linear in undistorted coordinates.
 
     A wrong match along the epipolar line fits any motion and shows in its depth alone.

@@ -10,9 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt16
+from jaxtyping import UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.algorithms.arrays import Flags, Points2, Points3, Values, Vector3
 from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
@@ -41,14 +42,17 @@ class View:
         return float(np.mean(self.camera.focal_lengths))
 
 
+#: The two images of an estimate.
+Views = tuple[View, View]
+
+
 def build_view(image: DetectorImage, pose: PoseMeasurement) -> View:
     """The view of an image taken at a pose. Raises ValueError if the image's size is not its camera's."""
     if image.counts.shape != image.camera.size[::-1]:
         raise ValueError(f"the picture has (rows, columns) {image.counts.shape}, its camera {image.camera.size[::-1]}")
     body_from_camera = camera_pose(image.camera)
-    return View(
-        flat_fielded(image), image.camera.moved(body_from_camera.inv()), pose.world_from_body * body_from_camera
-    )
+    camera = image.camera.moved(body_from_camera.inv())
+    return View(flat_fielded(image), camera, pose.world_from_body * body_from_camera)
 
 
 def flat_fielded(image: DetectorImage) -> UInt16[np.ndarray, "rows columns"]:
@@ -72,23 +76,21 @@ def camera_pose(camera: CameraModel) -> RigidTransform:
     return rigid(Rotation.from_matrix(axes), np.array(camera.c))
 
 
-def undistort(camera: CameraModel, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+def undistort(camera: CameraModel, pixels: Points2) -> Points2:
     """Unit focal length coordinates of pixels; NaN without a forward ray."""
     directions = camera.rays(pixels)[1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        places: Float[np.ndarray, "n 2"] = directions[:, :2] / directions[:, 2:]
+        places: Points2 = directions[:, :2] / directions[:, 2:]
     places[~(directions[:, 2] > 0.0)] = np.nan
     return places
 
 
-def points_at_depth(places: Float[np.ndarray, "n 2"], depths: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+def points_at_depth(places: Points2, depths: Values) -> Points3:
     """Points (camera frame) of undistorted coordinates at depths (Eq. 6)."""
     return np.asarray(np.column_stack([places, np.ones(len(places))]) * depths[:, None])
 
 
-def project_points(
-    camera: CameraModel, points: Float[np.ndarray, "n 3"]
-) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
+def project_points(camera: CameraModel, points: Points3) -> tuple[Points2, Flags]:
     """Pixels of points in the camera frame and whether they lie in the picture."""
     pixels, visible = camera.project(points)
     return pixels, visible & camera.in_frame(pixels)
@@ -103,10 +105,10 @@ class LandingScene:
     - apriori_site_world: Default landing site
     """
 
-    views: tuple[View, View]
+    views: Views
     range_m: float
-    up_camera: Float[np.ndarray, "3"]
-    apriori_site_world: Float[np.ndarray, "3"]
+    up_camera: Vector3
+    apriori_site_world: Vector3
 
     @property
     def second_from_first(self) -> RigidTransform:
@@ -116,9 +118,8 @@ class LandingScene:
 
 def build_scene(measurements: LandingMeasurements) -> LandingScene:
     """Transform the measurements to the cameras' frames. Raises ValueError if an image's size is not its camera's."""
-    first, second = (
-        build_view(image, pose) for image, pose in zip(measurements.images, measurements.poses, strict=True)
-    )
+    pairs = zip(measurements.images, measurements.poses, strict=True)
+    first, second = (build_view(image, pose) for image, pose in pairs)
     body_from_camera = camera_pose(measurements.images[0].camera)
     up_camera = body_from_camera.rotation.inv().apply(np.array(measurements.up_body))
     return LandingScene((first, second), measurements.slant_range_m, up_camera, measurements.apriori_site_world)

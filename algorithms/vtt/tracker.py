@@ -1,6 +1,6 @@
 """The visual target tracker: the loop of section 4.1 and its states.
 
-The steps are functions of `target`, `pointing`, `matching`, `stereo`, `loss` and `handoff`. The state of a track is an
+The steps are functions of `pointing`, `matching`, `stereo`, `loss` and `accuracy`. The state of a track is an
 immutable `Track`; the tracker holds the latest one.
 """
 
@@ -10,32 +10,15 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float, UInt16
 from scipy.spatial.transform import RigidTransform
 
+from marsyard.algorithms.arrays import Counts, Patch, Vector2, Vector3
 from marsyard.algorithms.interface import MastAim, TargetLoss, TargetUpdate, TrackingState
+from marsyard.algorithms.vtt import matching
 from marsyard.algorithms.vtt.loss import Evidence, Journey, Tolerances, find_losses, next_state, tolerances
-from marsyard.algorithms.vtt.matching import (
-    Change,
-    Match,
-    Matcher,
-    Sighting,
-    cut_patch,
-    has_room,
-    match_by_correlation,
-    search_window,
-)
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position
 from marsyard.algorithms.vtt.stereo import StereoMatch, epipolar_pixels, nearest_point, point_stereo, search_ranges
-from marsyard.algorithms.vtt.target import (
-    designated_position_world,
-    lever_pixels,
-    magnification,
-    pose_change,
-    predicted_position,
-    roll_angle,
-)
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import compose
 from marsyard.sim.measurements import MastCalibration, PixelTarget, RoverMeasurements, TargetDesignation
@@ -62,17 +45,17 @@ class VttDetails:
     """
 
     seeded: bool
-    predicted_pixel: Float[np.ndarray, "2"] | None
-    window: UInt16[np.ndarray, "rows columns"] | None = None
+    predicted_pixel: Vector2 | None
+    window: Counts | None = None
     window_corner: tuple[int, int] | None = None
-    change: Change | None = None
-    match: Match | None = None
-    template: Float[np.ndarray, "n n"] | None = None
+    change: matching.Change | None = None
+    match: matching.Match | None = None
+    template: Patch | None = None
     stereo: StereoMatch | None = None
     distance_m: float = float("nan")
     azimuth_rad: float = float("nan")
     azimuth_change_rad: float = 0.0
-    position_world: Float[np.ndarray, "3"] | None = None
+    position_world: Vector3 | None = None
     step_m: float = 0.0
     evidence: Evidence | None = None
     allowed: Tolerances | None = None
@@ -91,12 +74,12 @@ class Track:
     - driven_m: Estimated path length of the rover since the seed
     """
 
-    designated: PixelTarget | Float[np.ndarray, "3"]
+    designated: PixelTarget | Vector3
     world_from_rover: RigidTransform
     state: TrackingState = TrackingState.NORMAL
     lost_updates: int = 0
-    sighting: Sighting | None = None
-    seed_world: Float[np.ndarray, "3"] | None = None
+    sighting: matching.Sighting | None = None
+    seed_world: Vector3 | None = None
     seed_distance_m: float = float("nan")
     driven_m: float = 0.0
 
@@ -109,7 +92,9 @@ class VisualTargetTracker:
     `marsyard.algorithms.vtt.lucas_kanade`).
     """
 
-    def __init__(self, options: VttOptions | None = None, matcher: Matcher = match_by_correlation) -> None:
+    def __init__(
+        self, options: VttOptions | None = None, matcher: matching.Matcher = matching.match_by_correlation
+    ) -> None:
         self.options = VttOptions() if options is None else options
         self.matcher = matcher
         self.track: Track | None = None
@@ -124,7 +109,7 @@ class VisualTargetTracker:
         if isinstance(target, PixelTarget):
             self.track = Track(target, world_from_rover)
         else:
-            self.track = Track(designated_position_world(target, world_from_rover), world_from_rover)
+            self.track = Track(matching.designated_position_world(target, world_from_rover), world_from_rover)
 
     def clear(self) -> None:
         """Clear the target."""
@@ -163,8 +148,8 @@ class Finding:
 
     losses: tuple[TargetLoss, ...]
     details: VttDetails
-    position_rover: Float[np.ndarray, "3"] | None = None
-    sighting: Sighting | None = None
+    position_rover: Vector3 | None = None
+    sighting: matching.Sighting | None = None
 
 
 @dataclass(frozen=True)
@@ -192,16 +177,16 @@ class Stop:
         """The right camera."""
         return self.measurements.mast.right
 
-    def distance_m(self, position_head: Float[np.ndarray, "3"]) -> float:
+    def distance_m(self, position_head: Vector3) -> float:
         """From the left camera's centre."""
         return float(np.linalg.norm(position_head - self.left.c))
 
 
-def expected_position(track: Track, world_from_frame: RigidTransform) -> Float[np.ndarray, "3"] | None:
+def expected_position(track: Track, world_from_frame: RigidTransform) -> Vector3 | None:
     """Predicted target position in a frame of this pose (rover or head); None for a pixel target before the seed."""
     if track.sighting is not None:
         last = track.sighting
-        return predicted_position(last.position_head, last.world_from_head, world_from_frame)
+        return matching.predicted_position(last.position_head, last.world_from_head, world_from_frame)
     if isinstance(track.designated, PixelTarget):
         return None
     return np.asarray(world_from_frame.inv().apply(track.designated.copy()))
@@ -216,11 +201,12 @@ def seed_track(track: Track, measurements: RoverMeasurements, options: VttOption
         expected = np.asarray(stop.world_from_head.inv().apply(track.designated.copy()))
         pixel = stop.left.project(expected)[0]
         ranges = search_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
-    if not np.all(np.isfinite(pixel)) or not has_room(measurements.left, pixel, options.template_px):
+    if not np.all(np.isfinite(pixel)) or not matching.has_room(measurements.left, pixel, options.template_px):
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(True, None))
-    template = cut_patch(measurements.left, pixel, options.template_px)
-    window, window_corner = search_window(measurements.left, pixel, options.search_px)
-    details = VttDetails(True, pixel, window, window_corner, match=Match(pixel, 1.0, template), template=template)
+    template = matching.cut_patch(measurements.left, pixel, options.template_px)
+    window, window_corner = matching.search_window(measurements.left, pixel, options.search_px)
+    match = matching.Match(pixel, 1.0, template)
+    details = VttDetails(True, pixel, window, window_corner, match=match, template=template)
     located = triangulate_target(stop, pixel, template, ranges, details, options)
     stereo = located.details.stereo
     if located.sighting is not None and stereo is not None and stereo.score < options.min_stereo_score:
@@ -229,24 +215,29 @@ def seed_track(track: Track, measurements: RoverMeasurements, options: VttOption
 
 
 def follow_track(
-    track: Track, last: Sighting, measurements: RoverMeasurements, options: VttOptions, matcher: Matcher
+    track: Track,
+    last: matching.Sighting,
+    measurements: RoverMeasurements,
+    options: VttOptions,
+    matcher: matching.Matcher,
 ) -> Finding:
     """Actions 1 to 6 of section 4.1 except pointing, and the loss criteria."""
     stop = Stop.of(measurements)
-    new_from_old = pose_change(last.world_from_head, stop.world_from_head)
+    new_from_old = matching.pose_change(last.world_from_head, stop.world_from_head)
     expected = np.asarray(new_from_old.apply(last.position_head.copy()))
-    seen = lever_pixels(last.position_head, last.camera, stop.left, new_from_old, options.roll_lever_m)
+    seen = matching.lever_pixels(last.position_head, last.camera, stop.left, new_from_old, options.roll_lever_m)
     if seen is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(False, None))
     predicted = seen[0]
-    change = Change(magnification(last.position_head, last.camera.c, expected, stop.left.c), roll_angle(seen))
-    window, window_corner = search_window(measurements.left, predicted, options.search_px)
+    magnification = matching.magnification(last.position_head, last.camera.c, expected, stop.left.c)
+    change = matching.Change(magnification, matching.roll_angle(seen))
+    window, window_corner = matching.search_window(measurements.left, predicted, options.search_px)
     details = VttDetails(False, predicted, window, window_corner, change)
-    applied = Change(change.magnification if options.scale else 1.0, change.roll_rad if options.roll else 0.0)
+    applied = matching.Change(change.magnification if options.scale else 1.0, change.roll_rad if options.roll else 0.0)
     match = matcher(last, measurements.left, predicted, applied, options)
     if match is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), details)
-    template = cut_patch(measurements.left, match.pixel, options.template_px)
+    template = matching.cut_patch(measurements.left, match.pixel, options.template_px)
     details = replace(details, match=match, template=template)
     ranges = search_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
     located = triangulate_target(stop, match.pixel, template, ranges, details, options)
@@ -256,12 +247,7 @@ def follow_track(
 
 
 def triangulate_target(
-    stop: Stop,
-    pixel: Float[np.ndarray, "2"],
-    template: Float[np.ndarray, "n n"],
-    ranges_m: tuple[float, float],
-    details: VttDetails,
-    options: VttOptions,
+    stop: Stop, pixel: Vector2, template: Patch, ranges_m: tuple[float, float], details: VttDetails, options: VttOptions
 ) -> Finding:
     """Triangulate the target from its left pixel by point stereo over these ranges."""
     sight = stop.left.rays(pixel)
@@ -282,12 +268,14 @@ def triangulate_target(
         azimuth_rad=float(np.arctan2(-ahead[1], ahead[0])),
         position_world=np.asarray(stop.world_from_head.apply(position)),
     )
-    sighting = Sighting(stop.measurements.left, pixel, position, stop.left, stop.world_from_head, world_from_rover)
+    sighting = matching.Sighting(
+        stop.measurements.left, pixel, position, stop.left, stop.world_from_head, world_from_rover
+    )
     return Finding((), details, in_rover[0], sighting)
 
 
 def check_losses(
-    track: Track, last: Sighting, located: Finding, stop: Stop, expected_m: float, options: VttOptions
+    track: Track, last: matching.Sighting, located: Finding, stop: Stop, expected_m: float, options: VttOptions
 ) -> Finding:
     """Apply the four loss criteria to a match."""
     details, sighting = located.details, located.sighting

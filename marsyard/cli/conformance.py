@@ -20,14 +20,11 @@ def conformance(
     task: Annotated[
         str | None,
         Option(
-            "--task",
             metavar="TASK",
             help="velocity, tracking, landing, dynamics, instrument or score; by default from its methods.",
         ),
     ] = None,
-    time_limit: Annotated[
-        float, Option("--time-limit", metavar="S", help="Time limit of one answer in seconds.", min=0.1)
-    ] = 60.0,
+    time_limit: Annotated[float, Option(metavar="S", help="Time limit of one answer in seconds.", min=0.1)] = 60.0,
     as_json: JsonOption = False,
 ) -> None:
     """Check an algorithm, or a custom motion, instrument or score, against its protocol: types, inputs, time, ..."""

@@ -15,9 +15,7 @@ from marsyard.cli.options import Exit, JobsOption, console, handle_user_errors
 @handle_user_errors
 def nightly(
     plan: Annotated[Path | None, Argument(metavar="[PLAN.toml]", help="The plan; by default the built-in one.")] = None,
-    out: Annotated[Path, Option("--out", metavar="DIR", help="Folder of history, runs, page and dashboard.")] = Path(
-        "nightly"
-    ),
+    out: Annotated[Path, Option(metavar="DIR", help="Folder of history, runs, page and dashboard.")] = Path("nightly"),
     jobs: JobsOption = None,
 ) -> None:
     """Run the plan's campaigns, compare each figure with the nights before, write nightly.md and the dashboard.

@@ -18,10 +18,7 @@ LOOPBACK = "127.0.0.1"
 def report(
     directory: DirectoryArgument,
     requirements: Annotated[
-        Path | None,
-        Option(
-            "--requirements", metavar="FILE", help="Judge by this file's requirements for the campaign, not by its own."
-        ),
+        Path | None, Option(metavar="FILE", help="Judge by this file's requirements for the campaign, not by its own.")
     ] = None,
     pdf: Annotated[bool, Option("--pdf", help="Also print the page to report.pdf (needs Chromium).")] = False,
     csv: Annotated[bool, Option("--csv", help="Also write all rows to cases.csv.")] = False,
@@ -89,14 +86,10 @@ def dashboard(
     directories: Annotated[
         list[Path], Argument(metavar="DIR...", help="Folders of campaigns, or their parent folders.")
     ],
-    out: Annotated[Path, Option("--out", metavar="DIR", help="The site's folder.")] = Path("site"),
-    requirements: Annotated[
-        Path | None, Option("--requirements", metavar="FILE", help="Requirements to show in place of ours.")
-    ] = None,
-    serve: Annotated[
-        int | None, Option("--serve", metavar="PORT", help="Serve the site on this machine only.", min=0)
-    ] = None,
-    host: Annotated[str, Option("--host", metavar="ADDRESS", help="With --serve: address to listen on.")] = LOOPBACK,
+    out: Annotated[Path, Option(metavar="DIR", help="The site's folder.")] = Path("site"),
+    requirements: Annotated[Path | None, Option(metavar="FILE", help="Requirements to show in place of ours.")] = None,
+    serve: Annotated[int | None, Option(metavar="PORT", help="Serve the site on this machine only.", min=0)] = None,
+    host: Annotated[str, Option(metavar="ADDRESS", help="With --serve: address to listen on.")] = LOOPBACK,
 ) -> None:
     """Write a dashboard over stored campaigns: requirements, latest verdicts, trends, pages of campaigns and cases."""
     from marsyard.campaigns.definition.requirements import read_requirements

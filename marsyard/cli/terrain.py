@@ -37,10 +37,8 @@ def list_sites(as_json: JsonOption = False) -> None:
     for heading in ("site", "planet", "terrain", "description"):
         table.add_column(heading)
     for one in sites().values():
-        planet, scales = (
-            one.environment.planet,
-            [name for name in ("descent", "ground") if getattr(one, name) is not None],
-        )
+        planet = one.environment.planet
+        scales = [name for name in ("descent", "ground") if getattr(one, name) is not None]
         rows.append({"name": one.name, "planet": planet, "terrain": scales, "description": one.description})
         table.add_row(one.name, planet, ", ".join(scales), one.description)
     if as_json:
@@ -52,15 +50,11 @@ def list_sites(as_json: JsonOption = False) -> None:
 @app.command()
 def stats(
     site: SiteArgument,
-    scale: Annotated[
-        str | None, Option("--scale", metavar="SCALE", help="descent or ground; by default the coarser one.")
-    ] = None,
-    seed: Annotated[int, Option("--seed", metavar="S", min=0, help="Seed of the terrain.")] = 1,
+    scale: Annotated[str | None, Option(metavar="SCALE", help="descent or ground; by default the coarser one.")] = None,
+    seed: Annotated[int, Option(metavar="S", min=0, help="Seed of the terrain.")] = 1,
     as_json: JsonOption = False,
     max_holes: MaxHolesOption = None,
-    picture: Annotated[
-        Path | None, Option("--picture", metavar="PNG", help="Write a nadir picture; filled holes are red.")
-    ] = None,
+    picture: Annotated[Path | None, Option(metavar="PNG", help="Write a nadir picture; filled holes are red.")] = None,
 ) -> None:
     """Print albedo, slopes, relief and image contrast of a site's terrain next to the paper's figures."""
     import numpy as np
