@@ -8,32 +8,23 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from marsyard.algorithms import interface
 from marsyard.algorithms.faults import bad_answer
-from marsyard.algorithms.interface import (
-    MastAim,
-    PixelBox,
-    SiteEstimate,
-    SiteOutcome,
-    TargetUpdate,
-    TrackingState,
-    VelocityEstimate,
-    VelocityOutcome,
-)
 from marsyard.sim.measurements import MastCalibration
 
 #: Largest asymmetry of a covariance, as a fraction of its largest entry.
 _ROUNDING = 1e-9
 
 
-def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> VelocityEstimate:
+def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> interface.VelocityEstimate:
     """A copy of a valid `VelocityEstimate` in plain float64 arrays and Python numbers.
 
     `tags_s` are the time tags of the images, between which the span must lie; None if unknown. Raises AlgorithmError
     (BAD_ANSWER) that names the fault.
     """
-    _check_type("the answer", answer, VelocityEstimate)
-    _check_type("outcome", answer.outcome, VelocityOutcome)
-    if (answer.outcome is VelocityOutcome.VALID) != (answer.velocity_m_s is not None):
+    _check_type("the answer", answer, interface.VelocityEstimate)
+    _check_type("outcome", answer.outcome, interface.VelocityOutcome)
+    if (answer.outcome is interface.VelocityOutcome.VALID) != (answer.velocity_m_s is not None):
         count = "none" if answer.velocity_m_s is None else "one"
         raise bad_answer(
             f"outcome is {answer.outcome.name}, but of velocity_m_s {count} is given; allowed: one with VALID alone"
@@ -59,36 +50,36 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
             raise bad_answer(f"span_s is {span}; allowed: within the pictures' tags, {tags_s[0]} to {tags_s[-1]} s")
     elif tags_s is not None and len(tags_s) < 2 and velocity is not None:
         raise bad_answer("of one picture there is no last interval; allowed: a velocity with a span_s, or a failure")
-    return VelocityEstimate(answer.outcome, velocity, answer.details, covariance, span, answer.after_pictures)
+    return interface.VelocityEstimate(answer.outcome, velocity, answer.details, covariance, span, answer.after_pictures)
 
 
-def check_site(answer: Any) -> SiteEstimate:
+def check_site(answer: Any) -> interface.SiteEstimate:
     """A copy of a valid `SiteEstimate` in plain arrays; raises as `check_velocity`."""
-    _check_type("the answer", answer, SiteEstimate)
-    _check_type("outcome", answer.outcome, SiteOutcome)
-    if (answer.outcome is SiteOutcome.NO_SAFE_SITE) != (answer.site_world is None):
+    _check_type("the answer", answer, interface.SiteEstimate)
+    _check_type("outcome", answer.outcome, interface.SiteOutcome)
+    if (answer.outcome is interface.SiteOutcome.NO_SAFE_SITE) != (answer.site_world is None):
         given = "none" if answer.site_world is None else "one"
         raise bad_answer(
             f"outcome is {answer.outcome.name}, but site_world: {given} is given; allowed: none with NO_SAFE_SITE only"
         )
-    return SiteEstimate(answer.outcome, _check_numbers("site_world", answer.site_world, (3,)), answer.details)
+    return interface.SiteEstimate(answer.outcome, _check_numbers("site_world", answer.site_world, (3,)), answer.details)
 
 
-def check_update(answer: Any) -> TargetUpdate:
+def check_update(answer: Any) -> interface.TargetUpdate:
     """A copy of a valid `TargetUpdate` in plain arrays; raises as `check_velocity`."""
-    _check_type("the answer", answer, TargetUpdate)
-    _check_type("state", answer.state, TrackingState)
+    _check_type("the answer", answer, interface.TargetUpdate)
+    _check_type("state", answer.state, interface.TrackingState)
     position = _check_numbers("position_rover", answer.position_rover, (3,))
-    if answer.state is TrackingState.NORMAL and position is None:
+    if answer.state is interface.TrackingState.NORMAL and position is None:
         raise bad_answer("state is NORMAL, but position_rover is None")
-    return TargetUpdate(answer.state, answer.losses, position, answer.details)
+    return interface.TargetUpdate(answer.state, answer.losses, position, answer.details)
 
 
-def check_aim(answer: Any, mast: MastCalibration) -> MastAim | None:
+def check_aim(answer: Any, mast: MastCalibration) -> interface.MastAim | None:
     """A copy of a valid `MastAim` for this mast, or None; raises as `check_velocity`."""
     if answer is None:
         return None
-    if not isinstance(answer, MastAim):
+    if not isinstance(answer, interface.MastAim):
         raise bad_answer(f"the aim is a {_type_name(answer)}; allowed: a MastAim, or None")
     for name in ("azimuth", "elevation"):
         angle, (low, high) = getattr(answer, f"{name}_rad"), getattr(mast.geometry, f"{name}_limits_rad")
@@ -96,14 +87,14 @@ def check_aim(answer: Any, mast: MastCalibration) -> MastAim | None:
             raise bad_answer(f"{name}_rad is {angle!r}; allowed: {low:g} to {high:g}")
     for name, camera in (("left", mast.left), ("right", mast.right)):
         box = getattr(answer, name)
-        if not isinstance(box, PixelBox):
+        if not isinstance(box, interface.PixelBox):
             raise bad_answer(f"{name} is a {_type_name(box)}; allowed: a PixelBox")
         for corner, extent, whole in zip(box.corner, box.size, camera.size, strict=True):
             whole_numbers = all(isinstance(n, int | np.integer) for n in (corner, extent))
             if not whole_numbers or corner < 0 or extent < 1 or corner + extent > whole:
                 allowed = f"a part of the frame of {camera.size} pixels"
                 raise bad_answer(f"{name} is {box.corner} and {box.size}; allowed: {allowed}")
-    return MastAim(float(answer.azimuth_rad), float(answer.elevation_rad), answer.left, answer.right)
+    return interface.MastAim(float(answer.azimuth_rad), float(answer.elevation_rad), answer.left, answer.right)
 
 
 def _check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."] | None:

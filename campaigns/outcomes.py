@@ -18,10 +18,8 @@ TOO_MUCH_OUTPUT = "TOO_MUCH_OUTPUT"
 #: The algorithm's answer violated its interface.
 BAD_ANSWER = "BAD_ANSWER"
 #: All of them, by the names on the command line.
-RETRYABLE: Mapping[str, str] = {
-    outcome.lower().replace("_", "-"): outcome
-    for outcome in (CRASHED, TIMED_OUT, OUT_OF_MEMORY, TOO_MUCH_OUTPUT, BAD_ANSWER)
-}
+_OUTCOMES = (CRASHED, TIMED_OUT, OUT_OF_MEMORY, TOO_MUCH_OUTPUT, BAD_ANSWER)
+RETRYABLE: Mapping[str, str] = {outcome.lower().replace("_", "-"): outcome for outcome in _OUTCOMES}
 #: Cases with these outcomes fail requirements on all cases, and cause exit status 1.
 UNFINISHED = frozenset(RETRYABLE.values())
 

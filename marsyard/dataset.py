@@ -43,11 +43,10 @@ def write_dataset(campaign: Campaign, folder: Path, cases_per_shard: int, jobs: 
     total = campaign.configuration.total_cases
     starts = range(0, total, cases_per_shard)
     paths = [folder / f"shard-{number:06d}.tar" for number in range(len(starts))]
-    missing = [
-        (path, range(start, min(start + cases_per_shard, total)))
-        for path, start in zip(paths, starts, strict=True)
-        if not path.exists()
-    ]
+    shards = {
+        path: range(start, min(start + cases_per_shard, total)) for path, start in zip(paths, starts, strict=True)
+    }
+    missing = [(path, cases) for path, cases in shards.items() if not path.exists()]
     if missing:
         from joblib import Parallel, delayed
 

@@ -8,15 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from marsyard.algorithms.arrays import Flags, Points2, Values, Vector2, Vector3
-from marsyard.algorithms.dimes.binning import (
-    View,
-    ground_from_pixels,
-    inside_frame,
-    pixel_angle_rad,
-    pixels_from_ground,
-    square,
-    square_outline,
-)
+from marsyard.algorithms.dimes import binning
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.image.interest import harris_interest, local_mean, structure_tensor
 
@@ -50,9 +42,9 @@ class SearchGeometry:
         return 0.5 * self.window_px * self.gsd_m
 
 
-def search_geometry(first: View, second: View, options: DimesOptions) -> SearchGeometry:
+def search_geometry(first: binning.View, second: binning.View, options: DimesOptions) -> SearchGeometry:
     """Sizes from the second view's height, pixel angle, image interval and largest speed."""
-    gsd = float(second.centre[2]) * pixel_angle_rad(second)
+    gsd = float(second.centre[2]) * binning.pixel_angle_rad(second)
     reach_m = options.max_speed_m_s * (second.time_s - first.time_s)
     return SearchGeometry(gsd, options.template_px, int(np.ceil(reach_m / gsd)) + options.search_margin_px)
 
@@ -65,12 +57,12 @@ def border_pixels(size: tuple[int, int], per_side: int = 8) -> Points2:
     return np.column_stack([along * (size[0] - 1.0), down * (size[1] - 1.0)])
 
 
-def overlap_polygon(first: View, second: View, options: DimesOptions) -> Points2:
+def overlap_polygon(first: binning.View, second: binning.View, options: DimesOptions) -> Points2:
     """The second view's border in the first view at zero horizontal motion: pixels (u, v) in order; invisible ones
     omitted.
     """
-    ground, _ = ground_from_pixels(second, border_pixels(second.size), options.max_off_nadir_rad)
-    pixels, visible = pixels_from_ground(first, ground)
+    ground, _ = binning.ground_from_pixels(second, border_pixels(second.size), options.max_off_nadir_rad)
+    pixels, visible = binning.pixels_from_ground(first, ground)
     return np.asarray(pixels[visible])
 
 
@@ -86,14 +78,14 @@ def anti_solar_direction(sun_direction: Vector3) -> Vector3:
     return -np.asarray(sun_direction, dtype=np.float64) / (length if length > 0.0 else 1.0)
 
 
-def zero_phase_pixel(view: View, sun_direction: Vector3) -> Vector2:
+def zero_phase_pixel(view: binning.View, sun_direction: Vector3) -> Vector2:
     """Pixel (u, v) of the middle of the zero-phase spot, in or out of frame; NaN if the camera cannot image it."""
     pixels, visible = view.camera.project((view.centre + 1e7 * anti_solar_direction(sun_direction))[None, :])
     return np.asarray(pixels[0]) if visible[0] else np.full(2, np.nan)
 
 
 def outside_zero_phase(
-    view: View, ground: Float[np.ndarray, "*shape 2"], sun_direction: Vector3, radius_rad: float
+    view: binning.View, ground: Float[np.ndarray, "*shape 2"], sun_direction: Vector3, radius_rad: float
 ) -> Bool[np.ndarray, "*shape"]:
     """Whether ground points (east, north) are further than `radius_rad` from the anti-solar direction."""
     spot = anti_solar_direction(sun_direction)
@@ -117,20 +109,20 @@ class Candidates:
 
 
 def template_candidates(
-    first: View, second: View, geometry: SearchGeometry, sun_direction: Vector3, options: DimesOptions
+    first: binning.View, second: binning.View, geometry: SearchGeometry, sun_direction: Vector3, options: DimesOptions
 ) -> Candidates:
     """All feasible template positions on the coarse grid."""
     limit = options.max_off_nadir_rad
     pixels = grid_pixels(first.size, options.grid_step_px)
-    ground, seen = ground_from_pixels(first, pixels, limit)
+    ground, seen = binning.ground_from_pixels(first, pixels, limit)
     pixels, ground = pixels[seen], ground[seen]
     for view, half in ((second, 0.0), (first, geometry.template_half_m), (second, geometry.window_half_m)):
-        outline = square_outline(half, 3) if half > 0.0 else np.zeros((1, 2))
-        room = inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1)
+        outline = binning.square_outline(half, 3) if half > 0.0 else np.zeros((1, 2))
+        room = binning.inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1)
         pixels, ground = pixels[room], ground[room]
 
-    def dark(view: View, half_m: float, per_side: int) -> Flags:
-        points = ground[:, None] + square(half_m, per_side)
+    def dark(view: binning.View, half_m: float, per_side: int) -> Flags:
+        points = ground[:, None] + binning.square(half_m, per_side)
         outside = outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
         return np.asarray(outside.all(axis=1))
 
@@ -143,7 +135,7 @@ def template_candidates(
 DARK_FRACTION = 0.01
 
 
-def contrasts(view: View, pixels: Points2, support: int) -> Values:
+def contrasts(view: binning.View, pixels: Points2, support: int) -> Values:
     """Harris interest over squares of `support` pixels about whole pixels (u, v), divided by the mean signal there.
 
     Computed on the delivered image: the frame-transfer ramp is smooth along columns and hardly changes the interest.
@@ -170,7 +162,7 @@ def best_candidates(contrasts: Values, pixels: Points2, preferred: Flags, count:
 
 
 def select_templates(
-    view: View, candidates: Candidates, options: DimesOptions
+    view: binning.View, candidates: Candidates, options: DimesOptions
 ) -> tuple[list[int], Float[np.ndarray, "k"]]:
     """Indices of the selected candidates, best first, and their contrasts."""
     found, pixels = contrasts(view, candidates.pixels, options.template_px), candidates.pixels

@@ -13,7 +13,7 @@ from marsyard.algorithms.arrays import Flags, Points2
 from marsyard.algorithms.hda.kernels import matching
 from marsyard.algorithms.hda.motion import Motion
 from marsyard.algorithms.hda.options import HdaOptions
-from marsyard.algorithms.hda.view import View, points_at_depth, project_points, undistort
+from marsyard.algorithms.hda.view import View, Views, points_at_depth, project_points, undistort
 
 
 class Fate(IntEnum):
@@ -99,11 +99,7 @@ def triangulate(first: Points2, second: Points2, second_from_first: RigidTransfo
 
 
 def match_pixels(
-    views: tuple[View, View],
-    second_from_first: RigidTransform,
-    pixels: Points2,
-    bounds_m: tuple[float, float],
-    options: HdaOptions,
+    views: Views, second_from_first: RigidTransform, pixels: Points2, bounds_m: tuple[float, float], options: HdaOptions
 ) -> Matches:
     """Match whole pixels of the first image along their epipolar segments.
 
@@ -139,7 +135,7 @@ def match_pixels(
 
 
 def return_distance(
-    views: tuple[View, View],
+    views: Views,
     second_from_first: RigidTransform,
     pixels: Int[np.ndarray, "n 2"],
     found: Int[np.ndarray, "n 2"],
@@ -173,7 +169,7 @@ def clip_to_image(size: tuple[int, int], inside: Points2, ends: Points2, border_
 
 
 def dense_structure(
-    views: tuple[View, View], second_from_first: RigidTransform, depth_range_m: tuple[float, float], options: HdaOptions
+    views: Views, second_from_first: RigidTransform, depth_range_m: tuple[float, float], options: HdaOptions
 ) -> Matches:
     """Matches of a grid of pixels, searched within the widened depth range of the features."""
     pixels = pixel_lattice(views[0].camera.size, options.grid_px, options.search_half_px + 1)
@@ -186,9 +182,7 @@ SPOT_OFFSETS_PX = np.arange(-4.0, 5.0, 2.0)
 MIN_SPOT_MATCHES = 5
 
 
-def scale_factor(
-    views: tuple[View, View], motion: Motion, places: Points2, range_m: float, options: HdaOptions
-) -> float:
+def scale_factor(views: Views, motion: Motion, places: Points2, range_m: float, options: HdaOptions) -> float:
     """Factor on all lengths of the motion that makes the depth on the optical axis equal the laser's range.
 
     Pixels about the laser's spot are matched as structure is; with too few matches the plane through the features'

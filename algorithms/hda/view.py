@@ -42,6 +42,10 @@ class View:
         return float(np.mean(self.camera.focal_lengths))
 
 
+#: The two images of an estimate.
+Views = tuple[View, View]
+
+
 def build_view(image: DetectorImage, pose: PoseMeasurement) -> View:
     """The view of an image taken at a pose. Raises ValueError if the image's size is not its camera's."""
     if image.counts.shape != image.camera.size[::-1]:
@@ -102,7 +106,7 @@ class LandingScene:
     - apriori_site_world: Default landing site
     """
 
-    views: tuple[View, View]
+    views: Views
     range_m: float
     up_camera: Vector3
     apriori_site_world: Vector3

@@ -14,23 +14,8 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.arrays import Counts, Patch, Vector2, Vector3
 from marsyard.algorithms.interface import MastAim, TargetLoss, TargetUpdate, TrackingState
+from marsyard.algorithms.vtt import matching
 from marsyard.algorithms.vtt.loss import Evidence, Journey, Tolerances, find_losses, next_state, tolerances
-from marsyard.algorithms.vtt.matching import (
-    Change,
-    Match,
-    Matcher,
-    Sighting,
-    cut_patch,
-    designated_position_world,
-    has_room,
-    lever_pixels,
-    magnification,
-    match_by_correlation,
-    pose_change,
-    predicted_position,
-    roll_angle,
-    search_window,
-)
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position
 from marsyard.algorithms.vtt.stereo import StereoMatch, epipolar_pixels, nearest_point, point_stereo, search_ranges
@@ -63,8 +48,8 @@ class VttDetails:
     predicted_pixel: Vector2 | None
     window: Counts | None = None
     window_corner: tuple[int, int] | None = None
-    change: Change | None = None
-    match: Match | None = None
+    change: matching.Change | None = None
+    match: matching.Match | None = None
     template: Patch | None = None
     stereo: StereoMatch | None = None
     distance_m: float = float("nan")
@@ -93,7 +78,7 @@ class Track:
     world_from_rover: RigidTransform
     state: TrackingState = TrackingState.NORMAL
     lost_updates: int = 0
-    sighting: Sighting | None = None
+    sighting: matching.Sighting | None = None
     seed_world: Vector3 | None = None
     seed_distance_m: float = float("nan")
     driven_m: float = 0.0
@@ -107,7 +92,9 @@ class VisualTargetTracker:
     `marsyard.algorithms.vtt.lucas_kanade`).
     """
 
-    def __init__(self, options: VttOptions | None = None, matcher: Matcher = match_by_correlation) -> None:
+    def __init__(
+        self, options: VttOptions | None = None, matcher: matching.Matcher = matching.match_by_correlation
+    ) -> None:
         self.options = VttOptions() if options is None else options
         self.matcher = matcher
         self.track: Track | None = None
@@ -122,7 +109,7 @@ class VisualTargetTracker:
         if isinstance(target, PixelTarget):
             self.track = Track(target, world_from_rover)
         else:
-            self.track = Track(designated_position_world(target, world_from_rover), world_from_rover)
+            self.track = Track(matching.designated_position_world(target, world_from_rover), world_from_rover)
 
     def clear(self) -> None:
         """Clear the target."""
@@ -162,7 +149,7 @@ class Finding:
     losses: tuple[TargetLoss, ...]
     details: VttDetails
     position_rover: Vector3 | None = None
-    sighting: Sighting | None = None
+    sighting: matching.Sighting | None = None
 
 
 @dataclass(frozen=True)
@@ -199,7 +186,7 @@ def expected_position(track: Track, world_from_frame: RigidTransform) -> Vector3
     """Predicted target position in a frame of this pose (rover or head); None for a pixel target before the seed."""
     if track.sighting is not None:
         last = track.sighting
-        return predicted_position(last.position_head, last.world_from_head, world_from_frame)
+        return matching.predicted_position(last.position_head, last.world_from_head, world_from_frame)
     if isinstance(track.designated, PixelTarget):
         return None
     return np.asarray(world_from_frame.inv().apply(track.designated.copy()))
@@ -214,11 +201,13 @@ def seed_track(track: Track, measurements: RoverMeasurements, options: VttOption
         expected = np.asarray(stop.world_from_head.inv().apply(track.designated.copy()))
         pixel = stop.left.project(expected)[0]
         ranges = search_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
-    if not np.all(np.isfinite(pixel)) or not has_room(measurements.left, pixel, options.template_px):
+    if not np.all(np.isfinite(pixel)) or not matching.has_room(measurements.left, pixel, options.template_px):
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(True, None))
-    template = cut_patch(measurements.left, pixel, options.template_px)
-    window, window_corner = search_window(measurements.left, pixel, options.search_px)
-    details = VttDetails(True, pixel, window, window_corner, match=Match(pixel, 1.0, template), template=template)
+    template = matching.cut_patch(measurements.left, pixel, options.template_px)
+    window, window_corner = matching.search_window(measurements.left, pixel, options.search_px)
+    details = VttDetails(
+        True, pixel, window, window_corner, match=matching.Match(pixel, 1.0, template), template=template
+    )
     located = triangulate_target(stop, pixel, template, ranges, details, options)
     stereo = located.details.stereo
     if located.sighting is not None and stereo is not None and stereo.score < options.min_stereo_score:
@@ -227,24 +216,30 @@ def seed_track(track: Track, measurements: RoverMeasurements, options: VttOption
 
 
 def follow_track(
-    track: Track, last: Sighting, measurements: RoverMeasurements, options: VttOptions, matcher: Matcher
+    track: Track,
+    last: matching.Sighting,
+    measurements: RoverMeasurements,
+    options: VttOptions,
+    matcher: matching.Matcher,
 ) -> Finding:
     """Actions 1 to 6 of section 4.1 except pointing, and the loss criteria."""
     stop = Stop.of(measurements)
-    new_from_old = pose_change(last.world_from_head, stop.world_from_head)
+    new_from_old = matching.pose_change(last.world_from_head, stop.world_from_head)
     expected = np.asarray(new_from_old.apply(last.position_head.copy()))
-    seen = lever_pixels(last.position_head, last.camera, stop.left, new_from_old, options.roll_lever_m)
+    seen = matching.lever_pixels(last.position_head, last.camera, stop.left, new_from_old, options.roll_lever_m)
     if seen is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(False, None))
     predicted = seen[0]
-    change = Change(magnification(last.position_head, last.camera.c, expected, stop.left.c), roll_angle(seen))
-    window, window_corner = search_window(measurements.left, predicted, options.search_px)
+    change = matching.Change(
+        matching.magnification(last.position_head, last.camera.c, expected, stop.left.c), matching.roll_angle(seen)
+    )
+    window, window_corner = matching.search_window(measurements.left, predicted, options.search_px)
     details = VttDetails(False, predicted, window, window_corner, change)
-    applied = Change(change.magnification if options.scale else 1.0, change.roll_rad if options.roll else 0.0)
+    applied = matching.Change(change.magnification if options.scale else 1.0, change.roll_rad if options.roll else 0.0)
     match = matcher(last, measurements.left, predicted, applied, options)
     if match is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), details)
-    template = cut_patch(measurements.left, match.pixel, options.template_px)
+    template = matching.cut_patch(measurements.left, match.pixel, options.template_px)
     details = replace(details, match=match, template=template)
     ranges = search_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
     located = triangulate_target(stop, match.pixel, template, ranges, details, options)
@@ -275,12 +270,14 @@ def triangulate_target(
         azimuth_rad=float(np.arctan2(-ahead[1], ahead[0])),
         position_world=np.asarray(stop.world_from_head.apply(position)),
     )
-    sighting = Sighting(stop.measurements.left, pixel, position, stop.left, stop.world_from_head, world_from_rover)
+    sighting = matching.Sighting(
+        stop.measurements.left, pixel, position, stop.left, stop.world_from_head, world_from_rover
+    )
     return Finding((), details, in_rover[0], sighting)
 
 
 def check_losses(
-    track: Track, last: Sighting, located: Finding, stop: Stop, expected_m: float, options: VttOptions
+    track: Track, last: matching.Sighting, located: Finding, stop: Stop, expected_m: float, options: VttOptions
 ) -> Finding:
     """Apply the four loss criteria to a match."""
     details, sighting = located.details, located.sighting

@@ -39,9 +39,8 @@ def use_current_names(tables: Mapping[str, Any], selected: Scenario) -> dict[str
     if isinstance(correlations, list):
         current["correlations"] = [_rename_entries(group, ("parameters",), path) for group in correlations]
     if isinstance(tables.get("requirements"), list):
-        current["requirements"] = [
-            _rename_entries(stated, ("metric", "population"), column) for stated in tables["requirements"]
-        ]
+        keys = ("metric", "population")
+        current["requirements"] = [_rename_entries(stated, keys, column) for stated in tables["requirements"]]
     return current
 
 

@@ -158,10 +158,9 @@ def _apply_option(
     fixed = [".".join(path[1:]) for path in paths if path[0] == "parameters"]
     dispersions = merged.get("dispersions")
     if isinstance(dispersions, dict):
+        related = ((path, other) for path in dispersions for other in fixed)
         removed = {
-            path
-            for path in dispersions
-            if any(f"{path}.".startswith(f"{other}.") or other.startswith(f"{path}.") for other in fixed)
+            path for path, other in related if f"{path}.".startswith(f"{other}.") or other.startswith(f"{path}.")
         }
         merged["dispersions"] = {path: one for path, one in dispersions.items() if path not in removed}
         if removed and isinstance(merged.get("correlations"), list):
@@ -265,9 +264,8 @@ def _check_names(campaign: Campaign) -> list[tuple[Key, str]]:
     dispersions = campaign.configuration.dispersions
     problems: list[tuple[Key, str]] = []
     for path, dispersion in dispersions.items():
-        takes_tables = isinstance(dispersion, Choice | Fixed) or (
-            isinstance(dispersion, Grid) and dispersion.values is not None
-        )
+        listed = not isinstance(dispersion, Grid) or dispersion.values is not None
+        takes_tables = isinstance(dispersion, Choice | Fixed | Grid) and listed
         if path not in parameters and not any(leaf.startswith(f"{path}.") for leaf in parameters):
             problems.append((("dispersions", path), _describe_unknown(path, parameters)))
         elif path not in parameters and not takes_tables:

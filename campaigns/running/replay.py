@@ -106,9 +106,7 @@ def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) 
         if isinstance(error, ValidationError):
             found = problems_of(error, campaign.scenario.parameters_type)
             problems = [(key_text(("parameters", *key)), message) for key, message in found]
-        hint = (
-            "modules of your own are searched for in the current folder: start the command where the campaign was run"
-        )
-        problems.append(("", f"nothing was run or changed; {hint}"))
+        hint = "modules of your own are searched for in the current folder"
+        problems.append(("", f"nothing was run or changed; {hint}: start the command where the campaign was run"))
         raise ConfigurationError([Problem(str(directory), *problem) for problem in problems]) from error
     return campaign

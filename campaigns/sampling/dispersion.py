@@ -38,9 +38,7 @@ class Dispersion(Parameters, ABC):
     #: Whether the distribution has a density, so that ranks can be correlated.
     continuous: ClassVar[bool] = False
     #: Fields that hold texts or literal values, never formulas.
-    _literals: ClassVar[frozenset[str]] = frozenset(
-        {"distribution", "unit", "description", "source", "values", "value"}
-    )
+    _literals: ClassVar[set[str]] = {"distribution", "unit", "description", "source", "values", "value"}
 
     unit: str | None = None
     description: str | None = None
@@ -61,7 +59,7 @@ class Dispersion(Parameters, ABC):
     @cached_property
     def formulas(self) -> Mapping[tuple[str | int, ...], Formula]:
         """Formulas in place of numbers, by their keys."""
-        return dict(_find_formulas(self.model_dump(mode="json", exclude=set(self._literals))))
+        return dict(_find_formulas(self.model_dump(mode="json", exclude=self._literals)))
 
     @property
     def names(self) -> tuple[str, ...]:

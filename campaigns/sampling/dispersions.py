@@ -129,10 +129,8 @@ class Grid(_Levels):
         if self.step is not None:
             steps = (self.high - self.low) / self.step  # type: ignore[operator]  # both are given, see above
             if not 0.5 <= steps < MAX_LEVELS or abs(steps - round(steps)) > 1e-6:
-                raise ValueError(
-                    f"step = {self.step} does not divide the range from {self.low} to {self.high} "
-                    f"into 1 to {MAX_LEVELS - 1} whole steps"
-                )
+                divided = f"the range from {self.low} to {self.high} into 1 to {MAX_LEVELS - 1} whole steps"
+                raise ValueError(f"step = {self.step} does not divide {divided}")
         return self
 
     @cached_property
@@ -281,10 +279,8 @@ class Scipy(base.Dispersion):
         names = base.scipy_distributions()
         if name not in names:
             hint = near_match(name, [*BUILT_IN, *names])
-            raise ValueError(
-                f"unknown distribution '{name}'{hint}; allowed: {', '.join(BUILT_IN)}, "
-                "or a distribution of one variable of scipy.stats by its name there (norm, beta, poisson, ...)"
-            )
+            others = "a distribution of one variable of scipy.stats by its name there (norm, beta, poisson, ...)"
+            raise ValueError(f"unknown distribution '{name}'{hint}; allowed: {', '.join(BUILT_IN)}, or {others}")
         return name
 
     @model_validator(mode="after")

@@ -132,11 +132,8 @@ def write_gallery(plates: Sequence[SvgFigure], folder: Path) -> Path:
         source = f"data:image/jpeg;base64,{base64.b64encode(inline).decode()}"
         groups.setdefault(s.site, []).append({"source": source, **values})
     (folder / SHEET).write_bytes(contact_sheet(plates))
-    page = (
-        page_environment()
-        .get_template("gallery.html.j2")
-        .render(groups=[(sites()[name], shown) for name, shown in groups.items()], version=version("marsyard"))
-    )
+    shown = [(sites()[name], plates_of_site) for name, plates_of_site in groups.items()]
+    page = page_environment().get_template("gallery.html.j2").render(groups=shown, version=version("marsyard"))
     (folder / PAGE).write_text(page, encoding="utf-8")
     return folder / PAGE
 

@@ -89,15 +89,14 @@ def _is_terminal() -> bool:
 def _write_and_load(path: Path, template: CampaignTemplate, choices: Choices) -> Campaign:
     """Write the campaign and load it; where it cannot be loaded, restore what the path held before."""
     from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.campaigns.errors import CampaignError
+    from marsyard.campaigns.errors import CampaignError, writing
 
     before = path.read_text(encoding="utf-8") if path.exists() else None
     try:
-        path.write_text(template.text(choices), encoding="utf-8")
+        with writing(f"{path}:"):
+            path.write_text(template.text(choices), encoding="utf-8")
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    except OSError as error:
-        raise CampaignError(f"{path}: cannot be written: {error.strerror or error}") from error
     try:
         return load_campaign(str(path))
     except CampaignError:
@@ -113,9 +112,9 @@ def _answer(question: str, default: str, asked: bool, find_problem: Callable[[st
             raise typer.BadParameter(problem)
         return answer
 
-    return str(
-        typer.prompt(question, default=default, show_default=bool(default), value_proc=check) if asked else default
-    )
+    if not asked:
+        return default
+    return str(typer.prompt(question, default=default, show_default=bool(default), value_proc=check))
 
 
 def _find_word_problem(allowed: Sequence[str], answer: str) -> str:
@@ -159,7 +158,7 @@ def ingest(
 ) -> None:
     """Make a campaign of real cases from pictures with measured attitude and altitude."""
     from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.campaigns.errors import CampaignError, StoreError, not_allowed
+    from marsyard.campaigns.errors import CampaignError, StoreError, not_allowed, writing
     from marsyard.reports.wording import count
     from marsyard.scenarios.import_path import import_object
     from marsyard.scenarios.systems import systems
@@ -172,16 +171,15 @@ def ingest(
         raise StoreError(f"{out} is there already, and is not empty; name a new folder with --out")
     unfinished = out.with_name(f"{out.name}.part{os.getpid()}")
     try:
-        unfinished.mkdir(parents=True)
-        made: Ingested = import_object(known[chosen])(folder, unfinished, out.resolve())
-        (unfinished / CAMPAIGN_FILE).write_text(made.campaign, encoding="utf-8")
-        if out.exists():
-            out.rmdir()
-        unfinished.rename(out)
+        with writing(f"{out}:"):
+            unfinished.mkdir(parents=True)
+            made: Ingested = import_object(known[chosen])(folder, unfinished, out.resolve())
+            (unfinished / CAMPAIGN_FILE).write_text(made.campaign, encoding="utf-8")
+            if out.exists():
+                out.rmdir()
+            unfinished.rename(out)
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    except OSError as error:
-        raise StoreError(f"{out}: cannot be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
     try:

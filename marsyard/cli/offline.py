@@ -30,28 +30,28 @@ def export(
 ) -> None:
     """Write a campaign's pictures, measurements and cameras for external algorithms; repeat the command to continue."""
     from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.campaigns.running.offline import Exported, export_campaign, truth_folder
+    from marsyard.campaigns.running.offline import export_campaign, truth_folder
     from marsyard.campaigns.store import record
     from marsyard.reports.wording import count
     from marsyard.scenarios.offline import EXPORT
 
-    exported = Exported(out, truth if truth is not None else truth_folder(out))
+    truth = truth_folder(out) if truth is None else truth
     kept = ["retain.products=none", "retain.showcase=none"]
     loaded = load_campaign(campaign, [*(override or []), *kept], cases, seed, [f"{EXPORT}{out.resolve()}"])
-    words = ["marsyard", "export", campaign, "--out", str(out), "--truth", str(exported.truth)]
+    words = ["marsyard", "export", campaign, "--out", str(out), "--truth", str(truth)]
     words += [] if cases is None else ["-n", str(cases)]
     words += [] if seed is None else ["--seed", str(seed)]
     words += [word for value in override or [] for word in ("--set", value)]
     loaded = replace(loaded, command=tuple(words))
-    with shown_progress(exported.truth, f"the same command again ({out})") as watch:
-        export_campaign(loaded, exported, make_executor(jobs, cluster), watch)
-    crashed = int(record.read(exported.truth)["cases_crashed"])
+    with shown_progress(truth, f"the same command again ({out})") as watch:
+        export_campaign(loaded, out, truth, make_executor(jobs, cluster), watch)
+    crashed = int(record.read(truth)["cases_crashed"])
     total = loaded.configuration.total_cases
     typer.echo(f"{total - crashed} of {count(total, 'case')}: {out}")
-    typer.echo(f"their truth, not to be handed away: {exported.truth}")
+    typer.echo(f"their truth, not to be handed away: {truth}")
     typer.echo(f"once they are answered: marsyard score {out} ANSWERS.csv")
     if crashed:
-        typer.echo(f"{count(crashed, 'case')} could not be written; why: marsyard report {exported.truth}", err=True)
+        typer.echo(f"{count(crashed, 'case')} could not be written; why: marsyard report {truth}", err=True)
         raise typer.Exit(options.Exit.FAILED)
 
 
@@ -66,21 +66,20 @@ def score(
 ) -> None:
     """Score external answers: the scores, verdicts and report of a run."""
     from marsyard.campaigns.running.engine import Watch, run_campaign
-    from marsyard.campaigns.running.offline import Exported, cases_with_changed_pictures, scored_campaign, truth_folder
+    from marsyard.campaigns.running.offline import cases_with_changed_pictures, scored_campaign, truth_folder
     from marsyard.reports.wording import count
 
-    exported = Exported(directory, truth if truth is not None else truth_folder(directory))
-    words = ("marsyard", "score", str(directory), str(answers), "--truth", str(exported.truth))
-    campaign = replace(scored_campaign(exported, answers), command=words)
+    truth = truth_folder(directory) if truth is None else truth
+    words = ("marsyard", "score", str(directory), str(answers), "--truth", str(truth))
+    campaign = replace(scored_campaign(directory, truth, answers), command=words)
     target = out if out is not None else default_directory(campaign.configuration.name)
 
     def run(watch: Watch) -> None:
         run_campaign(campaign, target, make_executor(jobs, cluster), watch)
-        other = cases_with_changed_pictures(exported.truth, target)
+        other = cases_with_changed_pictures(truth, target)
         if other:
-            watch.note(
-                f"other pictures here than were exported: {count(len(other), 'case')}, the first case {other[0]}"
-            )
+            cases = f"{count(len(other), 'case')}, the first case {other[0]}"
+            watch.note(f"other pictures here than were exported: {cases}")
 
     run_and_judge(target, run)
 

@@ -61,9 +61,8 @@ def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[s
     lines = [f"verdict: {found.whole.word}", found.whole.sentence, f"report: {page}"]
     if not finished:
         state = "killed" if stored["state"] == "running" else stored["state"]
-        reason = (
-            "it is running" if is_locked(directory) else f"it was {state}; to continue: marsyard resume {directory}"
-        )
+        reason = f"it was {state}; to continue: marsyard resume {directory}"
+        reason = "it is running" if is_locked(directory) else reason
         lines.insert(0, f"INCOMPLETE: {len(found.run.whole)} of {count(stored['cases'], 'case')}; {reason}")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from marsyard.campaigns.definition.campaign import Campaign, leaves, value_at
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, description_at
-from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.errors import CampaignError, writing
 from marsyard.campaigns.sampling.design import describe_design
 from marsyard.reports.columns import split_unit
 from marsyard.reports.wording import asked_text, count
@@ -128,10 +128,8 @@ def write_draws_figure(campaign: Campaign, cases: int, path: Path) -> None:
         if not dispersion.formulas:
             quantiles = [dispersion.quantile((index + 0.5) / _QUANTILES) for index in range(_QUANTILES)]
         of_each.append(Drawn(name, values, quantiles))
-    try:
+    with writing(f"--figure {path}:"):
         save_figure(draws_figure(campaign.configuration.name, of_each), path)
-    except OSError as error:
-        raise CampaignError(f"--figure {path}: cannot be written: {error.strerror or error}") from error
 
 
 def drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
