@@ -26,9 +26,8 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> interf
     _check_type("outcome", answer.outcome, interface.VelocityOutcome)
     if (answer.outcome is interface.VelocityOutcome.VALID) != (answer.velocity_m_s is not None):
         count = "none" if answer.velocity_m_s is None else "one"
-        raise bad_answer(
-            f"outcome is {answer.outcome.name}, but of velocity_m_s {count} is given; allowed: one with VALID alone"
-        )
+        fault = f"but of velocity_m_s {count} is given; allowed: one with VALID alone"
+        raise bad_answer(f"outcome is {answer.outcome.name}, {fault}")
     velocity = _check_numbers("velocity_m_s", answer.velocity_m_s, (2,))
     if answer.covariance_m2_s2 is not None and velocity is None:
         raise bad_answer("covariance_m2_s2 is given without a velocity")
@@ -59,9 +58,8 @@ def check_site(answer: Any) -> interface.SiteEstimate:
     _check_type("outcome", answer.outcome, interface.SiteOutcome)
     if (answer.outcome is interface.SiteOutcome.NO_SAFE_SITE) != (answer.site_world is None):
         given = "none" if answer.site_world is None else "one"
-        raise bad_answer(
-            f"outcome is {answer.outcome.name}, but site_world: {given} is given; allowed: none with NO_SAFE_SITE only"
-        )
+        fault = f"but site_world: {given} is given; allowed: none with NO_SAFE_SITE only"
+        raise bad_answer(f"outcome is {answer.outcome.name}, {fault}")
     return interface.SiteEstimate(answer.outcome, _check_numbers("site_world", answer.site_world, (3,)), answer.details)
 
 

@@ -102,9 +102,8 @@ def stretch_to_8_bits(patch: Raster) -> UInt8[np.ndarray, "rows columns"]:
 def match_features(patches: PairPatches, options: HomographyOptions) -> tuple[Points2, Points2] | None:
     """Positions (column, row) of matching features in both images; None if too few for a homography."""
     orb = cv2.ORB.create(nfeatures=options.features, fastThreshold=options.fast_threshold)
-    (first, first_bits), (second, second_bits) = (
-        orb.detectAndCompute(stretch_to_8_bits(patch), None) for patch in (patches.first, patches.second)
-    )
+    images = (stretch_to_8_bits(patch) for patch in (patches.first, patches.second))
+    (first, first_bits), (second, second_bits) = (orb.detectAndCompute(image, None) for image in images)
     if first_bits is None or second_bits is None or len(second) < 2:
         return None
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(first_bits, second_bits, k=2)

@@ -68,9 +68,8 @@ def bin_factors(shape: tuple[int, int], binned_size: tuple[int, int]) -> tuple[i
     """
     rows, columns = shape
     if columns % binned_size[0] or rows % binned_size[1]:
-        raise ValueError(
-            f"a delivered picture of {columns} x {rows} pixels does not bin to {binned_size[0]} x {binned_size[1]}"
-        )
+        binned = f"{binned_size[0]} x {binned_size[1]}"
+        raise ValueError(f"a delivered picture of {columns} x {rows} pixels does not bin to {binned}")
     return columns // binned_size[0], rows // binned_size[1]
 
 

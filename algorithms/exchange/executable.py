@@ -196,8 +196,5 @@ def _read_update(answer: Mapping[str, Any], details: ProgramDetails) -> interfac
         raise bad_answer(f"losses is {losses!r}; allowed: a list of {', '.join(interface.TargetLoss.__members__)}")
     position = read_numbers(answer, "position_rover", (3,))
     state = read_member("state", answer.get("state"), interface.TrackingState)
-    return check_update(
-        interface.TargetUpdate(
-            state, tuple(read_member("a loss", one, interface.TargetLoss) for one in losses), position, details
-        )
-    )
+    named = tuple(read_member("a loss", one, interface.TargetLoss) for one in losses)
+    return check_update(interface.TargetUpdate(state, named, position, details))

@@ -72,10 +72,8 @@ def essential_motion(scene: LandingScene, tracks: Tracks, options: HdaOptions) -
     Its scale makes the median depth equal the range.
     """
     focal = scene.views[1].focal_px
-    first, second = (
-        undistort(one.camera, pixels[tracks.accepted])
-        for one, pixels in zip(scene.views, (tracks.first, tracks.second), strict=True)
-    )
+    accepted = (tracks.first[tracks.accepted], tracks.second[tracks.accepted])
+    first, second = (undistort(one.camera, pixels) for one, pixels in zip(scene.views, accepted, strict=True))
     intrinsics = np.diag([focal, focal, 1.0])
     poses = []
     for method, inlier_px in ATTEMPTS:

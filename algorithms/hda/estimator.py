@@ -106,10 +106,8 @@ def expected_pixels(scene: LandingScene, features: Points2, options: HdaOptions)
 
 def motion_from_tracks(scene: LandingScene, tracks: Tracks, options: HdaOptions) -> Motion:
     """The motion by robust least squares: the better of the starts from the on-board poses and from rest."""
-    first, second = (
-        undistort(one.camera, pixels[tracks.accepted])
-        for one, pixels in zip(scene.views, (tracks.first, tracks.second), strict=True)
-    )
+    accepted = (tracks.first[tracks.accepted], tracks.second[tracks.accepted])
+    first, second = (undistort(one.camera, pixels) for one, pixels in zip(scene.views, accepted, strict=True))
     depths = plane_depths(first, scene.range_m, scene.up_camera)
     starts: tuple[RigidTransform, ...] = (scene.second_from_first, rigid(Rotation.identity(), np.zeros(3)))
     return estimate_motion(first, second, scene.views[1].focal_px, depths, starts, options)
@@ -201,9 +199,8 @@ def map_ground(
     to_world = world_from_surface(first.world_from_camera.rotation, to_surface)
     apriori = to_world.inv().apply(scene.apriori_site_world - first.world_from_camera.translation)
     apriori_cell = elevation.cells(apriori[:2])
-    return Ground(
-        to_surface, to_world, points, elevation, maps, apriori_cell, hazards.safe_site(maps.safety, apriori_cell)
-    )
+    site_cell = hazards.safe_site(maps.safety, apriori_cell)
+    return Ground(to_surface, to_world, points, elevation, maps, apriori_cell, site_cell)
 
 
 def site_world(scene: LandingScene, ground: Ground) -> Vector3 | None:

@@ -110,10 +110,8 @@ def assess_motion(
     quaternion = second_from_first.rotation.as_quat(scalar_first=True)
     inverse = 1.0 / depths
     unmatched = kernels.Matches(first, np.zeros_like(first), focal_px, 1.0)
-    still, moved = (
-        kernels.residuals(unmatched, kernels.Motion(quaternion, translation, inverse))
-        for translation in (np.zeros(3), np.array(second_from_first.translation))
-    )
+    shifts = (np.zeros(3), np.array(second_from_first.translation))
+    still, moved = (kernels.residuals(unmatched, kernels.Motion(quaternion, one, inverse)) for one in shifts)
     residuals = np.hypot(*(moved - focal_px * second).T)
     fitting = residuals <= options.max_residual_px
     return Motion(

@@ -51,9 +51,8 @@ def build_view(image: DetectorImage, pose: PoseMeasurement) -> View:
     if image.counts.shape != image.camera.size[::-1]:
         raise ValueError(f"the picture has (rows, columns) {image.counts.shape}, its camera {image.camera.size[::-1]}")
     body_from_camera = camera_pose(image.camera)
-    return View(
-        flat_fielded(image), image.camera.moved(body_from_camera.inv()), pose.world_from_body * body_from_camera
-    )
+    camera = image.camera.moved(body_from_camera.inv())
+    return View(flat_fielded(image), camera, pose.world_from_body * body_from_camera)
 
 
 def flat_fielded(image: DetectorImage) -> UInt16[np.ndarray, "rows columns"]:
@@ -119,9 +118,8 @@ class LandingScene:
 
 def build_scene(measurements: LandingMeasurements) -> LandingScene:
     """Transform the measurements to the cameras' frames. Raises ValueError if an image's size is not its camera's."""
-    first, second = (
-        build_view(image, pose) for image, pose in zip(measurements.images, measurements.poses, strict=True)
-    )
+    pairs = zip(measurements.images, measurements.poses, strict=True)
+    first, second = (build_view(image, pose) for image, pose in pairs)
     body_from_camera = camera_pose(measurements.images[0].camera)
     up_camera = body_from_camera.rotation.inv().apply(np.array(measurements.up_body))
     return LandingScene((first, second), measurements.slant_range_m, up_camera, measurements.apriori_site_world)

@@ -51,10 +51,8 @@ def tolerances(journey: Journey, left: CameraModel, right: CameraModel, options:
     scale = disparity_px_m(left, right)
 
     def tolerance(before_m: float, moved_m: float, across_m: float) -> float:
-        before, now = (
-            stereo_range_error_m(range_m, scale, 1.0, options.stereo_disparity_error_px)
-            for range_m in (before_m, journey.now_m)
-        )
+        error_px = options.stereo_disparity_error_px
+        before, now = (stereo_range_error_m(one, scale, 1.0, error_px) for one in (before_m, journey.now_m))
         return options.tolerance_floor_m + math.hypot(before, now, options.pose_error * moved_m, across_m)
 
     return Tolerances(

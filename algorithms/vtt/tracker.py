@@ -205,9 +205,8 @@ def seed_track(track: Track, measurements: RoverMeasurements, options: VttOption
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(True, None))
     template = matching.cut_patch(measurements.left, pixel, options.template_px)
     window, window_corner = matching.search_window(measurements.left, pixel, options.search_px)
-    details = VttDetails(
-        True, pixel, window, window_corner, match=matching.Match(pixel, 1.0, template), template=template
-    )
+    match = matching.Match(pixel, 1.0, template)
+    details = VttDetails(True, pixel, window, window_corner, match=match, template=template)
     located = triangulate_target(stop, pixel, template, ranges, details, options)
     stereo = located.details.stereo
     if located.sighting is not None and stereo is not None and stereo.score < options.min_stereo_score:
@@ -230,9 +229,8 @@ def follow_track(
     if seen is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(False, None))
     predicted = seen[0]
-    change = matching.Change(
-        matching.magnification(last.position_head, last.camera.c, expected, stop.left.c), matching.roll_angle(seen)
-    )
+    magnification = matching.magnification(last.position_head, last.camera.c, expected, stop.left.c)
+    change = matching.Change(magnification, matching.roll_angle(seen))
     window, window_corner = matching.search_window(measurements.left, predicted, options.search_px)
     details = VttDetails(False, predicted, window, window_corner, change)
     applied = matching.Change(change.magnification if options.scale else 1.0, change.roll_rad if options.roll else 0.0)

@@ -202,10 +202,9 @@ def _prepare_inputs(run: _Run, executor: Executor, cases: Iterable[int]) -> None
     plan = plan_inputs(run.campaign, cases)
     inputs = plan.to_prepare
     if plan.build_bytes > plan.limit_bytes:
-        watch.note(
-            f"the terrains to be built take {plan.build_bytes / 1e9:.1f} GB, more than the cache may "
-            f"({plan.limit_bytes / 1e9:.1f} GB): some are built more than once; MARSYARD_CACHE_GB sets the limit"
-        )
+        sizes = f"{plan.build_bytes / 1e9:.1f} GB, more than the cache may ({plan.limit_bytes / 1e9:.1f} GB)"
+        advice = "some are built more than once; MARSYARD_CACHE_GB sets the limit"
+        watch.note(f"the terrains to be built take {sizes}: {advice}")
     if not inputs:
         return
     watch.begin("preparing", len(inputs))
