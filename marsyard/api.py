@@ -141,7 +141,6 @@ def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True,
 
 
 def _toml(value: Any) -> str:
-    """Format a value in TOML's notation."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{json.dumps(str(key))} = {_toml(inner)}" for key, inner in value.items()) + " }"
     if isinstance(value, list | tuple):

@@ -86,7 +86,6 @@ def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int) -> N
 
 
 def _write_shard(campaign: Campaign, path: Path, cases: range) -> None:
-    """Write one shard under a temporary name, and rename it when it is complete."""
     part = path.with_suffix(".part")
     with tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as shard:
         for case in cases:
@@ -98,7 +97,6 @@ def _write_shard(campaign: Campaign, path: Path, cases: range) -> None:
 
 
 def _files(campaign: Campaign, case: int) -> Iterator[tuple[str, bytes]]:
-    """Yield names and contents of a case's files."""
     scenario = campaign.scenario
     assert isinstance(scenario, ProvidesSamples)  # noqa: S101  (checked by `write_dataset`)
     drawn = campaign.draws(case)
@@ -118,7 +116,6 @@ def _files(campaign: Campaign, case: int) -> Iterator[tuple[str, bytes]]:
 
 
 def _encode(values: np.ndarray[Any, Any]) -> bytes:
-    """Encode whole numbers as PNG, other numbers as NPY."""
     if not np.issubdtype(values.dtype, np.integer):
         buffer = io.BytesIO()
         np.save(buffer, values, allow_pickle=False)

@@ -188,7 +188,6 @@ def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict
 
 
 def _kinds(frame: pd.DataFrame, column: str) -> list[str]:
-    """Distinct values of a column, at most `_MAX_KINDS`."""
     if column not in frame:
         return []
     return [str(value) for value in frame[column].dropna().unique()[:_MAX_KINDS]]
@@ -206,7 +205,6 @@ def page_environment() -> Environment:
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON, NaN and infinities as null."""
     if isinstance(value, Mapping):
         return {str(name): _plain(inner) for name, inner in value.items()}
     if isinstance(value, list | tuple):

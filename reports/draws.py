@@ -100,7 +100,6 @@ def _placed(figure: Figure, corner: tuple[float, float], size: tuple[float, floa
 
 
 def _heading(figure: Figure, top: float, text: str) -> None:
-    """Write a heading with its upper edge at a height in inches."""
     width, height = figure.get_size_inches()
     figure.text(_MARGIN / width, (top - 0.1) / height, text, fontsize=12, fontweight="bold", color=INK, va="top")
 
@@ -111,7 +110,6 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def _marginal(axes: Axes, drawn: Drawn) -> None:
-    """Draw the frequencies of values with their expectation."""
     kinds, values = drawn.kinds, drawn.numbers(drawn.values)
     expected = None if drawn.expected is None else drawn.numbers(drawn.expected)
     known = values if expected is None else np.concatenate([values, expected])

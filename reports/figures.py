@@ -262,7 +262,6 @@ def _annotate(axes: Axes, text: str, at: tuple[Any, Any], shift: tuple[int, int]
 
 
 def _magnitudes(frame: pd.DataFrame, metric: str, bound: float | None) -> tuple[Float[np.ndarray, " known"], float]:
-    """Known magnitudes of the errors, and the end of their axis."""
     magnitude = np.abs(numbers(frame, metric))
     known = magnitude[np.isfinite(magnitude)]
     return known, axis_edge(known, bound)
@@ -271,7 +270,6 @@ def _magnitudes(frame: pd.DataFrame, metric: str, bound: float | None) -> tuple[
 def _draw_points(
     axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], kind: Category, *, hollow: bool = False
 ) -> None:
-    """Draw points of a kind, hollow at the edge of the axes."""
     many = x.size > svg.LARGEST_VECTOR_SAMPLE
     axes.plot(
         x, y, linestyle="", marker=kind.marker, markersize=3.0 if many else 5.5, alpha=0.55 if many else 0.85,

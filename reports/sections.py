@@ -111,7 +111,6 @@ def _conditions(run: StoredRun, metric: str) -> list[str]:
 def _case_table(
     run: StoredRun, order: Int[np.ndarray, " n"], columns: Sequence[str], pictured: Collection[str] = ()
 ) -> CaseTable:
-    """The first rows of an order with the columns that exist."""
     frame = run.whole
     shown = [name for name in columns if name in frame]
     rows = []

@@ -67,12 +67,7 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
         inside += (along / ellipse.semi_major) ** 2 + (across / ellipse.semi_minor) ** 2 <= 1.0
     how = f"{4 * trials} samples of 20, and one error more each"
     yield Measure(
-        "95 % ellipse holds the next error",
-        inside / (4 * trials),
-        "",
-        _min_coverage(0.95, 4 * trials),
-        how,
-        "at least",
+        "95 % ellipse holds the next error", inside / (4 * trials), "", _min_coverage(0.95, 4 * trials), how, "at least"
     )
 
 

@@ -189,7 +189,6 @@ class WatchedWorker:
                 os.kill(self._process.pid, number)
 
     def _kill(self) -> None:
-        """Kill the process and its descendants, and wait for their end."""
         self._signal(END_SIGNAL)
         if self._process is None or self._ends_within(_KILLING_S):
             return
@@ -350,7 +349,6 @@ class _Run:
         return [TaskResult(batch[0], None, error if isinstance(error, Exception) else RuntimeError(repr(error)))]
 
     def _handle_batch_result(self, worker: WatchedWorker, end: BatchResult[Any]) -> list[TaskResult[Any]]:
-        """Results of a delivered batch; a spent worker is replaced."""
         self._again.extend([item] for item in end.alone)
         if end.rest:
             self._again.append(list(end.rest))
@@ -395,7 +393,6 @@ class _Run:
 
 
 def _remove_abandoned_folders() -> None:
-    """Remove the temporary folders of killed executors."""
     for lock in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*/{_LOCK}"):
         with suppress(OSError):
             held = os.open(lock, os.O_RDWR)

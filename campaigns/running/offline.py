@@ -108,7 +108,6 @@ def scored_campaign(directory: Path, truth: Path, answers: Path) -> Campaign:
 
 
 def _check_answers(task: Task[Any, Any], configuration: CampaignConfiguration, answers: Path) -> None:
-    """Refuse a table that cannot be read, lacks cases or has unknown ones."""
     if task.offline is None:
         raise CampaignError(f"{configuration.name} cannot be answered in a table")
     try:

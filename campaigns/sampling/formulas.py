@@ -123,7 +123,6 @@ def _format_path(node: ast.expr) -> str:
 
 
 def _evaluate(node: ast.expr, numbers: Mapping[str, float]) -> float:
-    """Value of a node that `_list_names` has accepted."""
     match node:
         case ast.Constant(value=value):
             return float(value)  # type: ignore[arg-type]  # `_list_names` accepts numbers only

@@ -185,7 +185,6 @@ def _dispersion_data(campaign: Campaign, path: str) -> dict[str, Any]:
 
 
 def _value(value: Any) -> str:
-    """A drawn value, numbers with five digits."""
     if isinstance(value, float):
         return f"{value:.5g}"
     return value if isinstance(value, str) else json.dumps(value, default=str)

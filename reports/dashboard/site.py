@@ -77,7 +77,6 @@ def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, St
 
 
 def _write_campaign(folder: Path, entry: Entry) -> None:
-    """Write a campaign's page, its report, and pages of its kept cases."""
     page, report = folder / INDEX, entry.directory / PAGE_FILE
     if page.is_file() and page.stat().st_mtime > (entry.directory / TWIN_FILE).stat().st_mtime:
         return
@@ -96,7 +95,6 @@ def _write_campaign(folder: Path, entry: Entry) -> None:
 
 
 def _write_cases(folder: Path, entry: Entry) -> list[dict[str, str]]:
-    """Write pages of the kept cases; return their entries for the campaign's page."""
     if not entry.kept:
         return []
     run, listed = read_run(entry.directory), []

@@ -162,7 +162,6 @@ def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> No
 def _draw_rectified(
     axes: Axes, products: Mapping[str, Any], picture: Picture, ours: Sequence[Track], pair: int, side: int
 ) -> None:
-    """One picture of a pair in the virtual nadir camera."""
     lattice = numbers(products.get(f"rectified_{pair}_{side}"))
     frame, gsd = numbers(products.get(f"rectified_frame_{pair}")), numbers(products.get(f"gsd_{pair}"))
     if lattice is None or lattice.ndim != 3 or lattice.shape[2] != 2 or frame is None or frame.size != 3:
@@ -206,7 +205,6 @@ def _rectify(picture: Picture, lattice: Float[np.ndarray, "n n 2"]) -> Float[np.
 
 
 def _draw_template_window(axes: Sequence[Axes], track: Track) -> None:
-    """Draw a template and its search window with the match; nothing for what is missing."""
     line = "-" if track.valid else _DASHES
     parts = ((track.patch, f"Template {track.template + 1}", TEMPLATE, line), (track.window, "Window", WINDOW, "-"))
     for one, (picture, title, colour, style) in zip(axes, parts, strict=True):
@@ -222,7 +220,6 @@ def _draw_template_window(axes: Sequence[Axes], track: Track) -> None:
 
 
 def _mark_tracks(axes: Axes, ours: Sequence[Track], stem: str, colour: str) -> None:
-    """Numbered squares at the tracks' positions in a delivered picture."""
     box = {"facecolor": "#000000", "alpha": 0.55, "pad": 1.0, "linewidth": 0.0}
     for track in ours:
         u, v = track.values.get(f"{stem}_u", np.nan), track.values.get(f"{stem}_v", np.nan)
@@ -254,7 +251,6 @@ def _draw_square(axes: Axes, centre: tuple[float, float], side: float, colour: s
 
 
 def _picture(products: Mapping[str, Any], key: str) -> Picture:
-    """A delivered picture with columns binned to square pixels, as in DIMES."""
     counts = plane(products.get(key))
     if counts is None:
         raise ValueError(f"the products hold no picture '{key}'")

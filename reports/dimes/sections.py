@@ -141,7 +141,6 @@ def scatter_plates(subject: Subject) -> list[SvgFigure]:
 
 @in_page_style
 def _scatter(chosen: kinds.Rows, parts: Sequence[str], subject: Subject, reach: float) -> Figure:
-    """Errors of one category, marked by run."""
     figure, axes = new_axes(4.2, 4.4)
     runs = sorted(str(run) for run in subject.frame["run"].dropna().unique())
     for place, run in enumerate(runs):
@@ -204,7 +203,6 @@ def landing_shares(landed: kinds.Rows) -> dict[str, rates.Share]:
 
 
 def _speeds(landed: kinds.Rows, subject: Subject, key: str) -> kinds.Drawn:
-    """Table of mean, quantiles with bounds, and fractions above round speeds."""
     columns, groups = [numbers(landed, name) for name in (WITH, WITHOUT)], rates.terrain_groups(landed)
     change = columns[0] - columns[1]
     rows = [["mean (m/s)", *(number(float(values.mean())) for values in columns)]]

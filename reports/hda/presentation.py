@@ -42,7 +42,6 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
 
 
 def _stages(products: Mapping[str, Any]) -> tuple[list[str], list[TableRow]]:
-    """Table of the stages with their results."""
     tracks, motion = stages.tracked_features(products), stages.solved_motion(products)
     matches, maps = stages.epipolar_matches(products), stages.landing_maps(products)
     results = dict.fromkeys(("Features and tracks", "Motion", "Structure", "Map", "Site"), "")

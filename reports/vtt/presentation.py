@@ -39,6 +39,5 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
 
 
 VTT = Presentation(
-    cases=(CaseKind(is_vtt_case, view, write_vtt_figures, note_text("vtt.legend")),),
-    first=(*sections.SECTIONS, GOAL),
+    cases=(CaseKind(is_vtt_case, view, write_vtt_figures, note_text("vtt.legend")),), first=(*sections.SECTIONS, GOAL)
 )

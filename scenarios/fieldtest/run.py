@@ -17,12 +17,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.fieldtest.attitude import (
-    Targets,
-    add_thermal_drift,
-    sight_targets,
-    solve_attitude,
-)
+from marsyard.scenarios.fieldtest.attitude import Targets, add_thermal_drift, sight_targets, solve_attitude
 from marsyard.scenarios.fieldtest.parameters import (
     CAMERA,
     ElevationParameters,

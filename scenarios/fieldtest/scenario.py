@@ -14,13 +14,7 @@ from pydantic import BaseModel
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
 from marsyard.scenarios.base import LoadGround, TerrainScenario, algorithm_result
-from marsyard.scenarios.conditions import (
-    attitude_rate_deg_s,
-    hash_images,
-    off_nadir_deg,
-    picture_columns,
-    sun_columns,
-)
+from marsyard.scenarios.conditions import attitude_rate_deg_s, hash_images, off_nadir_deg, picture_columns, sun_columns
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import camera_optics, draw_calibrated, render_state, sunlight_ratio
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters

@@ -148,7 +148,6 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     @model_validator(mode="before")
     @classmethod
     def _complete_terrain(cls, stated: Any) -> Any:
-        """Complete the table `terrain` with the site's own."""
         if not isinstance(stated, Mapping):
             return stated
         name, scale = stated.get("site", "heli-hazardous"), stated.get("scale", "ground")

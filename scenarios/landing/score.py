@@ -283,7 +283,6 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
 
 
 def _navigation_errors(flight: Flight, measurements: LandingMeasurements) -> dict[str, Scalar]:
-    """Errors of the on-board poses and of the inclinometers' vertical."""
     states, poses = flight.states, flight.poses
     first, second = (
         (pose.world_from_body.rotation * state.attitude.inv()).as_rotvec()

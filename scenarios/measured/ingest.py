@@ -218,7 +218,6 @@ class _FolderReader:
     def _body_pose(
         self, row: PictureRow, rotation: Rotation, position: Float64[np.ndarray, "n"] | None
     ) -> tuple[Rotation, Float64[np.ndarray, "3"] | None]:
-        """Convert a recorded pose to the attitude and position of the body."""
         poses = self.file.poses
         if poses is None:
             raise row.error(f"quaternions are given, but {INGEST_FILE} has no [poses] that says in which axes")
@@ -228,7 +227,6 @@ class _FolderReader:
         return poses.bodies(vehicle), np.asarray(poses.world.apply(position) + poses.levers(vehicle))
 
     def _to_world(self, row: PictureRow, vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
-        """Rotate a vector of the table to east, north, up."""
         if self.file.poses is None:
             raise row.error(f"vectors are given, but {INGEST_FILE} has no [poses] that says in which axes")
         return np.asarray(self.file.poses.world.apply(vector))

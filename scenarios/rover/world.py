@@ -148,7 +148,6 @@ def place_rocks(p: RoverScenarioParameters, bare: SiteGround, rng: np.random.Gen
 
 
 def _distances(rocks: RockField, position: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "rocks"]:
-    """Horizontal distances of rocks from a position on the periodic ground."""
     away = rocks.position_m[:, :2] - position
     away -= rocks.period_m * np.round(away / rocks.period_m)
     return np.asarray(np.hypot(away[:, 0], away[:, 1]))

@@ -380,7 +380,6 @@ def _fisheye_directions(points: Array, coefficients: Array) -> Array:
 
 
 def _in_world(directions: Array, camera_from_world: RigidTransform | None) -> Array:
-    """Rotate directions from OpenCV's axes to the camera's frame of reference."""
     return directions if camera_from_world is None else directions @ camera_from_world.as_matrix()[:3, :3]
 
 

@@ -126,7 +126,6 @@ def _unit_box() -> Triangles:
 
 @cache
 def _unit_rod() -> Triangles:
-    """A cylinder along z from 0 to 1, of radius 1."""
     import trimesh
 
     rod = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=_SIDES)
@@ -138,7 +137,6 @@ def _rod(
     end: Float64[np.ndarray, "3"] | tuple[float, float, float],
     radius_m: float,
 ) -> Triangles:
-    """A closed cylinder between two points."""
     along = np.subtract(end, start)
     x = np.cross(np.eye(3)[int(np.argmin(np.abs(along)))], along)
     x /= np.linalg.norm(x)

@@ -139,7 +139,6 @@ def _normalize(vectors: Vectors) -> Vectors:
 
 
 def _add_offset(up: Vectors, offset: Float64[np.ndarray, "*any 2"]) -> Vectors:
-    """Add an offset to the x and y components of unit vectors and normalise them."""
     tilted = up.copy()
     tilted[:, :2] += offset
     return _normalize(tilted)

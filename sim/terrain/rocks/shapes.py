@@ -86,7 +86,6 @@ def _max_pixels_per_deviation() -> Float64[np.ndarray, "shapes levels"]:
 
 @cache
 def _icosphere(detail: int) -> tuple[Float64[np.ndarray, "n 3"], Int32[np.ndarray, "faces 3"]]:
-    """Unit vectors and triangles of the subdivided icosahedron."""
     import trimesh  # here, as it is slow to import
 
     sphere = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS[detail])

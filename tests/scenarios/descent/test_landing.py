@@ -33,8 +33,7 @@ def test_a_wrong_answer_does_harm() -> None:
 
 
 @pytest.mark.parametrize(
-    ("believed", "available_s"),
-    [(None, 17.0), (DRIFT, EXACT.computation_s - 0.1), (np.array([3.0, -4.0]), 17.0)],
+    ("believed", "available_s"), [(None, 17.0), (DRIFT, EXACT.computation_s - 0.1), (np.array([3.0, -4.0]), 17.0)]
 )
 def test_without_an_answer_in_time_nothing_is_steered(believed: np.ndarray | None, available_s: float) -> None:
     landed = touchdown(EXACT, DRIFT, believed, available_s, _rng())

@@ -94,10 +94,7 @@ def test_a_picture_that_is_cut_short_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "least", "most", "mean"),
-    [
-        ("1F483288473EFFCMUFP1214L0M1.IMG", 5, 4046, 840.053),
-        ("1N491020376ILFCNY9P0706L0M1.IMG", 517, 4029, 1421.71),
-    ],
+    [("1F483288473EFFCMUFP1214L0M1.IMG", 5, 4046, 840.053), ("1N491020376ILFCNY9P0706L0M1.IMG", 517, 4029, 1421.71)],
 )
 def test_opportunitys_pictures_have_their_labels_statistics(
     shared_data: Path, name: str, least: int, most: int, mean: float
