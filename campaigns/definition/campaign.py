@@ -22,7 +22,7 @@ from marsyard.campaigns.sampling.design import (
 from marsyard.campaigns.sampling.dispersion import Dispersion
 from marsyard.campaigns.sampling.dispersions import Derived, Fixed, Grid, InTurn, Normal
 from marsyard.scenarios.interface import Scenario
-from marsyard.sim.renamed import stream_name
+from marsyard.sim.parameters import stream_name
 from marsyard.sim.streams import Streams
 
 

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, current_path
 from marsyard.scenarios.interface import Scenario
 from marsyard.scenarios.systems import UnknownScenarioError, row_columns, scenario
-from marsyard.sim.renamed import RenamedWarning, current_column, current_key
+from marsyard.sim.parameters import RenamedWarning, current_column, current_key
 
 _NAME = re.compile(r"[A-Za-z_]\w*(?:\.\w+)*")
 #: Keys of a dispersion whose texts are no formulas.

@@ -16,14 +16,12 @@ from typer import Option
 from typer.core import TyperCommand, TyperGroup
 
 from marsyard.cli.campaign import append, replay, resume, run
-from marsyard.cli.conformance import conformance
 from marsyard.cli.housekeeping import clean, compile_kernels
 from marsyard.cli.new import ingest, new
-from marsyard.cli.nightly import nightly
-from marsyard.cli.offline import dataset, export, score
+from marsyard.cli.offline import conformance, dataset, export, score
 from marsyard.cli.options import CampaignArgument, Exit, JsonOption, SetOption, console, handle_user_errors
 from marsyard.cli.render import gallery, render
-from marsyard.cli.report import compare, dashboard, report
+from marsyard.cli.report import compare, dashboard, nightly, report
 from marsyard.cli.terrain import app as terrain
 
 
@@ -161,7 +159,7 @@ _format_usual = warnings.formatwarning
 def _format_warning(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
 ) -> str:
-    from marsyard.sim.renamed import RenamedWarning
+    from marsyard.sim.parameters import RenamedWarning
 
     if issubclass(category, RenamedWarning):
         return f"warning: {message}\n"
@@ -174,7 +172,7 @@ def main() -> None:
     warnings.filterwarnings("ignore", message="Failed to kill subprocesses")
     warnings.formatwarning = _format_warning
     if not {"--help", "--version"}.issuperset(sys.argv[1:]):  # these answer before NumPy is imported
-        from marsyard.sim.renamed import current_options
+        from marsyard.sim.parameters import current_options
 
         sys.argv[1:] = current_options(sys.argv[1:])
     try:
