@@ -17,8 +17,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from marsyard.campaigns.definition import catalogue as shipped
 from marsyard.campaigns.definition import loading
+from marsyard.campaigns.definition import loading as shipped
 from marsyard.campaigns.definition.campaign import Campaign as Campaign
 from marsyard.scenarios.interface import CaseResult as CaseResult
 from marsyard.sim.camera import CameraModel as CameraModel

@@ -19,7 +19,6 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from marsyard.reports import figures
-from marsyard.reports.columns import axis_columns, driver_columns, label, numbers
 from marsyard.reports.rates import CONFIDENCE, engine_failed, members, terrain_groups
 from marsyard.reports.sampling_design import sampled
 from marsyard.reports.section import Grid, SvgFigure, plate
@@ -28,7 +27,19 @@ from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.tables import outcome_counts
 from marsyard.reports.traceability import algorithms_of
 from marsyard.reports.verdicts import Verdict
-from marsyard.reports.wording import NOTHING, asked_text, coefficient, count, number, percent, stated
+from marsyard.reports.wording import (
+    NOTHING,
+    asked_text,
+    axis_columns,
+    coefficient,
+    count,
+    driver_columns,
+    label,
+    number,
+    numbers,
+    percent,
+    stated,
+)
 
 #: Maximum number of rows of the tables of single cases.
 _MAX_CASES = 10

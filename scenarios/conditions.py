@@ -10,7 +10,7 @@ from jaxtyping import Float64, UInt16
 
 from marsyard.scenarios.interface import Scalar
 from marsyard.sim.dynamics import State
-from marsyard.sim.processor import processor_features
+from marsyard.sim.kernel_cache import processor_features
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import Backend
 

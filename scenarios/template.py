@@ -12,7 +12,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from marsyard.scenarios.descent.parameters import binned_size_for
-from marsyard.scenarios.system import SCENARIOS_FOLDER
+from marsyard.scenarios.systems import SCENARIOS_FOLDER
 from marsyard.sim.camera import read_camera
 
 #: Number of terrains of a new campaign's bank: enough for appended cases, and the maximum of a bank.

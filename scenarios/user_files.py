@@ -8,12 +8,16 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Protocol, TypeVar, runtime_checkable
+from typing import Annotated, Any, Literal, Protocol, TypeVar, runtime_checkable
 
+import numpy as np
+from jaxtyping import Float64
 from pydantic import BaseModel, Field, model_validator
+from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.faults import AlgorithmError
 from marsyard.sim.files import check_regular
+from marsyard.sim.frames import SITE_FROM_WORLD
 from marsyard.sim.parameters import Parameters
 
 Row = TypeVar("Row")
@@ -165,3 +169,46 @@ def check_together(groups: Iterable[Sequence[str]], given: Mapping[str, float]) 
         missing = [name for name in names if name not in given]
         if filled and missing:
             raise ValueError(f"{filled[0]} is given, but {missing[0]} is not")
+
+
+#: Rotations from a file's world axes to east, north, up.
+_WORLD = {"enu": Rotation.identity(), "ned": SITE_FROM_WORLD.inv()}
+#: OpenCV's camera axes (x right, y down, z forward) in the body's: camera along -z, columns along x.
+_CAMERA_IN_BODY = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+
+
+class RecordedAxes(Parameters):
+    """Axes of recorded poses, and mounting of the camera in the recorded vehicle."""
+
+    axes: Annotated[Literal["enu", "ned"], Field(description="world axes: east, north, up; or north, east, down")]
+    attitude_of: Annotated[
+        Literal["camera", "body"],
+        Field(description="whose axes: OpenCV's of the camera, or the body's, whose camera looks along -z"),
+    ] = "camera"
+    mounting: Annotated[
+        tuple[float, float, float, float],
+        Field(description="quaternion x, y, z, w from those axes of the camera or body to the recorded vehicle's"),
+    ] = (0.0, 0.0, 0.0, 1.0)
+    lever_m: Annotated[
+        tuple[float, float, float], Field(description="the camera in the recorded vehicle's axes, m")
+    ] = (0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _check_mounting(self) -> RecordedAxes:
+        if abs(float(np.linalg.norm(self.mounting)) - 1.0) > 1e-3:
+            raise ValueError(f"mounting {list(self.mounting)} is no quaternion of length 1")
+        return self
+
+    @property
+    def world(self) -> Rotation:
+        """Rotation from the file's world axes to east, north, up."""
+        return _WORLD[self.axes]
+
+    def bodies(self, world_from_vehicle: Rotation) -> Rotation:
+        """Convert attitudes of the recorded vehicle to those of the body, both relative to east, north, up."""
+        attitudes = world_from_vehicle * Rotation.from_quat(np.array(self.mounting))
+        return attitudes * _CAMERA_IN_BODY.inv() if self.attitude_of == "camera" else attitudes
+
+    def levers(self, world_from_vehicle: Rotation) -> Float64[np.ndarray, "*batch 3"]:
+        """Return the offsets from the recorded vehicle to the camera in east, north, up."""
+        return np.asarray(world_from_vehicle.apply(np.array(self.lever_m)))

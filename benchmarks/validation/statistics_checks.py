@@ -11,8 +11,7 @@ from scipy import stats
 from benchmarks.validation.nights import BEFORE, CASES, KINDS, WORSE, planted_found, quiet_nights
 from benchmarks.validation.records import Check, Measure
 from marsyard.reports.history import WINDOW
-from marsyard.reports.statistics.clusters import clustered_evidence
-from marsyard.reports.statistics.proportions import Interval, proportion_lower, proportion_upper
+from marsyard.reports.statistics.proportions import Interval, clustered_evidence, proportion_lower, proportion_upper
 from marsyard.reports.statistics.samples import error_ellipse, mean_interval, quantile_bounds, spread_interval
 from marsyard.reports.statistics.sequential import confidence_at, planned_looks
 

@@ -17,7 +17,6 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves, value_at
-from marsyard.campaigns.definition.catalogue import catalogue
 from marsyard.campaigns.definition.configuration import (
     POPULATIONS,
     CampaignConfiguration,
@@ -37,7 +36,13 @@ from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
 from marsyard.scenarios.estimators import labels
 from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
 from marsyard.scenarios.parts.named import SCORE
-from marsyard.scenarios.systems import RowColumns, UnknownScenarioError, row_columns, scenario
+from marsyard.scenarios.systems import RowColumns, UnknownScenarioError, row_columns, scenario, systems
+
+
+def catalogue() -> dict[str, Path]:
+    """The campaign files of all systems, by their campaigns' names in order."""
+    return dict(sorted((name, path) for system in systems() for name, path in system.campaigns.items()))
+
 
 #: Keys of the file that `--set` may name; any other key is one of the parameters.
 _FILE_KEYS = (

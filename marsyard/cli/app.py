@@ -62,7 +62,7 @@ def list_campaigns(as_json: JsonOption = False) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from marsyard.campaigns.definition.catalogue import catalogue
+    from marsyard.campaigns.definition.loading import catalogue
     from marsyard.scenarios.systems import problems
 
     for problem in problems():

@@ -55,15 +55,15 @@ def run(given: RunOptions) -> None:
     loaded = load_campaign(given.campaign, changes, given.cases, given.seed, given.algorithm or [])
     # imported after loading, so that an error in the file is reported at once
     from marsyard.campaigns.running.engine import run_campaign
-    from marsyard.cli import evidence
+    from marsyard.cli import outcome
 
     executor = make_executor(given.jobs, given.cluster)
     if given.dry_run:
-        evidence.print_estimate(loaded, executor)
-        evidence.print_limits(loaded)
+        outcome.print_estimate(loaded, executor)
+        outcome.print_limits(loaded)
         return
     directory = given.out if given.out is not None else default_directory(loaded.configuration.name)
-    start = evidence.run_until_decided if given.until_decided else run_campaign
+    start = outcome.run_until_decided if given.until_decided else run_campaign
     run_and_judge(directory, lambda watch: start(loaded, directory, executor, watch))
 
 
@@ -88,7 +88,7 @@ def resume(
     from marsyard.campaigns.errors import CampaignError, not_allowed
     from marsyard.campaigns.outcomes import RETRYABLE
     from marsyard.campaigns.running.engine import resume_campaign
-    from marsyard.cli.evidence import continue_until_decided
+    from marsyard.cli.outcome import continue_until_decided
 
     executor, allowed = make_executor(jobs, cluster), [*RETRYABLE, "all"]
     for word in retry or []:
@@ -115,11 +115,11 @@ def append(
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.running.engine import append_cases, campaign_with_block
     from marsyard.campaigns.store.record import stored_configuration
-    from marsyard.cli import evidence
+    from marsyard.cli import outcome
 
     if stored_configuration(directory).max_cases is not None:
         raise CampaignError(f"{directory} stopped itself (--until-decided): more cases would buy a second chance")
-    evidence.print_limits(campaign_with_block(directory, cases))
+    outcome.print_limits(campaign_with_block(directory, cases))
     executor = make_executor(jobs, cluster)
     run_and_judge(directory, lambda watch: append_cases(directory, cases, executor, watch, allow_changed=allow_changed))
 
@@ -143,7 +143,7 @@ def replay(
         write_packed,
     )
     from marsyard.cli.stages import write_stages
-    from marsyard.reports.cases import write_case_figures
+    from marsyard.reports.presentation import write_case_figures
 
     replayed = run_again(directory, case)
     target = out if out is not None else case_directory(directory, case)

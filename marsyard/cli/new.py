@@ -19,7 +19,7 @@ from marsyard.cli.options import OverwriteOption, handle_user_errors, with_optio
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
-    from marsyard.scenarios.system import Ingested
+    from marsyard.scenarios.systems import Ingested
     from marsyard.scenarios.template import CampaignTemplate, Choices
 
 CAMPAIGN_FILE = "campaign.toml"
@@ -47,7 +47,7 @@ class NewOptions:
 def new(given: NewOptions) -> None:
     """Write a commented campaign of your own; at a terminal asks for what is not given."""
     from marsyard.campaigns.errors import CampaignError, not_allowed
-    from marsyard.cli.evidence import evidence_limits
+    from marsyard.cli.outcome import evidence_limits
     from marsyard.reports.wording import count
     from marsyard.scenarios.import_path import import_object
     from marsyard.scenarios.systems import template_paths

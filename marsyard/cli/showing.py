@@ -16,8 +16,7 @@ from marsyard.campaigns.definition.campaign import Campaign, leaves, value_at
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, description_at
 from marsyard.campaigns.errors import CampaignError, writing
 from marsyard.campaigns.sampling.design import describe_design
-from marsyard.reports.columns import split_unit
-from marsyard.reports.wording import asked_text, count
+from marsyard.reports.wording import asked_text, count, split_unit
 
 if TYPE_CHECKING:
     from marsyard.reports.section import Grid

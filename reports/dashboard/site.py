@@ -16,9 +16,9 @@ from typing import Any
 
 from marsyard.campaigns.definition.requirements import StatedRequirement, shipped_requirements
 from marsyard.reports.campaign import PAGE_FILE, TWIN_FILE, VERIFICATION_FILE, page_environment, write_whole
-from marsyard.reports.cases import shown_case
 from marsyard.reports.dashboard import entries as stored
 from marsyard.reports.dashboard.entries import Entry, RequirementRow, basis_text, evidence_text, margin_text
+from marsyard.reports.presentation import shown_case
 from marsyard.reports.sections import embedded, replay_command, script_hash
 from marsyard.reports.stored import read_run
 from marsyard.reports.traceability import algorithm_cells, verification_csv

@@ -11,13 +11,20 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from marsyard.reports import presentation
-from marsyard.reports.columns import label
+from marsyard.reports.charts import INK, MARKERS, MUTED, SERIES, in_page_style
 from marsyard.reports.dimes import case_figures as figures
 from marsyard.reports.dimes.sections import FIRING, LANDING, field_test_section, sensitivity_section
-from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow, numbers, plane, read_arrays
+from marsyard.reports.presentation import (
+    CaseKind,
+    CaseView,
+    Presentation,
+    TableRow,
+    numeric_product,
+    plane,
+    read_arrays,
+)
 from marsyard.reports.section import plate
-from marsyard.reports.svg import INK, MARKERS, MUTED, SERIES, in_page_style
-from marsyard.reports.wording import note_text, number
+from marsyard.reports.wording import label, note_text, number
 
 #: Columns of the tracks that the page shows elsewhere or has no width for.
 _NOT_SHOWN = ("pair", "template", "valid", "ground_east_m", "ground_north_m")
@@ -51,7 +58,7 @@ def _velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Estimated and true velocity, if the products hold them."""
     facts = []
     for key, name in (("velocity_estimated_m_s", "Estimated velocity"), ("velocity_true_m_s", "True velocity")):
-        velocity = numbers(products.get(key))
+        velocity = numeric_product(products.get(key))
         if velocity is not None and velocity.size >= 2 and np.isfinite(velocity.ravel()[:2]).all():
             east, north = velocity.ravel()[:2]
             facts.append((name, f"{east:+.2f} m/s east, {north:+.2f} m/s north"))

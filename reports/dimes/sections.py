@@ -16,13 +16,24 @@ from matplotlib.patches import Circle
 from scipy import stats
 
 from marsyard.reports import kinds, rates
-from marsyard.reports.columns import axis_columns, label, magnitude_label, numbers, split_unit
-from marsyard.reports.papers import read_paper
+from marsyard.reports.charts import MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, SvgFigure, grid_of, plate
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.svg import MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
-from marsyard.reports.wording import NOTHING, count, note_text, number, percent, stated
+from marsyard.reports.tables import read_paper
+from marsyard.reports.wording import (
+    NOTHING,
+    axis_columns,
+    count,
+    label,
+    magnitude_label,
+    note_text,
+    number,
+    numbers,
+    percent,
+    split_unit,
+    stated,
+)
 
 #: Rows of the paper's Fig. 11 by (category, run).
 FIG_11: Mapping[tuple[str, str], Mapping[str, Any]] = {

@@ -14,14 +14,20 @@ from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from marsyard.reports.columns import label, numbers
+from marsyard.reports.charts import MARKERS, MUTED, SERIES, in_page_style, new_axes, show_picture
 from marsyard.reports.dimes.presentation import DIMES_CASE
 from marsyard.reports.hda.case_figures import FIGURES, figures_reached
-from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow, plane, save_figures
-from marsyard.reports.presentation import numbers as finite_numbers
+from marsyard.reports.presentation import (
+    CaseKind,
+    CaseView,
+    Presentation,
+    TableRow,
+    numeric_product,
+    plane,
+    save_figures,
+)
 from marsyard.reports.section import Block, Grid, Section, Subject, plate
-from marsyard.reports.svg import MARKERS, MUTED, SERIES, in_page_style, new_axes, show_picture
-from marsyard.reports.wording import NOTHING, number
+from marsyard.reports.wording import NOTHING, label, number, numbers
 
 MEDIAN, PERCENTILE_90 = "residual_median_px", "residual_90_percent_px"
 #: Maximum number of rows of the table; further cases are counted.
@@ -201,7 +207,7 @@ def matched_pairs(products: Mapping[str, Any]) -> list[MatchedPair]:
     """Readable pairs of a case's products."""
     pairs = []
     for k in _PICTURES:
-        table = finite_numbers(products.get(f"matches_{k}"))
+        table = numeric_product(products.get(f"matches_{k}"))
         first, second = (plane(products.get(f"image_{one}")) for one in (k, k + 1))
         if table is not None and table.ndim == 2 and table.shape[1] == 7 and first is not None and second is not None:
             pixels, right = table[:, :4].reshape(-1, 2, 2), table[:, 6] > 0.0

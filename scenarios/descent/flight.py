@@ -11,12 +11,11 @@ from jaxtyping import Float64
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.descent.faults import faulty_times
+from marsyard.scenarios.descent.measurement import faulty_times
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.motions import CustomMotion, DescentPlace
-from marsyard.scenarios.recorded_axes import RecordedAxes
-from marsyard.scenarios.user_files import UserFile
+from marsyard.scenarios.user_files import RecordedAxes, UserFile
 from marsyard.sim.dynamics import State, SwingDescent, Trajectory
 from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError, read_poses
 from marsyard.sim.parameters import bounded

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from pydantic import AwareDatetime, Field, model_validator
 
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
+from marsyard.scenarios.algorithm_run import AlgorithmSelection
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import CalibrationParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredFlight

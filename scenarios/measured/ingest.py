@@ -30,7 +30,7 @@ from marsyard.scenarios.measured.layout import (
     read_ingest_file,
     read_table,
 )
-from marsyard.scenarios.system import Ingested
+from marsyard.scenarios.systems import Ingested
 from marsyard.scenarios.template import toml_environment
 from marsyard.scenarios.user_files import format_problems
 from marsyard.sim.camera import CameraModel, mount_looking_down, read_cameras, read_pds3_product

@@ -20,8 +20,7 @@ from jaxtyping import Float64, UInt16
 from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.recorded_axes import RecordedAxes
-from marsyard.scenarios.user_files import check_together, finite_number, format_problems, parse_table
+from marsyard.scenarios.user_files import RecordedAxes, check_together, finite_number, format_problems, parse_table
 from marsyard.sim.files import check_regular, npy_header, open_regular
 from marsyard.sim.frames import direction
 from marsyard.sim.parameters import Parameters, bounded

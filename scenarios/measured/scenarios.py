@@ -17,8 +17,7 @@ from marsyard.algorithms.dimes import DimesDetails, DimesOptions
 from marsyard.algorithms.hda import HdaDetails, HdaOptions, hda_products
 from marsyard.algorithms.hda.view import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate
-from marsyard.scenarios.algorithm_run import AlgorithmRun, case_result, run_algorithm_on_copy
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
+from marsyard.scenarios.algorithm_run import AlgorithmRun, AlgorithmSelection, case_result, run_algorithm_on_copy
 from marsyard.scenarios.base import BaseScenario, algorithm_result
 from marsyard.scenarios.conditions import hash_images
 from marsyard.scenarios.descent.parameters import check_binning

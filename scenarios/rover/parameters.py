@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.vtt import VttOptions
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
+from marsyard.scenarios.algorithm_run import AlgorithmSelection
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.parts.scores import CustomScores, ScoredRun
 from marsyard.scenarios.terrain_files import check_site

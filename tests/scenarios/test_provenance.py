@@ -7,7 +7,7 @@ import hashlib
 import numpy as np
 
 from marsyard.scenarios.conditions import hash_images, picture_columns
-from marsyard.sim.processor import processor_features
+from marsyard.sim.kernel_cache import processor_features
 from marsyard.sim.render.backend import default_backend
 
 

@@ -15,7 +15,7 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
 from marsyard.sim.cache import cache_directory, evict_files, load_array, save_array, touch
-from marsyard.sim.processor import processor_features
+from marsyard.sim.kernel_cache import processor_features
 
 SHAPES_OF_FORM = 16  #: Shapes of each form; the first blocks are angular, the last rounded.
 #: Forms in the order of their shapes' numbers: blocks, and the rough clinker of a'a.

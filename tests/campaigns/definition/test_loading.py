@@ -11,8 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from marsyard.campaigns.definition.catalogue import catalogue
-from marsyard.campaigns.definition.loading import find_campaign, load_campaign
+from marsyard.campaigns.definition.loading import catalogue, find_campaign, load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 
 CampaignFile = Callable[..., Path]

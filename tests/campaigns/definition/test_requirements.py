@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.campaigns.definition.catalogue import catalogue
-from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.loading import catalogue, load_campaign
 from marsyard.campaigns.definition.requirements import read_requirements, select_applicable, shipped_requirements
 from marsyard.campaigns.errors import ConfigurationError
 from tests.campaigns.fake_campaign import write_campaign
