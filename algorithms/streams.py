@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from marsyard.algorithms.answers import check_velocity
-from marsyard.algorithms.faults import bad_answer
+from marsyard.algorithms.answers import bad_answer, check_velocity
 from marsyard.algorithms.interface import VelocityEstimate, VelocityStream
 from marsyard.sim.measurements import DescentMeasurements
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 
-from marsyard.campaigns.outcomes import UNFINISHED
+from marsyard.campaigns.errors import UNFINISHED
 from marsyard.reports.statistics.proportions import Interval, clustered_evidence, proportion_interval
 from marsyard.reports.wording import NOTHING, number, numbers, percent
 

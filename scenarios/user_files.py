@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from pydantic import BaseModel, Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.faults import AlgorithmError
+from marsyard.algorithms.answers import AlgorithmError
 from marsyard.sim.files import check_regular
 from marsyard.sim.frames import SITE_FROM_WORLD
 from marsyard.sim.parameters import Parameters

@@ -14,11 +14,19 @@ from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.hda.estimator import find_site, matched_structure
-from marsyard.algorithms.hda.motion import Motion, assess_motion
+from marsyard.algorithms.hda.motion import (
+    LandingScene,
+    Motion,
+    Views,
+    assess_motion,
+    build_scene,
+    points_at_depth,
+    project_points,
+    undistort,
+)
 from marsyard.algorithms.hda.options import HdaOptions
 from marsyard.algorithms.hda.structure import Fate, Matches, depth_bounds, epipolar_segments, pixel_lattice, triangulate
 from marsyard.algorithms.hda.tracking import Tracks
-from marsyard.algorithms.hda.view import LandingScene, Views, build_scene, points_at_depth, project_points, undistort
 from marsyard.algorithms.interface import SiteEstimate
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid

@@ -17,11 +17,19 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.arrays import Points2, Points3, Vector3
 from marsyard.algorithms.hda import hazards
 from marsyard.algorithms.hda.details import Ground, HdaDetails
-from marsyard.algorithms.hda.motion import Motion, estimate_motion, plane_depths
+from marsyard.algorithms.hda.motion import (
+    LandingScene,
+    Motion,
+    View,
+    build_scene,
+    estimate_motion,
+    plane_depths,
+    points_at_depth,
+    undistort,
+)
 from marsyard.algorithms.hda.options import HdaOptions, SurfaceFrame, TrackSeed
 from marsyard.algorithms.hda.structure import Matches, dense_structure, scale_factor
 from marsyard.algorithms.hda.tracking import Tracks, select_features, track_features
-from marsyard.algorithms.hda.view import LandingScene, View, build_scene, points_at_depth, undistort
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements

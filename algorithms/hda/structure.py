@@ -11,9 +11,8 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.arrays import Flags, Points2
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.motion import Motion
+from marsyard.algorithms.hda.motion import Motion, View, Views, points_at_depth, project_points, undistort
 from marsyard.algorithms.hda.options import HdaOptions
-from marsyard.algorithms.hda.view import View, Views, points_at_depth, project_points, undistort
 
 
 class Fate(IntEnum):

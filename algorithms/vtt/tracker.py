@@ -176,7 +176,7 @@ class VisualTargetTracker:
     """Tracks a target by its template, scaled and rolled with the rover's motion; see `TargetTracker`.
 
     `PURE_NCC` as options is the paper's baseline; `matcher` replaces the search in the left image (see
-    `marsyard.algorithms.vtt.lucas_kanade`).
+    `marsyard.algorithms.vtt.matching`).
     """
 
     def __init__(

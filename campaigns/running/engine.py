@@ -16,11 +16,10 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, key_text
 from marsyard.campaigns.definition.identity import Identity, describe_algorithms, identity_of
 from marsyard.campaigns.definition.loading import NUMBERS, find_unknown_columns
-from marsyard.campaigns.errors import CampaignError, ConfigurationError, Problem, StoreError
+from marsyard.campaigns.errors import RETRYABLE, UNFINISHED, CampaignError, ConfigurationError, Problem, StoreError
 from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
 from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
-from marsyard.campaigns.outcomes import RETRYABLE, UNFINISHED
 from marsyard.campaigns.running.preparation import plan_inputs, report_compilation
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_with
 from marsyard.campaigns.store import record

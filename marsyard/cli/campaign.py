@@ -85,8 +85,7 @@ def resume(
     allow_changed: options.ChangedOption = False,
 ) -> None:
     """Run the remaining cases of an interrupted or killed campaign, and judge it."""
-    from marsyard.campaigns.errors import CampaignError, not_allowed
-    from marsyard.campaigns.outcomes import RETRYABLE
+    from marsyard.campaigns.errors import RETRYABLE, CampaignError, not_allowed
     from marsyard.campaigns.running.engine import resume_campaign
     from marsyard.cli.outcome import continue_until_decided
 

@@ -124,7 +124,7 @@ def conformance(
     as_json: JsonOption = False,
 ) -> None:
     """Check an algorithm, or a custom motion, instrument or score, against its protocol: types, inputs, time, ..."""
-    from marsyard.campaigns.running.conformance import examine, subject_of
+    from marsyard.campaigns.running.replay import examine, subject_of
     from marsyard.scenarios.parts.named import KINDS
 
     subject = subject_of(algorithm, task, time_limit)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from marsyard.sim.terrain import Surface
     from marsyard.sim.terrain.imported import Embedded, RealExtent
     from marsyard.sim.terrain.parameters import TerrainParameters
-    from marsyard.sim.terrain.statistics import TerrainStatistics
+    from marsyard.sim.terrain.surface import TerrainStatistics
 
 #: Longest side of a picture; colours are blue, green, red.
 MAX_PIXELS = 2048
@@ -63,7 +63,7 @@ def stats(
     from marsyard.sim.terrain.bank import synthesise
     from marsyard.sim.terrain.imported import embed
     from marsyard.sim.terrain.sites import PAPER
-    from marsyard.sim.terrain.statistics import terrain_statistics
+    from marsyard.sim.terrain.surface import terrain_statistics
 
     try:
         known = site_or_file(site, MAX_HOLE_FRACTION if max_holes is None else max_holes)
@@ -110,7 +110,7 @@ def _print_statistics(
     from rich.table import Table
 
     from marsyard.sim.terrain.sites import PAPER
-    from marsyard.sim.terrain.statistics import CONTRAST_PIXEL_M, CONTRAST_SUN_ELEVATION_DEG
+    from marsyard.sim.terrain.surface import CONTRAST_PIXEL_M, CONTRAST_SUN_ELEVATION_DEG
 
     side, paper = parameters.samples * parameters.spacing_m, PAPER.get(name)
     albedo, slope, relief, contrast = "", "", "", ""
@@ -164,7 +164,7 @@ def write_terrain_picture(path: Path, surface: Surface, real: Embedded | None) -
     import cv2
     import numpy as np
 
-    from marsyard.sim.terrain.statistics import CONTRAST_SUN_ELEVATION_DEG, nadir_picture
+    from marsyard.sim.terrain.surface import CONTRAST_SUN_ELEVATION_DEG, nadir_picture
 
     if path.suffix.lower() != ".png":
         raise ValueError(f"--picture {path}: a file that ends in .png is needed")

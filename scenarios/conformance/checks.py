@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from marsyard.algorithms.faults import AlgorithmError
+from marsyard.algorithms.answers import AlgorithmError
 from marsyard.scenarios.algorithm_run import copy_inputs, hash_inputs
 from marsyard.scenarios.estimators import algorithm_sources
 
@@ -80,7 +80,7 @@ class Check:
 class Suite(ABC):
     """Conformance suite of one algorithm or part, which is constructed again for each check.
 
-    The process of a check detects state left behind in it (`marsyard.campaigns.running.conformance`).
+    The process of a check detects state left behind in it (`marsyard.campaigns.running.replay`).
 
     - make: constructs the algorithm or part
     - program: it is a program with files as input, which cannot change the suite's objects

@@ -11,10 +11,10 @@ from jaxtyping import Float64, UInt16
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
+from marsyard.scenarios.conditions import SizedFaults
 from marsyard.scenarios.descent.exposure import World, calibrated_camera
 from marsyard.scenarios.descent.flight import MARGIN_S, DescentFlight, gravity_m_s2
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.faults import SizedFaults
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.instruments import (
     CustomAltimeter,

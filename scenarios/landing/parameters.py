@@ -11,10 +11,10 @@ from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.hda import HdaOptions, TrackSeed
 from marsyard.scenarios.algorithm_run import AlgorithmSelection
+from marsyard.scenarios.conditions import SizedFaults
 from marsyard.scenarios.descent.parameters import Location, RenderParameters, SunParameters
 from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.exposure import CalibrationParameters
-from marsyard.scenarios.faults import SizedFaults
 from marsyard.scenarios.landing.helicopter import HelicopterParameters
 from marsyard.scenarios.landing.relief import Limits
 from marsyard.scenarios.meshes import MeshParameters

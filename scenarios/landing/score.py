@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.hda import STAGES, Fate, HdaDetails, hda_products
-from marsyard.algorithms.hda.view import camera_pose
+from marsyard.algorithms.hda.motion import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.conditions import sun_columns
 from marsyard.scenarios.interface import Scalar

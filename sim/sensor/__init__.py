@@ -14,9 +14,8 @@ from marsyard.sim.sensor.mast import (
     mount_on_head,
     stereo_mast,
 )
-from marsyard.sim.sensor.motion import ImageMotion
 from marsyard.sim.sensor.odometry import OdometryParameters
-from marsyard.sim.sensor.optics import natural_fall_off
+from marsyard.sim.sensor.optics import ImageMotion, natural_fall_off
 from marsyard.sim.sensor.presets import (
     PRESETS,
     CameraDesign,

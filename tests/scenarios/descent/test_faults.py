@@ -9,6 +9,7 @@ import pytest
 from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
 
+from marsyard.scenarios.conditions import deliver, faulty_detector
 from marsyard.scenarios.descent.exposure import (
     SHIELD_DIAMETER_M,
     HeatShield,
@@ -27,7 +28,6 @@ from marsyard.scenarios.descent.measurement import (
     faulty_times,
 )
 from marsyard.scenarios.descent.parameters import CameraParameters
-from marsyard.scenarios.faults import deliver, faulty_detector
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from marsyard.scenarios.faults import faulty_detector
+from marsyard.scenarios.conditions import faulty_detector
 from marsyard.scenarios.landing.helicopter import HelicopterParameters, Transit
 from marsyard.scenarios.landing.parameters import (
     Faults,
