@@ -1,4 +1,4 @@
-"""Errors that a user can fix: each is printed as one message, without a traceback, and ends with status 2."""
+"""Outcomes of cases, and errors that a user can fix: one message without a traceback, exit status 2."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Charts of report sections: cumulative curves, rates against a condition, stacked bars, scatter panels."""
+"""Figures as SVG in the style of the page, and charts: cumulative curves, rates, stacked bars, scatter panels."""
 
 from __future__ import annotations
 

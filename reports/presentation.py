@@ -1,4 +1,4 @@
-"""Presentation of a system: its report sections, and the pictures of its cases.
+"""Presentation of a system: its report sections, and which cases are shown with their pictures.
 
 `marsyard.scenarios.systems.System.report` names it; reports find systems in `marsyard.scenarios.systems`.
 """

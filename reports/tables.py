@@ -1,4 +1,4 @@
-"""Verdicts as a Rich table, outcomes and error statistics; texts from files are `Text` objects, never markup."""
+"""Tables of verdicts, outcomes, errors and comparisons with papers; texts from files are `Text`, never markup."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers, fractions and requirements as text: significant digits, and rates never rounded up to certainty."""
+"""Texts of reports: numbers, fractions, requirements, and names of columns with units."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Columns of a case: conditions computed from the simulated objects, and provenance of the pictures."""
+"""Columns of a case: conditions, provenance of the pictures, and the faults that a case may have."""
 
 from __future__ import annotations
 

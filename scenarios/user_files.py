@@ -1,4 +1,4 @@
-"""Files of a user: parameters that name a file with its hash, CSV tables, and lists of problems."""
+"""Files of a user: parameters that name a file with its hash, CSV tables, axes of recordings, and lists of problems."""
 
 from __future__ import annotations
 

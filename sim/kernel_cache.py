@@ -1,4 +1,4 @@
-"""Cache folder of compiled kernels: one folder per state of the kernels' sources.
+"""Cache folder of compiled kernels: one folder per state of the kernels' sources and per processor.
 
 numba recompiles a function when its own file changes, not when a function that it calls from another file changes. A
 stale kernel would return old results. Any change of any kernel source therefore selects a new folder.

@@ -1,4 +1,4 @@
-"""Structure from motion: the camera's motion and the features' depths from their tracks (section II.B)."""
+"""Undistorted views, and structure from motion: camera motion and depths of features from tracks (section II.B)."""
 
 from __future__ import annotations
 

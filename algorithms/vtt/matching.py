@@ -1,4 +1,4 @@
-"""Prediction of the target, magnification and roll (4.1, 4.3.1); template extraction and matching (4.3.2, 4.3.3)."""
+"""Prediction of the target, magnification and roll (4.1, 4.3.1); template matching (4.3.2, 4.3.3)."""
 
 from __future__ import annotations
 

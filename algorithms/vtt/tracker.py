@@ -1,4 +1,4 @@
-"""The visual target tracker: the loop of section 4.1 and its states.
+"""The visual target tracker: the loop of section 4.1, its states, and the criteria of a loss.
 
 The steps are functions of `pointing`, `matching`, `stereo`, `loss` and `accuracy`. The state of a track is an
 immutable `Track`; the tracker holds the latest one.

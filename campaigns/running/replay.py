@@ -1,4 +1,4 @@
-"""Stored campaigns loaded again, and single cases of them run again and compared with their stored rows."""
+"""Stored campaigns loaded again, single cases compared with their stored rows, and checks of an algorithm."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Base class of the dispersions, types of their fields, and quantiles of truncated distributions.
+"""Base class of the dispersions, types of their fields, formulas, and quantiles of truncated distributions.
 
 A dispersion is a parameter's distribution over the cases, as an inverse distribution function. It maps one uniform
 number to a value. The values of a case therefore depend on one number per dispersion, whether these numbers are

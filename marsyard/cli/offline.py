@@ -1,4 +1,4 @@
-"""`marsyard export`, `score`, `dataset`: cases for external algorithms, their answers scored, and training data."""
+"""`marsyard conformance`, `export`, `score`, `dataset`: checks of an algorithm, cases, scores, training data."""
 
 from __future__ import annotations
 

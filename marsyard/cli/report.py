@@ -1,4 +1,4 @@
-"""`marsyard report`, `compare` and `dashboard`: verdicts, differences and a static site from stored rows."""
+"""`marsyard report`, `compare`, `dashboard` and `nightly`: verdicts, differences, a static site, and planned runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Success rates: exact binomial bounds, and the number of cases that a reliability requires.
+"""Success rates: exact binomial bounds, also for cases that share terrains, and the number of cases required.
 
 Bounds: Clopper & Pearson, "The use of confidence or fiducial limits illustrated in the case of the binomial",
 Biometrika 26, 1934.

@@ -1,4 +1,4 @@
-"""Measurements of a descent: pictures, attitudes propagated from a star reference, altitudes, velocity changes."""
+"""Measurements of a descent: pictures, attitudes from a star reference, altitudes, velocity changes; and faults."""
 
 from __future__ import annotations
 

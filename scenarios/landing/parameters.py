@@ -1,4 +1,4 @@
-"""Parameters of the landing scenario, all of which a campaign may set or disperse."""
+"""Parameters and faults of the landing scenario; a campaign may set or disperse all of them."""
 
 from __future__ import annotations
 

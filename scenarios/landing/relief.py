@@ -1,4 +1,4 @@
-"""Exact heights of ground and rocks, and true slope and roughness of lander footprints.
+"""Exact heights of ground and rocks, and true slope and roughness of footprints; confusion matrices.
 
 Slope is the angle of the plane of least absolute deviations over the footprint, roughness the maximum distance from it,
 upwards or downwards. Like the algorithm's plane of least median of squares (paper, section III), it is robust against

@@ -1,4 +1,4 @@
-"""True motion of a body: its state at an instant, at many instants, and over a span of time."""
+"""True motion of a body: its state at an instant, at many instants, and over a span of time; wind."""
 
 from __future__ import annotations
 

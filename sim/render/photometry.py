@@ -1,4 +1,4 @@
-"""Reflectance law, illumination, sky, and texture finer than the terrain's samples."""
+"""Reflectance law, illumination, sky, clouds, and texture finer than the terrain's samples."""
 
 from __future__ import annotations
 

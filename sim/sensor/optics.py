@@ -1,4 +1,4 @@
-"""Optics and radiometry of a camera: sunlight to electrons, point spread, natural fall-off and dust on the lens.
+"""Optics and radiometry of a camera: sunlight to electrons, point spread, natural fall-off, dust, and motion blur.
 
 A surface of radiance factor I/F under the solar photon irradiance E shows the radiance (I/F) E / pi. Behind a lens of
 f-number N and transmission T a pixel of area A gathers, on axis, electrons per second at the rate

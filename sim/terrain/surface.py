@@ -1,4 +1,4 @@
-"""The ground as a smooth, periodic surface with albedo.
+"""The ground as a smooth, periodic surface with albedo, and statistics of its slopes and relief.
 
 A terrain is *defined* as the uniform cubic B-spline whose control values are the stored samples: twice continuously
 differentiable, evaluated exactly with its gradient, and reproduced independently by
