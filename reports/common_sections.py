@@ -15,7 +15,6 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from scipy import stats
 
 from marsyard.reports import rates
-from marsyard.reports.charts import REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.comparison import compared_names, select_algorithm
 from marsyard.reports.figures import ELLIPSE
 from marsyard.reports.kinds import OutcomesBySize, Rows, SectionDeclaration
@@ -26,6 +25,7 @@ from marsyard.reports.statistics.changes import holm
 from marsyard.reports.statistics.drivers import Driver, driver
 from marsyard.reports.statistics.proportions import proportion_interval
 from marsyard.reports.statistics.samples import circular_error, error_ellipse, mean_interval, quantile_bounds
+from marsyard.reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.verdicts import judge_campaign
 from marsyard.reports.wording import (
     NOTHING,

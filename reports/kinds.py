@@ -1,7 +1,7 @@
 """Kinds of report sections as data: a `SectionDeclaration` of parts, each of which draws blocks and their numbers.
 
 Parts: `RateTable`, `RateByCondition`, `OutcomesBySize`, `Distribution`, `Statistics`, `Quantiles`, `Scatter`, `MadeBy`.
-`marsyard.reports.tables.PaperFacts` is a section of its own. Example: `docs/reports.md`.
+`marsyard.reports.papers.PaperFacts` is a section of its own. Example: `docs/reports.md`.
 """
 
 from __future__ import annotations
@@ -225,7 +225,7 @@ class OutcomesBySize:
     """Outcomes of cases by a kind and its size (a fault and its severity): a table and stacked bars.
 
     outcomes: masks of the rows by key of `report.json`, in the order of the bars; the last has an interval
-    styles: name for readers and style of `marsyard.reports.charts.BARS` by outcome
+    styles: name for readers and style of `marsyard.reports.svg.BARS` by outcome
     cases: heading of the rows
     wording: kind and size in words; no size is empty
     further: further columns: heading, key of `report.json`, value of the rows, and its text

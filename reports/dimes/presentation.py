@@ -11,7 +11,6 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from marsyard.reports import presentation
-from marsyard.reports.charts import INK, MARKERS, MUTED, SERIES, in_page_style
 from marsyard.reports.dimes import case_figures as figures
 from marsyard.reports.dimes.sections import FIRING, LANDING, field_test_section, sensitivity_section
 from marsyard.reports.presentation import (
@@ -24,6 +23,7 @@ from marsyard.reports.presentation import (
     read_arrays,
 )
 from marsyard.reports.section import plate
+from marsyard.reports.svg import INK, MARKERS, MUTED, SERIES, in_page_style
 from marsyard.reports.wording import label, note_text, number
 
 #: Columns of the tracks that the page shows elsewhere or has no width for.

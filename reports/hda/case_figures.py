@@ -19,9 +19,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LightSource, LinearSegmentedColormap, ListedColormap, to_rgb
 from matplotlib.figure import Figure
 
-from marsyard.reports.charts import MUTED, in_page_style, show_picture
 from marsyard.reports.hda import products as stages
 from marsyard.reports.presentation import save_figures
+from marsyard.reports.svg import MUTED, in_page_style, show_picture
 
 T = TypeVar("T")
 

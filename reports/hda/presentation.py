@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from marsyard.reports.charts import draw_pictures
 from marsyard.reports.hda import products as stages
 from marsyard.reports.hda import sections
 from marsyard.reports.hda.case_figures import FIGURES, figures_reached, write_hda_figures
@@ -15,6 +14,7 @@ from marsyard.reports.hda.classes import draw_classes, limits_section
 from marsyard.reports.kinds import Distribution, MadeBy, RateTable, SectionDeclaration
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
 from marsyard.reports.section import plate
+from marsyard.reports.svg import draw_pictures
 from marsyard.reports.wording import note_text, number
 
 _CAPTIONS: Mapping[str, str] = {

@@ -14,7 +14,6 @@ from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from marsyard.reports.charts import MARKERS, MUTED, SERIES, in_page_style, new_axes, show_picture
 from marsyard.reports.dimes.presentation import DIMES_CASE
 from marsyard.reports.hda.case_figures import FIGURES, figures_reached
 from marsyard.reports.presentation import (
@@ -27,6 +26,7 @@ from marsyard.reports.presentation import (
     save_figures,
 )
 from marsyard.reports.section import Block, Grid, Section, Subject, plate
+from marsyard.reports.svg import MARKERS, MUTED, SERIES, in_page_style, new_axes, show_picture
 from marsyard.reports.wording import NOTHING, label, number, numbers
 
 MEDIAN, PERCENTILE_90 = "residual_median_px", "residual_90_percent_px"

@@ -17,10 +17,10 @@ from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, AccuracyRow, table
 from marsyard.reports import rates
 from marsyard.reports.charts import RateLine, rate_figure
 from marsyard.reports.kinds import Drawn, MadeBy, Rows
+from marsyard.reports.papers import PaperFacts, read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
 from marsyard.reports.stored import table
-from marsyard.reports.tables import PaperFacts, read_paper
 from marsyard.reports.vtt.goal import is_closed_loop, is_tracking, losses_grid, selectable
 from marsyard.reports.wording import NOTHING, note_text, number, numbers, percent, stated
 

@@ -9,8 +9,8 @@ from pydantic import Field, Tag, model_validator
 
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.scenarios.algorithm_run import AlgorithmSelection
-from marsyard.scenarios.descent.flight import FlightFile
-from marsyard.scenarios.descent.measurement import Faults, faulty_times
+from marsyard.scenarios.descent.faults import Faults, faulty_times
+from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.parts.instruments import CustomAltimeter, CustomAttitudeSource

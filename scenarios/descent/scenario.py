@@ -12,10 +12,12 @@ from pydantic import BaseModel
 
 from marsyard.algorithms.dimes import DimesDetails
 from marsyard.scenarios.algorithm_run import case_result
+from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import deliver, faulty_detector, hash_images, picture_columns
 from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
+from marsyard.scenarios.descent.faults import faulty_terrain
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, picture_states, true_velocity
-from marsyard.scenarios.descent.measurement import Instruments, faulty_terrain, measure
+from marsyard.scenarios.descent.measurement import Instruments, measure
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.score import (
     Pictures,
@@ -27,7 +29,7 @@ from marsyard.scenarios.descent.score import (
 )
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import Optics, Sample, pixel_sample
-from marsyard.scenarios.interface import CaseResult, Scalar, TerrainScenario, algorithm_result
+from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredDescent, scored
 from marsyard.scenarios.velocity import (

@@ -13,12 +13,13 @@ from pydantic import BaseModel
 
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
+from marsyard.scenarios.base import LoadGround, TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import attitude_rate_deg_s, hash_images, off_nadir_deg, picture_columns, sun_columns
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import camera_optics, draw_calibrated, render_state, sunlight_ratio
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
 from marsyard.scenarios.fieldtest.run import Category, Run, RunKey, Triple, field_camera, simulate_run
-from marsyard.scenarios.interface import CaseResult, LoadGround, Scalar, TerrainScenario, algorithm_result
+from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.scores import ScoredFlight, scored
 from marsyard.scenarios.velocity import check_last_interval, consistency_row, velocity_products, velocity_row
 from marsyard.scenarios.views import Eye, SiteGround, site_scene

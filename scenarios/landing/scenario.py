@@ -10,10 +10,11 @@ from pydantic import BaseModel
 from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
+from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import hash_images, picture_columns
 from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.exposure import Sample, pixel_sample, summed_rows
-from marsyard.scenarios.interface import CaseResult, TerrainScenario, algorithm_result
+from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.pictures import KEPT_GROUNDS, RenderedFlight, measure
 from marsyard.scenarios.landing.score import (

@@ -18,10 +18,11 @@ from marsyard.algorithms.hda import HdaDetails, HdaOptions, hda_products
 from marsyard.algorithms.hda.motion import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate
 from marsyard.scenarios.algorithm_run import AlgorithmRun, AlgorithmSelection, case_result, run_algorithm_on_copy
+from marsyard.scenarios.base import BaseScenario, algorithm_result
 from marsyard.scenarios.conditions import hash_images
 from marsyard.scenarios.descent.parameters import check_binning
 from marsyard.scenarios.estimators import LANDING, VELOCITY
-from marsyard.scenarios.interface import BaseScenario, CaseResult, Scalar, algorithm_result, record_conditions
+from marsyard.scenarios.interface import CaseResult, Scalar, record_conditions
 from marsyard.scenarios.landing.score import motion_errors, solved_row
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images

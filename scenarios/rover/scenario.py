@@ -24,16 +24,17 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.interface import TrackingState
 from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm
+from marsyard.scenarios.base import LoadGround, TerrainScenario
 from marsyard.scenarios.conditions import picture_columns
 from marsyard.scenarios.estimators import TRACKING
-from marsyard.scenarios.interface import CaseResult, LoadGround, Scalar, TerrainScenario
+from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import scored
 from marsyard.scenarios.rover import score
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.points import Visibility, evaluate_visibility, pick_target
 from marsyard.scenarios.rover.run import Run, Setup, TrackerGuide, TruthGuide, drive_legs, prepare_run, track_target
 from marsyard.scenarios.rover.stops import RunOutcome, View
+from marsyard.scenarios.rover.target import Visibility, evaluate_visibility, pick_target
 from marsyard.scenarios.rover.world import terrain_parameters
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.parameters import Parameters

@@ -14,9 +14,10 @@ from marsyard.scenarios.conditions import sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.scores import ScoredRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.points import evaluate_visibility, rover_shades_patch, template_patch
+from marsyard.scenarios.rover.points import rover_shades_patch, template_patch
 from marsyard.scenarios.rover.run import Run
 from marsyard.scenarios.rover.stops import RunOutcome
+from marsyard.scenarios.rover.target import evaluate_visibility
 from marsyard.sim.measurements import RoverMeasurements
 
 NAN = float("nan")

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.scenarios.interface import LoadGround
+from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters, SunParameters, WorldParameters
 from marsyard.scenarios.rover.points import RockOutline
 from marsyard.scenarios.views import Eye, SiteGround, site_scene

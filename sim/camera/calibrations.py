@@ -35,9 +35,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.sim.camera.assembly import Source
 from marsyard.sim.camera.base import CameraModel
 from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
-from marsyard.sim.camera.text_files import Source
 
 Array = NDArray[np.float64]
 C = TypeVar("C", bound=CameraModel)

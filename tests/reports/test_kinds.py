@@ -24,10 +24,10 @@ from marsyard.reports.kinds import (
     condition_bins,
     flagged,
 )
+from marsyard.reports.papers import PaperFacts
 from marsyard.reports.presentation import Presentation, presentations
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
-from marsyard.reports.tables import PaperFacts
 from marsyard.scenarios.systems import System
 
 ERROR = Quantity("altitude_error_m")
