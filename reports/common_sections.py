@@ -20,12 +20,22 @@ from marsyard.reports.figures import ELLIPSE
 from marsyard.reports.kinds import OutcomesBySize, Rows, SectionDeclaration
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.sampling_design import sampled
-from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
+from marsyard.reports.section import (
+    REQUIREMENT,
+    SERIES,
+    Block,
+    Grid,
+    Section,
+    Subject,
+    grid_of,
+    in_page_style,
+    new_axes,
+    plate,
+)
 from marsyard.reports.statistics.changes import holm
 from marsyard.reports.statistics.drivers import Driver, driver
 from marsyard.reports.statistics.proportions import proportion_interval
 from marsyard.reports.statistics.samples import circular_error, error_ellipse, mean_interval, quantile_bounds
-from marsyard.reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.verdicts import judge_campaign
 from marsyard.reports.wording import (
     NOTHING,

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from marsyard.reports.svg import GRID, INK, LARGEST_VECTOR_SAMPLE, MUTED, RASTER_DPI, SERIES, in_page_style
+from marsyard.reports.section import GRID, INK, LARGEST_VECTOR_SAMPLE, MUTED, RASTER_DPI, SERIES, in_page_style
 from marsyard.reports.wording import count, rank_correlation, split_unit
 
 #: Size of a marginal, height of a heading, margin of the figure, inches; minimum number of marginals in a row.

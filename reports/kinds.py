@@ -16,7 +16,7 @@ import pandas as pd
 from jaxtyping import Bool, Float
 
 from marsyard.reports import rates
-from marsyard.reports.charts import RateLine, cumulative_figure, rate_figure, scatter_panels, stacked_bars
+from marsyard.reports.figures import RateLine, cumulative_figure, rate_figure, scatter_panels, stacked_bars
 from marsyard.reports.rates import CONFIDENCE, PooledRate, Share, known, varies
 from marsyard.reports.section import Block, Grid, Section, Subject, plate
 from marsyard.reports.statistics.drivers import MIN_CASES, driver
@@ -225,7 +225,7 @@ class OutcomesBySize:
     """Outcomes of cases by a kind and its size (a fault and its severity): a table and stacked bars.
 
     outcomes: masks of the rows by key of `report.json`, in the order of the bars; the last has an interval
-    styles: name for readers and style of `marsyard.reports.svg.BARS` by outcome
+    styles: name for readers and style of `marsyard.reports.section.BARS` by outcome
     cases: heading of the rows
     wording: kind and size in words; no size is empty
     further: further columns: heading, key of `report.json`, value of the rows, and its text
@@ -288,7 +288,7 @@ class OutcomesBySize:
 
 @dataclass(frozen=True)
 class Distribution:
-    """Cumulative curves of quantities, or of values by name; see `marsyard.reports.charts.cumulative_figure`."""
+    """Cumulative curves of quantities, or of values by name; see `marsyard.reports.figures.cumulative_figure`."""
 
     curves: Sequence[Quantity] | Callable[[Rows], Mapping[str, Float[np.ndarray, " n"]]]
     labels: tuple[str, str]

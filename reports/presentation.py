@@ -21,8 +21,8 @@ from marsyard.reports.rates import members
 from marsyard.reports.section import SectionMaker, SvgFigure
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.wording import NOTHING, numbers, primary_metric
-from marsyard.scenarios.import_path import import_object
 from marsyard.scenarios.systems import systems
+from marsyard.scenarios.user_files import import_object
 
 Products = Mapping[str, Any]
 

@@ -12,7 +12,7 @@ import pandas as pd
 from jaxtyping import Bool
 
 from marsyard.campaigns.sampling.design import describe_design
-from marsyard.reports.statistics.sequential import planned_looks, spent_fraction
+from marsyard.reports.statistics.proportions import planned_looks, spent_fraction
 from marsyard.reports.stored import table
 from marsyard.reports.wording import count, stated
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from marsyard.campaigns.definition.former_names import stored_columns_now, stored_configuration_now
+from marsyard.campaigns.definition.configuration import stored_columns_now, stored_configuration_now
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products
 from marsyard.reports.wording import axis_columns, driver_columns, primary_metric

@@ -3,10 +3,9 @@
 A requirement asks that `|metric| <= bound`, or a true column, holds for a fraction of a population at a confidence. Its
 status follows from one-sided Clopper-Pearson bounds of the success rate. MET BY RATE: decided by the estimate, whose
 rate reaches the fraction, but not at the confidence. Cases on shared terrains get bounds that allow for correlation
-(`marsyard.reports.statistics.proportions`). Looks at appended cases keep their joint risk
-(`marsyard.reports.statistics.sequential.LaterLook`); each planned look spends a fraction of the risk. Cases that are no
-independent random draws (Latin hypercube, Sobol, grids) have neither bounds nor confidence: their rate decides only
-requirements that are decided by the estimate.
+(`marsyard.reports.statistics.proportions`). Looks at appended cases keep their joint risk (`LaterLook` there); each
+planned look spends a fraction of the risk. Cases that are no independent random draws (Latin hypercube, Sobol, grids)
+have neither bounds nor confidence: their rate decides only requirements that are decided by the estimate.
 """
 
 from __future__ import annotations
@@ -24,8 +23,13 @@ from jaxtyping import Bool, Int
 from marsyard.reports import rates
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
 from marsyard.reports.statistics import proportions
-from marsyard.reports.statistics.proportions import ClusteredEvidence, ClusterMethod, clustered_evidence
-from marsyard.reports.statistics.sequential import LaterLook, confidence_at
+from marsyard.reports.statistics.proportions import (
+    ClusteredEvidence,
+    ClusterMethod,
+    LaterLook,
+    clustered_evidence,
+    confidence_at,
+)
 from marsyard.reports.wording import count, percent, stated
 
 #: Value of a requirement's `decide_by` that has the rate seen compared with the probability.

@@ -30,7 +30,6 @@ from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlob
 from marsyard.algorithms.interface import SiteEstimator, TargetTracker, VelocityEstimator
 from marsyard.algorithms.streams import STREAM_METHODS, StreamedEstimator
 from marsyard.algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
-from marsyard.scenarios.import_path import import_object, source_files
 from marsyard.scenarios.offline import (
     SITE_FORM,
     VELOCITY_FORM,
@@ -41,6 +40,7 @@ from marsyard.scenarios.offline import (
     read_answers,
 )
 from marsyard.scenarios.systems import systems
+from marsyard.scenarios.user_files import import_object, source_files
 
 #: Entry points of other packages' algorithms.
 GROUP = "marsyard.algorithms"

@@ -20,8 +20,8 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import cast
 
-from marsyard.scenarios.import_path import import_object
 from marsyard.scenarios.interface import Scenario
+from marsyard.scenarios.user_files import import_object
 
 #: Folder of the files that the systems of Marsyard share.
 SCENARIOS_FOLDER = Path(__file__).resolve().parent

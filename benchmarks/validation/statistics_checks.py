@@ -11,9 +11,15 @@ from scipy import stats
 from benchmarks.validation.nights import BEFORE, CASES, KINDS, WORSE, planted_found, quiet_nights
 from benchmarks.validation.records import Check, Measure
 from marsyard.reports.history import WINDOW
-from marsyard.reports.statistics.proportions import Interval, clustered_evidence, proportion_lower, proportion_upper
+from marsyard.reports.statistics.proportions import (
+    Interval,
+    clustered_evidence,
+    confidence_at,
+    planned_looks,
+    proportion_lower,
+    proportion_upper,
+)
 from marsyard.reports.statistics.samples import error_ellipse, mean_interval, quantile_bounds, spread_interval
-from marsyard.reports.statistics.sequential import confidence_at, planned_looks
 
 CONFIDENCE = 0.9
 #: Cases on a terrain, and what is asked and risked in simulated campaigns.

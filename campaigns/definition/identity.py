@@ -25,11 +25,10 @@ from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
 from marsyard.scenarios.estimators import algorithm_sources, installed
-from marsyard.scenarios.import_path import import_object, relative_to, source_files
 from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
 from marsyard.scenarios.offline import answers_file, is_offline
 from marsyard.scenarios.systems import UnknownScenarioError, scenario, scenario_source
-from marsyard.scenarios.user_files import input_files
+from marsyard.scenarios.user_files import import_object, input_files, relative_to, source_files
 
 #: Packages on whose code rows depend; reports and commands change no row.
 _CODE = ("sim", "algorithms", "scenarios", "campaigns")

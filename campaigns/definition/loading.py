@@ -26,8 +26,8 @@ from marsyard.campaigns.definition.configuration import (
     key_text,
     problems_of,
     read_tables,
+    use_current_names,
 )
-from marsyard.campaigns.definition.former_names import use_current_names
 from marsyard.campaigns.definition.identity import find_scenario, list_algorithms
 from marsyard.campaigns.definition.requirements import fill_requirements
 from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed

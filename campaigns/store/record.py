@@ -17,8 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.configuration import CampaignConfiguration
-from marsyard.campaigns.definition.former_names import stored_configuration_now
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, stored_configuration_now
 from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.errors import StoreError, writing
 from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store

@@ -20,9 +20,9 @@ from marsyard.cli.housekeeping import clean, compile_kernels
 from marsyard.cli.new import ingest, new
 from marsyard.cli.offline import conformance, dataset, export, score
 from marsyard.cli.options import CampaignArgument, Exit, JsonOption, SetOption, console, handle_user_errors
-from marsyard.cli.render import gallery, render
 from marsyard.cli.report import compare, dashboard, nightly, report
 from marsyard.cli.terrain import app as terrain
+from marsyard.cli.terrain import gallery, render
 
 
 class _PlainFlags:

@@ -141,7 +141,7 @@ def replay(
         unpack_products,
         write_packed,
     )
-    from marsyard.cli.stages import write_stages
+    from marsyard.cli.showing import write_stages
     from marsyard.reports.presentation import write_case_figures
 
     replayed = run_again(directory, case)

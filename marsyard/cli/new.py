@@ -49,9 +49,9 @@ def new(given: NewOptions) -> None:
     from marsyard.campaigns.errors import CampaignError, not_allowed
     from marsyard.cli.outcome import evidence_limits
     from marsyard.reports.wording import count
-    from marsyard.scenarios.import_path import import_object
     from marsyard.scenarios.systems import template_paths
     from marsyard.scenarios.template import Choices
+    from marsyard.scenarios.user_files import import_object
     from marsyard.sim.terrain import sites
 
     name = given.name
@@ -160,8 +160,8 @@ def ingest(
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.errors import CampaignError, StoreError, not_allowed, writing
     from marsyard.reports.wording import count
-    from marsyard.scenarios.import_path import import_object
     from marsyard.scenarios.systems import systems
+    from marsyard.scenarios.user_files import import_object
 
     known = {one.name: one.ingest for one in systems() if one.ingest}
     chosen = system or next(iter(known))

@@ -1,13 +1,17 @@
-"""A campaign's verdict, exit status, report, table and pictures from its stored rows."""
+"""A campaign's verdict, exit status, report, table and pictures from its stored rows; server of a site."""
 
 from __future__ import annotations
 
+import ipaddress
 import math
 import os
 import shutil
+import socket
 import subprocess
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.former_names import stored_columns_now
+from marsyard.campaigns.definition.configuration import stored_columns_now
 from marsyard.campaigns.errors import CampaignError, StoreError, writing
 from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
 from marsyard.campaigns.running.engine import Watch, append_cases, run_campaign
@@ -36,8 +40,7 @@ from marsyard.reports.comparison import comparison, comparison_grids
 from marsyard.reports.evaluation import Judged, judged, next_look
 from marsyard.reports.presentation import notable_cases
 from marsyard.reports.sampling_design import sampled
-from marsyard.reports.statistics.proportions import minimum_sample_size
-from marsyard.reports.statistics.sequential import planned_looks
+from marsyard.reports.statistics.proportions import minimum_sample_size, planned_looks
 from marsyard.reports.stored import read_run
 from marsyard.reports.tables import verdict_table
 from marsyard.reports.verdicts import ESTIMATE, Verdict, judge_campaign
@@ -234,7 +237,7 @@ def print_limits(campaign: Campaign) -> None:
 
 
 def run_until_decided(campaign: Campaign, directory: Path, executor: ExecutorConfig, watch: Watch) -> None:
-    """Run a campaign of at most its number of cases; see `marsyard.reports.statistics.sequential`.
+    """Run a campaign of at most its number of cases; see `marsyard.reports.statistics.proportions`.
 
     Raises CampaignError for dependent draws, or without a requirement to decide; and as `run_campaign`.
     """
@@ -268,3 +271,62 @@ def continue_until_decided(directory: Path, executor: ExecutorConfig, watch: Wat
             watch.note(f"stopped after {cases} of at most {count(configuration.max_cases, 'case')}")
             return
         append_cases(directory, look - cases, executor, watch)
+
+
+class _Handler(SimpleHTTPRequestHandler):
+    """Serves the site's files; lists no folders, follows nothing out of it, and keeps quiet.
+
+    `names` are the host names by which the server may be addressed.
+    """
+
+    def __init__(self, *args: Any, names: Collection[str], **kwargs: Any) -> None:
+        self._names = names
+        super().__init__(*args, **kwargs)
+
+    def parse_request(self) -> bool:
+        """Refuse a request for another host: a foreign page whose name was bound to this address may not read."""
+        if not super().parse_request():
+            return False
+        if not is_own_host(self.headers.get("Host", ""), self._names):
+            self.send_error(403, "this server is not known by that host name")
+            return False
+        return True
+
+    def translate_path(self, path: str) -> str:
+        """The file that a path of the address means; one that is not there where it leads out of the site."""
+        root = Path(self.directory).resolve()
+        try:
+            found = Path(super().translate_path(path)).resolve()
+        except (OSError, ValueError):  # such as a name with a zero byte
+            return str(root / "no such file")
+        return str(found if found.is_relative_to(root) else root / "no such file")
+
+    def list_directory(self, path: object) -> None:
+        """Refuses."""
+        self.send_error(404, "no such file")
+
+    def log_message(self, *_: object) -> None:
+        """Keeps quiet."""
+
+
+def is_own_host(header: str, names: Collection[str]) -> bool:
+    """Whether a Host header names this server: by an address, which no name server can redirect, or by a known name.
+
+    >>> [is_own_host(text, ["localhost"]) for text in ("127.0.0.1:80", "[::1]", "LOCALHOST:8", "evil.example", "")]
+    [True, True, True, False, False]
+    """
+    host = header.strip().lower()
+    host = host[1:].partition("]")[0] if host.startswith("[") else host.partition(":")[0]
+    if host in names:
+        return True
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def server(directory: Path, host: str, port: int) -> ThreadingHTTPServer:
+    """A server of a site's folder; port 0 takes one that is free."""
+    names = {"localhost", host.lower(), socket.gethostname().lower()}
+    return ThreadingHTTPServer((host, port), partial(_Handler, directory=str(directory), names=names))

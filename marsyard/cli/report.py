@@ -109,7 +109,7 @@ def dashboard(
     typer.echo(f"dashboard: {site.index}")
     if serve is None:
         return
-    from marsyard.cli.site_server import server
+    from marsyard.cli.outcome import server
 
     try:
         serving = server(out, host, serve)

@@ -20,7 +20,7 @@ from matplotlib.patches import Polygon, Rectangle
 from scipy import ndimage
 
 from marsyard.reports.presentation import numeric_product, plane, save_figures
-from marsyard.reports.svg import INK, draw_pictures, in_page_style, show_subframe
+from marsyard.reports.section import INK, draw_pictures, in_page_style, show_subframe
 
 Picture = Float[np.ndarray, "_ _"]
 TEMPLATE, MATCH, WINDOW = "#ff4b3e", "#35d46b", "#4aa3ff"

@@ -22,8 +22,7 @@ from marsyard.reports.presentation import (
     plane,
     read_arrays,
 )
-from marsyard.reports.section import plate
-from marsyard.reports.svg import INK, MARKERS, MUTED, SERIES, in_page_style
+from marsyard.reports.section import INK, MARKERS, MUTED, SERIES, in_page_style, plate
 from marsyard.reports.wording import label, note_text, number
 
 #: Columns of the tracks that the page shows elsewhere or has no width for.

@@ -18,9 +18,22 @@ from scipy import stats
 from marsyard.reports import kinds, rates
 from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Section, Subject, SvgFigure, grid_of, plate
+from marsyard.reports.section import (
+    MARKERS,
+    MUTED,
+    REQUIREMENT,
+    SERIES,
+    Block,
+    Grid,
+    Section,
+    Subject,
+    SvgFigure,
+    grid_of,
+    in_page_style,
+    new_axes,
+    plate,
+)
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.svg import MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.wording import (
     NOTHING,
     axis_columns,

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from marsyard.reports.hda import products as stages
 from marsyard.reports.presentation import save_figures
-from marsyard.reports.svg import MUTED, in_page_style, show_picture
+from marsyard.reports.section import MUTED, in_page_style, show_picture
 
 T = TypeVar("T")
 

@@ -13,8 +13,7 @@ from marsyard.reports.hda.case_figures import FIGURES, figures_reached, write_hd
 from marsyard.reports.hda.classes import draw_classes, limits_section
 from marsyard.reports.kinds import Distribution, MadeBy, RateTable, SectionDeclaration
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
-from marsyard.reports.section import plate
-from marsyard.reports.svg import draw_pictures
+from marsyard.reports.section import draw_pictures, plate
 from marsyard.reports.wording import note_text, number
 
 _CAPTIONS: Mapping[str, str] = {

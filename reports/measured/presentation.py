@@ -25,8 +25,19 @@ from marsyard.reports.presentation import (
     plane,
     save_figures,
 )
-from marsyard.reports.section import Block, Grid, Section, Subject, plate
-from marsyard.reports.svg import MARKERS, MUTED, SERIES, in_page_style, new_axes, show_picture
+from marsyard.reports.section import (
+    MARKERS,
+    MUTED,
+    SERIES,
+    Block,
+    Grid,
+    Section,
+    Subject,
+    in_page_style,
+    new_axes,
+    plate,
+    show_picture,
+)
 from marsyard.reports.wording import NOTHING, label, number, numbers
 
 MEDIAN, PERCENTILE_90 = "residual_median_px", "residual_90_percent_px"

@@ -23,7 +23,7 @@ from matplotlib.patches import Circle, Rectangle
 from scipy import ndimage
 
 from marsyard.reports.presentation import numeric_product, plane, save_figures, shaped
-from marsyard.reports.svg import GRID, INK, MUTED, SERIES, in_page_style, show_subframe
+from marsyard.reports.section import GRID, INK, MUTED, SERIES, in_page_style, show_subframe
 
 Picture = Float[np.ndarray, "_ _"]
 Point = Float[np.ndarray, "2"]

@@ -15,7 +15,7 @@ import pandas as pd
 
 from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, AccuracyRow, table_1, tracked_approach_error_m
 from marsyard.reports import rates
-from marsyard.reports.charts import RateLine, rate_figure
+from marsyard.reports.figures import RateLine, rate_figure
 from marsyard.reports.kinds import Drawn, MadeBy, Rows
 from marsyard.reports.papers import PaperFacts, read_paper
 from marsyard.reports.rates import CONFIDENCE

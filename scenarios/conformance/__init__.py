@@ -17,8 +17,8 @@ from marsyard.scenarios.conformance import estimators, parts, trackers
 from marsyard.scenarios.conformance.checks import Finding as Finding
 from marsyard.scenarios.conformance.checks import Suite
 from marsyard.scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, installed
-from marsyard.scenarios.import_path import import_object
 from marsyard.scenarios.parts.named import KINDS
+from marsyard.scenarios.user_files import import_object
 
 #: Tasks and kinds with a suite, words of the command line.
 SUBJECT_KINDS = (*TASKS, *KINDS)

@@ -10,9 +10,8 @@ from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.descent.exposure import World, calibrated_camera
-from marsyard.scenarios.descent.faults import faulty_altitudes, faulty_attitudes
 from marsyard.scenarios.descent.flight import MARGIN_S, DescentFlight, gravity_m_s2
-from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters, faulty_altitudes, faulty_attitudes
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.instruments import (
     CustomAltimeter,

@@ -15,10 +15,9 @@ from marsyard.scenarios.algorithm_run import case_result
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import deliver, faulty_detector, hash_images, picture_columns
 from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
-from marsyard.scenarios.descent.faults import faulty_terrain
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, picture_states, true_velocity
 from marsyard.scenarios.descent.measurement import Instruments, measure
-from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters, faulty_terrain
 from marsyard.scenarios.descent.score import (
     Pictures,
     conditions,

@@ -12,11 +12,10 @@ from marsyard.algorithms.hda.motion import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.conditions import sun_columns
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.landing.confusion import SampledMap, hazard_counts, map_errors
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.helicopter import horizontal_distance_m, land
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, stuck_range_m
-from marsyard.scenarios.landing.pictures import GroundTruth, Pair, RenderedFlight
+from marsyard.scenarios.landing.pictures import GroundTruth, Pair, RenderedFlight, SampledMap, hazard_counts, map_errors
 from marsyard.sim.dynamics.rotorcraft import GroundPatch
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor import height_above_ground

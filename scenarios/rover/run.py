@@ -24,8 +24,7 @@ from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.rover.parameters import LegParameters, RoverScenarioParameters
 from marsyard.scenarios.rover.points import cast_rover_shadow
-from marsyard.scenarios.rover.stops import RunOutcome, StereoCamera, Stop, View
-from marsyard.scenarios.rover.target import DesignatedTarget, choose_target
+from marsyard.scenarios.rover.stops import DesignatedTarget, RunOutcome, StereoCamera, Stop, View, choose_target
 from marsyard.scenarios.rover.world import TARGET, Rig, RunWorld, Vehicle
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.dynamics import Drive

@@ -33,8 +33,7 @@ from marsyard.scenarios.parts.scores import scored
 from marsyard.scenarios.rover import score
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.run import Run, Setup, TrackerGuide, TruthGuide, drive_legs, prepare_run, track_target
-from marsyard.scenarios.rover.stops import RunOutcome, View
-from marsyard.scenarios.rover.target import Visibility, evaluate_visibility, pick_target
+from marsyard.scenarios.rover.stops import RunOutcome, View, Visibility, evaluate_visibility, pick_target
 from marsyard.scenarios.rover.world import terrain_parameters
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.parameters import Parameters

@@ -16,8 +16,7 @@ from marsyard.scenarios.parts.scores import ScoredRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import rover_shades_patch, template_patch
 from marsyard.scenarios.rover.run import Run
-from marsyard.scenarios.rover.stops import RunOutcome
-from marsyard.scenarios.rover.target import evaluate_visibility
+from marsyard.scenarios.rover.stops import RunOutcome, evaluate_visibility
 from marsyard.sim.measurements import RoverMeasurements
 
 NAN = float("nan")

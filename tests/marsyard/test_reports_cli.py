@@ -22,8 +22,7 @@ from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.store import record
 from marsyard.cli import app as cli
-from marsyard.cli.outcome import run_until_decided
-from marsyard.cli.site_server import server
+from marsyard.cli.outcome import run_until_decided, server
 from marsyard.reports.evaluation import next_look
 from marsyard.reports.presentation import notable_cases
 from marsyard.reports.sampling_design import SamplingDesign

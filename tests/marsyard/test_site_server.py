@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.cli.site_server import server
+from marsyard.cli.outcome import server
 
 
 @pytest.fixture

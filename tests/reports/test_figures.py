@@ -17,7 +17,7 @@ from marsyard.reports.figures import (
     error_scatter_against,
     outcome_bars,
 )
-from marsyard.reports.svg import svg_markup
+from marsyard.reports.section import svg_markup
 
 Rows = Callable[..., pd.DataFrame]
 METRIC = "velocity_error_m_s"

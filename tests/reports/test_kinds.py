@@ -11,7 +11,7 @@ import pytest
 
 from marsyard.reports import presentation
 from marsyard.reports.campaign import section_makers, write_report
-from marsyard.reports.charts import cumulative_figure
+from marsyard.reports.figures import cumulative_figure
 from marsyard.reports.kinds import (
     Distribution,
     Quantity,

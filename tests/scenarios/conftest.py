@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from marsyard.scenarios.import_path import import_object
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.systems import RowColumns, row_columns, scenario_paths
+from marsyard.scenarios.user_files import import_object
 
 
 def _unstated(row: Any, stated: RowColumns, own: tuple[str, ...]) -> list[str]:

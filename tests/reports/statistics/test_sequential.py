@@ -8,8 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
-from marsyard.reports.statistics.sequential import LaterLook, confidence_at, planned_looks, spent_fraction
+from marsyard.reports.statistics.proportions import (
+    LaterLook,
+    confidence_at,
+    planned_looks,
+    proportion_lower,
+    proportion_upper,
+    spent_fraction,
+)
 
 
 def test_looks_halve_from_the_last_case() -> None:

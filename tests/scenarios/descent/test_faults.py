@@ -19,9 +19,15 @@ from marsyard.scenarios.descent.exposure import (
     camera_optics,
     take_exposures,
 )
-from marsyard.scenarios.descent.faults import Faults, faulty_altitudes, faulty_attitudes, faulty_terrain, faulty_times
 from marsyard.scenarios.descent.flight import create_flight, picture_states
-from marsyard.scenarios.descent.parameters import CameraParameters
+from marsyard.scenarios.descent.parameters import (
+    CameraParameters,
+    Faults,
+    faulty_altitudes,
+    faulty_attitudes,
+    faulty_terrain,
+    faulty_times,
+)
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
