@@ -246,9 +246,8 @@ def _candidates(goal: Float[np.ndarray, "2"], options: NavigationOptions) -> Ite
     bent = first**2 * length + second**2 * rest
     cost = np.where(fits, length + rest + options.turn_cost_m * np.abs(turn) + options.bend_cost_m2 * bent, np.inf)
     for best in np.argsort(cost, kind="stable")[: np.count_nonzero(fits)]:
-        yield _Path(
-            float(turn[best]), (float(first[best]), float(second[best])), (float(length[best]), float(rest[best]))
-        )
+        arcs = (float(first[best]), float(second[best])), (float(length[best]), float(rest[best]))
+        yield _Path(float(turn[best]), *arcs)
 
 
 def _is_clear(positions_m: Float[np.ndarray, "n 2"], rocks: Iterable[Obstacle], options: NavigationOptions) -> bool:

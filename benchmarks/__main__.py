@@ -15,7 +15,7 @@ import cv2
 from benchmarks import descent, engine, estimators, hda, pictures, renderers, reporting, starting, vtt
 from benchmarks.page import PAGE, write_page
 from benchmarks.timing import Figure
-from marsyard.sim.processor import processor_features
+from marsyard.sim.kernel_cache import processor_features
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import default_backend
 

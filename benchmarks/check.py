@@ -28,7 +28,7 @@ from benchmarks.pictures import descent_exposure
 from benchmarks.vtt import seeded_update
 from marsyard.algorithms.dimes import DimesEstimator
 from marsyard.algorithms.hda import ElevationMap, HdaEstimator, HdaOptions, hazard_maps
-from marsyard.sim.processor import processor_features
+from marsyard.sim.kernel_cache import processor_features
 
 RATIOS = Path(__file__).parent / "results" / "ratios.json"
 #: Pairs of runs of a path and the reference workload.

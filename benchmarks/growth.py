@@ -145,11 +145,7 @@ def _campaign_s(cases: int, waiting_s: float, executor: ExecutorConfig) -> float
     """Wall-clock time from the first to the last completed case."""
     scenario = "benchmarks.growth:LightScenario" if waiting_s else "benchmarks.engine:BusyScenario"
     configuration = CampaignConfiguration(
-        name="growth",
-        scenario=scenario,
-        cases=cases,
-        parameters={"busy_s": waiting_s},
-        retain=Retain(showcase="none"),
+        name="growth", scenario=scenario, cases=cases, parameters={"busy_s": waiting_s}, retain=Retain(showcase="none")
     )
     watch = Stopwatch((1, cases))
     with TemporaryDirectory() as folder:

@@ -12,12 +12,11 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from benchmarks.timing import Figure, core_seconds
 from marsyard.algorithms.hda import ElevationMap, HdaDetails, HdaEstimator, HdaOptions, hazard_maps
 from marsyard.algorithms.hda.baselines import SemiGlobalEstimator
-from marsyard.algorithms.hda.estimator import expected_pixels, matched_structure, motion_from_tracks
+from marsyard.algorithms.hda.estimator import expected_pixels, map_ground, matched_structure, motion_from_tracks
 from marsyard.algorithms.hda.hazards import map_resolution
-from marsyard.algorithms.hda.landing import map_ground
+from marsyard.algorithms.hda.motion import build_scene, undistort
 from marsyard.algorithms.hda.structure import scale_factor
 from marsyard.algorithms.hda.tracking import select_features, track_features
-from marsyard.algorithms.hda.view import build_scene, undistort
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid

@@ -11,8 +11,7 @@ import numpy as np
 
 from benchmarks.timing import Figure, core_seconds
 from marsyard.algorithms.image.correlation import coarse_to_fine_peak, normalized_correlation
-from marsyard.algorithms.vtt.lucas_kanade import lucas_kanade_tracker
-from marsyard.algorithms.vtt.matching import cut_patch, search_window
+from marsyard.algorithms.vtt.matching import cut_patch, lucas_kanade_tracker, search_window
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.tracker import VisualTargetTracker
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters

@@ -15,19 +15,17 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from marsyard.reports import common_sections, sections
-from marsyard.reports.cases import shown_cases
-from marsyard.reports.columns import label, numbers, primary_metric
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
 from marsyard.reports.evaluation import Judged, OverallVerdict, judged
-from marsyard.reports.presentation import presentations
+from marsyard.reports.presentation import presentations, shown_cases
 from marsyard.reports.sampling_design import sampled
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
 from marsyard.reports.traceability import algorithms_of, evidence_of, junit_xml, verification_csv
 from marsyard.reports.verdicts import Verdict
-from marsyard.reports.wording import count, number
+from marsyard.reports.wording import count, label, number, numbers, primary_metric
 
 #: Sections of every campaign, in the page's order; `conditions_section` ends the page.
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (
@@ -188,7 +186,6 @@ def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict
 
 
 def _kinds(frame: pd.DataFrame, column: str) -> list[str]:
-    """Distinct values of a column, at most `_MAX_KINDS`."""
     if column not in frame:
         return []
     return [str(value) for value in frame[column].dropna().unique()[:_MAX_KINDS]]
@@ -206,7 +203,6 @@ def page_environment() -> Environment:
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON, NaN and infinities as null."""
     if isinstance(value, Mapping):
         return {str(name): _plain(inner) for name, inner in value.items()}
     if isinstance(value, list | tuple):

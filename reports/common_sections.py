@@ -15,7 +15,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from scipy import stats
 
 from marsyard.reports import rates
-from marsyard.reports.columns import axis_columns, driver_columns, label, magnitude_label, numbers, split_unit
+from marsyard.reports.charts import REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.comparison import compared_names, select_algorithm
 from marsyard.reports.figures import ELLIPSE
 from marsyard.reports.kinds import OutcomesBySize, Rows, SectionDeclaration
@@ -26,9 +26,23 @@ from marsyard.reports.statistics.changes import holm
 from marsyard.reports.statistics.drivers import Driver, driver
 from marsyard.reports.statistics.proportions import proportion_interval
 from marsyard.reports.statistics.samples import circular_error, error_ellipse, mean_interval, quantile_bounds
-from marsyard.reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.verdicts import judge_campaign
-from marsyard.reports.wording import NOTHING, coefficient, interval, note_text, number, p_text, percent, stated
+from marsyard.reports.wording import (
+    NOTHING,
+    axis_columns,
+    coefficient,
+    driver_columns,
+    interval,
+    label,
+    magnitude_label,
+    note_text,
+    number,
+    numbers,
+    p_text,
+    percent,
+    split_unit,
+    stated,
+)
 
 #: Column of true and false: whether the geometry leaves a feasible overlap for the algorithm.
 ROOM = "feasible_overlap"

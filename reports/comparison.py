@@ -19,13 +19,23 @@ import pandas as pd
 from jaxtyping import Float
 
 from marsyard.reports import rates
-from marsyard.reports.columns import label, numbers, primary_metric, split_unit
 from marsyard.reports.rates import CONFIDENCE, succeeded
 from marsyard.reports.sampling_design import sampled
 from marsyard.reports.section import Block, Grid, Section, Subject, grid_of
 from marsyard.reports.statistics.changes import Sample, compare_errors, compare_successes, difference_p, holm
 from marsyard.reports.stored import StoredRun, table
-from marsyard.reports.wording import NOTHING, note_text, number, p_text, percent, stated
+from marsyard.reports.wording import (
+    NOTHING,
+    label,
+    note_text,
+    number,
+    numbers,
+    p_text,
+    percent,
+    primary_metric,
+    split_unit,
+    stated,
+)
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,20 @@ from jaxtyping import Bool
 from scipy import stats
 
 from marsyard.reports import rates
-from marsyard.reports.columns import axis_columns, label, numbers, split_unit
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.wording import note_text, number, percent, plain_value, stated
+from marsyard.reports.wording import (
+    axis_columns,
+    label,
+    note_text,
+    number,
+    numbers,
+    percent,
+    plain_value,
+    split_unit,
+    stated,
+)
 
 #: Prefixes of the condition columns in the order of the page; the first column of each prefix counts.
 CONDITIONS = (

@@ -17,9 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from marsyard.reports.columns import rank_correlation, split_unit
-from marsyard.reports.svg import GRID, INK, LARGEST_VECTOR_SAMPLE, MUTED, RASTER_DPI, SERIES, in_page_style
-from marsyard.reports.wording import count
+from marsyard.reports.charts import GRID, INK, LARGEST_VECTOR_SAMPLE, MUTED, RASTER_DPI, SERIES, in_page_style
+from marsyard.reports.wording import count, rank_correlation, split_unit
 
 #: Size of a marginal, height of a heading, margin of the figure, inches; minimum number of marginals in a row.
 _WIDTH, _HEIGHT, _HEAD, _MARGIN, _MIN_IN_ROW = 3.0, 1.9, 0.45, 0.15, 4
@@ -100,7 +99,6 @@ def _placed(figure: Figure, corner: tuple[float, float], size: tuple[float, floa
 
 
 def _heading(figure: Figure, top: float, text: str) -> None:
-    """Write a heading with its upper edge at a height in inches."""
     width, height = figure.get_size_inches()
     figure.text(_MARGIN / width, (top - 0.1) / height, text, fontsize=12, fontweight="bold", color=INK, va="top")
 
@@ -111,7 +109,6 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def _marginal(axes: Axes, drawn: Drawn) -> None:
-    """Draw the frequencies of values with their expectation."""
     kinds, values = drawn.kinds, drawn.numbers(drawn.values)
     expected = None if drawn.expected is None else drawn.numbers(drawn.expected)
     known = values if expected is None else np.concatenate([values, expected])

@@ -11,8 +11,7 @@ import pandas as pd
 
 from marsyard.reports.rates import engine_failed
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, sampled
-from marsyard.reports.statistics.clusters import ClusterMethod
-from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
+from marsyard.reports.statistics.proportions import ClusterMethod, proportion_lower, proportion_upper
 from marsyard.reports.statistics.sequential import confidence_at, planned_looks
 from marsyard.reports.stored import StoredRun, read_run
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict, judge_campaign

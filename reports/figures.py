@@ -15,23 +15,22 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse
 from matplotlib.ticker import MaxNLocator
 
-from marsyard.reports.columns import axis_columns, category_column, label, magnitude_label, numbers, split_unit
+from marsyard.reports import charts
+from marsyard.reports.charts import BARS, INK, MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.rates import ENGINE_FAILURES
 from marsyard.reports.statistics.samples import error_ellipse
-from marsyard.reports.svg import (
-    BARS,
-    INK,
-    LARGEST_VECTOR_SAMPLE,
-    MARKERS,
-    MUTED,
-    REQUIREMENT,
-    SERIES,
-    in_page_style,
-    new_axes,
-)
 from marsyard.reports.tables import answered_outcomes, outcome_counts
+from marsyard.reports.wording import (
+    axis_columns,
+    category_column,
+    label,
+    magnitude_label,
+    numbers,
+    plain_value,
+    split_unit,
+    stated,
+)
 from marsyard.reports.wording import count as counted
-from marsyard.reports.wording import plain_value, stated
 
 #: Probability of the ellipse about the errors.
 ELLIPSE = 0.95
@@ -223,7 +222,7 @@ def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: 
             axes.plot(middles, values, line, color=INK, zorder=4)
     if bound is not None and bound <= top:
         axes.axhline(bound, color=REQUIREMENT, linewidth=1.4, linestyle="--", zorder=3)
-    raster = bool(silent.sum() > LARGEST_VECTOR_SAMPLE)
+    raster = bool(silent.sum() > charts.LARGEST_VECTOR_SAMPLE)
     axes.plot(x[silent], np.full(silent.sum(), top), "|", color=INK, markersize=9, clip_on=False, rasterized=raster)
     axes.set(xlabel=label(driver), ylabel=magnitude_label(metric), ylim=(0.0, top))
     axes.xaxis.set_major_locator(MaxNLocator(5))
@@ -271,7 +270,6 @@ def _annotate(axes: Axes, text: str, at: tuple[Any, Any], shift: tuple[int, int]
 
 
 def _magnitudes(frame: pd.DataFrame, metric: str, bound: float | None) -> tuple[Float[np.ndarray, " known"], float]:
-    """Known magnitudes of the errors, and the end of their axis."""
     magnitude = np.abs(numbers(frame, metric))
     known = magnitude[np.isfinite(magnitude)]
     return known, axis_edge(known, bound)
@@ -280,8 +278,7 @@ def _magnitudes(frame: pd.DataFrame, metric: str, bound: float | None) -> tuple[
 def _draw_points(
     axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], kind: Category, *, hollow: bool = False
 ) -> None:
-    """Draw points of a kind, hollow at the edge of the axes."""
-    many = x.size > LARGEST_VECTOR_SAMPLE
+    many = x.size > charts.LARGEST_VECTOR_SAMPLE
     axes.plot(
         x, y, linestyle="", marker=kind.marker, markersize=3.0 if many else 5.5, alpha=0.55 if many else 0.85,
         markeredgewidth=1.0 if hollow else 0.0, markerfacecolor="none" if hollow else kind.colour, color=kind.colour,

@@ -314,6 +314,5 @@ def night_text(
 
 
 def _cell(text: str) -> str:
-    """A text escaped for a table of Markdown."""
     marks = {letter: f"&#{ord(letter)};" for letter in "&<>|"} | {letter: f"\\{letter}" for letter in "\\`*_[]#"}
     return "".join(marks.get(letter, letter) for letter in " ".join(text.split()))

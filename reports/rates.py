@@ -10,11 +10,9 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 
-from marsyard.campaigns.outcomes import UNFINISHED
-from marsyard.reports.columns import numbers
-from marsyard.reports.statistics.clusters import clustered_evidence
-from marsyard.reports.statistics.proportions import Interval, proportion_interval
-from marsyard.reports.wording import NOTHING, number, percent
+from marsyard.campaigns.errors import UNFINISHED
+from marsyard.reports.statistics.proportions import Interval, clustered_evidence, proportion_interval
+from marsyard.reports.wording import NOTHING, number, numbers, percent
 
 #: Outcomes of cases that the engine could not finish.
 ENGINE_FAILURES = UNFINISHED

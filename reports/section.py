@@ -10,8 +10,8 @@ import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from marsyard.reports.charts import svg_markup
 from marsyard.reports.stored import StoredRun
-from marsyard.reports.svg import svg_markup
 
 T = TypeVar("T")
 

@@ -13,7 +13,7 @@ import pandas as pd
 from marsyard.campaigns.definition.former_names import stored_columns_now, stored_configuration_now
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products
-from marsyard.reports.columns import axis_columns, driver_columns, primary_metric
+from marsyard.reports.wording import axis_columns, driver_columns, primary_metric
 
 #: Maximum number of cases of which all columns are read; of more cases, all columns of the first ones are read.
 LARGEST_WHOLE, FIRST_CASES = 50_000, 20_000

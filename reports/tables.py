@@ -1,21 +1,47 @@
-"""Verdicts as a Rich table, outcomes and error statistics; texts from files are `Text` objects, never markup."""
+"""Tables of verdicts, outcomes, errors and comparisons with papers; texts from files are `Text`, never markup."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pandas as pd
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from marsyard.reports.columns import axis_columns, label, numbers
-from marsyard.reports.rates import ENGINE_FAILURES, is_flag, members, terrain_groups
-from marsyard.reports.section import Grid
+from marsyard.reports.kinds import Part, Rows
+from marsyard.reports.rates import (
+    ENGINE_FAILURES,
+    all_flags,
+    flag_share,
+    is_flag,
+    known,
+    members,
+    share_text,
+    spread_text,
+    terrain_groups,
+)
+from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.statistics.samples import ErrorSummary, summarize
 from marsyard.reports.verdicts import Status, Verdict
-from marsyard.reports.wording import NOTHING, asked_text, interval, number, percent, stated
+from marsyard.reports.wording import (
+    NOTHING,
+    asked_text,
+    axis_columns,
+    interval,
+    label,
+    number,
+    numbers,
+    percent,
+    stated,
+)
 
 _STYLES = {
     Status.PASS: "bold green",
@@ -106,3 +132,54 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
         rows.append([name, *(number(q.estimate) for q in of_each)])
         rows.append([f"{name}, {confidence} bounds", *(interval(q.lower, q.upper) for q in of_each)])
     return [*rows, ["largest magnitude", *(number(s.largest) for s in summaries)]]
+
+
+@cache
+def read_paper(path: Path) -> Mapping[str, Any]:
+    """Read the numbers of a paper from its TOML file."""
+    with path.open("rb") as file:
+        return tomllib.load(file)
+
+
+@dataclass(frozen=True)
+class PaperFacts:
+    """A paper's numbers of single runs next to ours: `[[facts]]` of its TOML file.
+
+    Keys: `campaign` (that repeats the run), `title`, `source`, `note`, and `rows`. Keys of a row: `name` (with its
+    unit), `paper` (text, a dash by default), `column`, and optionally `statistic` (``spread``, the median with minimum
+    and maximum, or ``rate``), `among` (flags that choose rows), `scale`, `digits`, and `magnitude` (drop signs).
+
+    further: additional parts by campaign
+    """
+
+    path: Path
+    further: Mapping[str, Part] = field(default_factory=dict)
+
+    def __call__(self, subject: Subject) -> Section | None:
+        """The section; None if the paper has no run of the campaign's name."""
+        facts = {one["campaign"]: one for one in read_paper(self.path)["facts"]}.get(subject.run.name)
+        if facts is None or not any(row["column"] in subject.frame for row in facts["rows"]):
+            return None
+        data: dict[str, Any] = {
+            row["name"]: {"paper": row.get("paper", NOTHING), "ours": format_own_value(subject.frame, row)}
+            for row in facts["rows"]
+        }
+        grid = Grid(["", "Paper", "Ours"], [[name, *one.values()] for name, one in data.items()])
+        blocks = [Block(grid=grid, note=f"{_MEDIANS} {facts.get('note', '')}".strip())]
+        if subject.run.name in self.further:
+            shown, numbers_too = self.further[subject.run.name].draw(subject.frame, subject, "paper")
+            blocks += shown
+            data |= numbers_too
+        return Section("paper", "Paper comparison", facts["title"], blocks, data)
+
+
+_MEDIANS = "Ours: median over all cases, minimum to maximum in brackets. A dash: not stated by the paper."
+
+
+def format_own_value(frame: Rows, row: Mapping[str, Any]) -> str:
+    """Our value of a paper's quantity."""
+    chosen, column = frame[all_flags(frame, *row.get("among", ()))], row["column"]
+    if row.get("statistic") == "rate":
+        return share_text(flag_share(chosen, column)) if column in chosen else NOTHING
+    values = known(chosen, column, row.get("scale", 1.0))
+    return spread_text(np.abs(values) if row.get("magnitude") else values, row.get("digits"))

@@ -15,6 +15,14 @@ from marsyard.sim.streams import Streams
 if TYPE_CHECKING:
     from marsyard.scenarios.estimators import Task
     from marsyard.scenarios.parts.named import Kind
+from abc import ABC, abstractmethod
+from functools import lru_cache
+from typing import Generic, TypeVar
+
+from marsyard.scenarios.algorithm_run import AlgorithmRun
+from marsyard.scenarios.parts.named import SCORE, Kind
+from marsyard.scenarios.views import SiteGround
+from marsyard.sim.terrain import Site, TerrainBank, TerrainParameters
 
 #: A value in a column of the results.
 Scalar = float | int | str | bool
@@ -48,7 +56,7 @@ def conditions_recorded_by(recorder: Callable[[Mapping[str, Scalar]], None]) -> 
 class Failure:
     """Failure of the algorithm under test in an otherwise valid case.
 
-    - outcome: a name of `marsyard.algorithms.faults.Fault`
+    - outcome: a name of `marsyard.algorithms.answers.Fault`
     - error, trace: stored as `error` and `traceback`
     """
 
@@ -128,3 +136,58 @@ class HasParts(Protocol):
     @property
     def part_keys(self) -> Mapping[str, Kind]:
         """Kinds of the parts by the dotted path of the parameter that names them, one name or a list."""
+
+
+ParametersType = TypeVar("ParametersType", bound=BaseModel)
+
+#: Loads terrain `number` of the bank of a site: site, terrain, seed of the bank, number.
+LoadGround = Callable[[Site, TerrainParameters, int, int], SiteGround]
+
+
+class BaseScenario(Generic[ParametersType]):
+    """A scenario with one type of parameters. Subclasses define `name` and `parameters_type`."""
+
+    name: str
+    parameters_type: type[ParametersType]
+
+    def check_parameters(self, parameters: BaseModel) -> ParametersType:
+        """Return the parameters with their type. Raises TypeError for those of another scenario."""
+        if not isinstance(parameters, self.parameters_type):
+            expected, given = self.parameters_type.__name__, type(parameters).__name__
+            raise TypeError(f"the scenario {self.name} takes {expected}, not {given}")
+        return parameters
+
+
+class TerrainScenario(BaseScenario[ParametersType], ABC):
+    """A scenario whose shared inputs are terrains; keeps the most recently used grounds in memory.
+
+    By default algorithms and scores are selected at the top level of the parameters.
+    """
+
+    algorithm_table: tuple[str, ...] = ()
+    part_keys: Mapping[str, Kind] = {"scores": SCORE}
+
+    def __init__(self, cached_grounds: int = 0) -> None:
+        self.load_ground: LoadGround = lru_cache(maxsize=cached_grounds)(SiteGround.from_bank)
+
+    @abstractmethod
+    def input_terrain(self, p: ParametersType, shared_input: int) -> tuple[TerrainBank, int]:
+        """Return the bank of a shared input, and the number of its terrain there."""
+
+    def prepare(self, parameters: BaseModel, shared_input: int) -> None:
+        """Build one terrain into the cache on disk."""
+        bank, number = self.input_terrain(self.check_parameters(parameters), shared_input)
+        bank.terrain(number)
+
+    def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
+        """Return the bytes of a terrain that is not on disk."""
+        bank, number = self.input_terrain(self.check_parameters(parameters), shared_input)
+        return bank.missing_bytes(number)
+
+
+def algorithm_result(
+    attempt: AlgorithmRun[Any], answered: bool, row: Mapping[str, Scalar], products: Mapping[str, Any]
+) -> CaseResult:
+    """Combine an algorithm's answer or failure with its columns and products."""
+    outcome = attempt.outcome(lambda answer: str(answer.outcome.name))
+    return CaseResult(outcome, answered, row, products, attempt.failure)

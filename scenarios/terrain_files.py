@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import AfterValidator
 
 from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, npz_headers
-from marsyard.sim.terrain import Site, TerrainParameters, site
+from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, check_holes, choose_grid, read_rasters
 
 #: Maximum posts of a DTM and pixels of a picture along a side: limits of the largest terrain and of memory.
@@ -40,6 +40,18 @@ def _check_terrain(terrain: TerrainParameters) -> TerrainParameters:
 
 #: A terrain whose files are checked: raises TerrainFileError where they are unusable.
 CheckedTerrain = Annotated[TerrainParameters, AfterValidator(_check_terrain)]
+
+
+def check_site(user: str, scale: str) -> AfterValidator:
+    """Return a check of a site's name: a preset with a terrain at the scale; messages name the user of the site."""
+
+    def check(name: str | None) -> str | None:
+        allowed = [one.name for one in sites().values() if getattr(one, scale) is not None]
+        if name is not None and name not in allowed:
+            raise ValueError(f"no site for {user} is called '{name}'; allowed: {', '.join(allowed)}")
+        return name
+
+    return AfterValidator(check)
 
 
 def check_source(source: RealTerrain) -> None:

@@ -5,15 +5,5 @@ from marsyard.algorithms.dimes.estimator import DimesEstimator
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.validity import Combination, TrackMetrics, ValidityCheck, propagated
 
-__all__ = [
-    "Combination",
-    "DimesDetails",
-    "DimesEstimator",
-    "DimesOptions",
-    "PairDetails",
-    "Track",
-    "TrackMetrics",
-    "ValidityCheck",
-    "dimes_products",
-    "propagated",
-]
+__all__ = ["Combination", "DimesDetails", "DimesEstimator", "DimesOptions", "PairDetails", "Track", "TrackMetrics"]
+__all__ += ["ValidityCheck", "dimes_products", "propagated"]

@@ -256,11 +256,8 @@ def read_mast(folder: Path) -> MastCalibration:
 
 def write_stop(folder: Path, measurements: RoverMeasurements) -> None:
     """Write a stop's images and angles into an existing folder, without the mast."""
-    content: dict[str, Any] = {
-        "azimuth_rad": measurements.azimuth_rad,
-        "elevation_rad": measurements.elevation_rad,
-        "world_from_rover": encode_pose(measurements.world_from_rover),
-    }
+    content: dict[str, Any] = {name: getattr(measurements, name) for name in ("azimuth_rad", "elevation_rad")}
+    content["world_from_rover"] = encode_pose(measurements.world_from_rover)
     for name, image in (("left", measurements.left), ("right", measurements.right)):
         write_picture(folder / f"{name}.pgm", image.counts)
         rows, columns = image.counts.shape
@@ -281,10 +278,8 @@ def read_stop(folder: Path, mast: MastCalibration) -> RoverMeasurements:
 
 def encode_pose(pose: RigidTransform, body: str = "rover") -> dict[str, Any]:
     """The pose of a rover or a body: position in the world and unit quaternion, scalar last."""
-    return {
-        "position_world_m": np.asarray(pose.translation).tolist(),
-        f"world_from_{body}_xyzw": pose.rotation.as_quat().tolist(),
-    }
+    position, quaternion = np.asarray(pose.translation).tolist(), pose.rotation.as_quat().tolist()
+    return {"position_world_m": position, f"world_from_{body}_xyzw": quaternion}
 
 
 def read_pose(content: Mapping[str, Any], body: str = "rover") -> RigidTransform:

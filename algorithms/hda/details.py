@@ -12,10 +12,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda.hazards import ElevationMap, HazardMaps
-from marsyard.algorithms.hda.motion import Motion
+from marsyard.algorithms.hda.motion import Motion, View, Views, points_at_depth, undistort
 from marsyard.algorithms.hda.structure import Matches
 from marsyard.algorithms.hda.tracking import Tracks
-from marsyard.algorithms.hda.view import View, points_at_depth, undistort
 
 #: The stages of Table I, in order; the scale belongs to motion, the elevation map to hazards.
 STAGES = ("tracking", "motion", "structure", "hazards")
@@ -50,7 +49,7 @@ class HdaDetails:
     - ends_s: Processor time at the start and at the end of every completed stage of `STAGES`
     """
 
-    views: tuple[View, View]
+    views: Views
     tracks: Tracks | None = None
     motion: Motion | None = None
     matches: Matches | None = None

@@ -77,7 +77,4 @@ def estimators(quick: bool) -> Iterator[Measure]:
         yield Measure(f"velocity error, rms: {name}", rms, "m/s", None, how)
 
 
-CHECKS = (
-    Check("imu-check", "DIMES", imu_check),
-    Check("estimators", "DIMES", estimators),
-)
+CHECKS = (Check("imu-check", "DIMES", imu_check), Check("estimators", "DIMES", estimators))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from benchmarks.validation.records import Check, Measure
 from benchmarks.validation.scenes import renderer
-from marsyard.sim.processor import processor_features
+from marsyard.sim.kernel_cache import processor_features
 
 ROOT = Path(__file__).parents[2]
 TEMPLATE = Path(__file__).parent / "template.md"

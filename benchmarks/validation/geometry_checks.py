@@ -18,15 +18,7 @@ from benchmarks.validation.markers import MARKERS
 from benchmarks.validation.motion import View, render
 from benchmarks.validation.raycast import Ground, meet_triangles
 from benchmarks.validation.records import Check, Measure
-from benchmarks.validation.scenes import (
-    OVERHEAD,
-    PAINT,
-    cameras,
-    descent_view,
-    ground_view,
-    renderer,
-    rock_view,
-)
+from benchmarks.validation.scenes import OVERHEAD, PAINT, cameras, descent_view, ground_view, renderer, rock_view
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import Scene
 from marsyard.sim.terrain import Surface

@@ -11,8 +11,7 @@ from scipy import stats
 from benchmarks.validation.nights import BEFORE, CASES, KINDS, WORSE, planted_found, quiet_nights
 from benchmarks.validation.records import Check, Measure
 from marsyard.reports.history import WINDOW
-from marsyard.reports.statistics.clusters import clustered_evidence
-from marsyard.reports.statistics.proportions import Interval, proportion_lower, proportion_upper
+from marsyard.reports.statistics.proportions import Interval, clustered_evidence, proportion_lower, proportion_upper
 from marsyard.reports.statistics.samples import error_ellipse, mean_interval, quantile_bounds, spread_interval
 from marsyard.reports.statistics.sequential import confidence_at, planned_looks
 
@@ -67,12 +66,7 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
         inside += (along / ellipse.semi_major) ** 2 + (across / ellipse.semi_minor) ** 2 <= 1.0
     how = f"{4 * trials} samples of 20, and one error more each"
     yield Measure(
-        "95 % ellipse holds the next error",
-        inside / (4 * trials),
-        "",
-        _min_coverage(0.95, 4 * trials),
-        how,
-        "at least",
+        "95 % ellipse holds the next error", inside / (4 * trials), "", _min_coverage(0.95, 4 * trials), how, "at least"
     )
 
 

@@ -16,8 +16,7 @@ from marsyard.campaigns.errors import ConfigurationError, Problem, near_match
 from marsyard.campaigns.sampling.design import Correlation, Design
 from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, Grid, Normal
 from marsyard.sim.files import check_regular
-from marsyard.sim.parameters import Parameters
-from marsyard.sim.renamed import current_key
+from marsyard.sim.parameters import Parameters, current_key
 
 Model = TypeVar("Model", bound=BaseModel)
 #: A key in nested tables and lists, part by part.

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, current_path
 from marsyard.scenarios.interface import Scenario
 from marsyard.scenarios.systems import UnknownScenarioError, row_columns, scenario
-from marsyard.sim.renamed import RenamedWarning, current_column, current_key
+from marsyard.sim.parameters import RenamedWarning, current_column, current_key
 
 _NAME = re.compile(r"[A-Za-z_]\w*(?:\.\w+)*")
 #: Keys of a dispersion whose texts are no formulas.
@@ -39,9 +39,8 @@ def use_current_names(tables: Mapping[str, Any], selected: Scenario) -> dict[str
     if isinstance(correlations, list):
         current["correlations"] = [_rename_entries(group, ("parameters",), path) for group in correlations]
     if isinstance(tables.get("requirements"), list):
-        current["requirements"] = [
-            _rename_entries(stated, ("metric", "population"), column) for stated in tables["requirements"]
-        ]
+        keys = ("metric", "population")
+        current["requirements"] = [_rename_entries(stated, keys, column) for stated in tables["requirements"]]
     return current
 
 

@@ -109,7 +109,7 @@ def hash_inputs(configuration: CampaignConfiguration) -> dict[str, str]:
 
 def list_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
     """Algorithms under test that a configuration or its dispersions name."""
-    used = _scenario(configuration)
+    used = find_scenario(configuration.scenario)
     if not isinstance(used, HasAlgorithms):
         return ()
     judged, compared = (".".join((*used.algorithm_table, name)) for name in ("algorithm", "compared"))
@@ -121,7 +121,7 @@ def list_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
 
 def list_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
     """Import paths (``module:name``) of the custom parts that a configuration or its dispersions name."""
-    used = _scenario(configuration)
+    used = find_scenario(configuration.scenario)
     if not isinstance(used, HasParts):
         return ()
     trees = [configuration.parameters]
@@ -140,9 +140,10 @@ def list_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
     return tuple(paths)
 
 
-def _scenario(configuration: CampaignConfiguration) -> Scenario | None:
+def find_scenario(name: object) -> Scenario | None:
+    """Scenario of a name; None where it is no name, or unknown."""
     try:
-        return scenario(configuration.scenario)
+        return scenario(name) if isinstance(name, str) and name else None
     except UnknownScenarioError:
         return None
 

@@ -24,10 +24,6 @@ class StatedRequirement(Requirement):
 
     campaigns: Annotated[tuple[str, ...], Field(strict=False)] = ()
 
-    def applies_to(self, campaign: str) -> bool:
-        """Whether a campaign of that name verifies it."""
-        return any(fnmatchcase(campaign, pattern) for pattern in self.campaigns)
-
     def plain(self) -> dict[str, Any]:
         """As stated in a campaign."""
         return self.model_dump(mode="json", exclude={"campaigns"})
@@ -71,7 +67,7 @@ def _read_shipped() -> tuple[Mapping[str, StatedRequirement], tuple[str, ...]]:
 
 def select_applicable(stated: Sequence[StatedRequirement], campaign: str) -> list[dict[str, Any]]:
     """Requirements that a campaign of that name verifies, as campaigns state them."""
-    return [one.plain() for one in stated if one.applies_to(campaign)]
+    return [one.plain() for one in stated if any(fnmatchcase(campaign, pattern) for pattern in one.campaigns)]
 
 
 def fill_requirements(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[Key, str]]]:

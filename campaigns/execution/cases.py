@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
-from marsyard.algorithms.faults import describe_error
+from marsyard.algorithms.answers import describe_error
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, Requirement
+from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, UNFINISHED, CaseEndedError
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.worker_process import Executor, TaskResult, Work, WorkLimits
-from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, UNFINISHED, CaseEndedError
 from marsyard.campaigns.store.products import Keep, PackedProducts, pack_products
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by

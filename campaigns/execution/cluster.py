@@ -20,10 +20,9 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from marsyard.campaigns.definition.identity import hash_code, read_versions
-from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.errors import CRASHED, CampaignError, CaseEndedError
 from marsyard.campaigns.execution.worker_process import TaskResult, Work
 from marsyard.campaigns.execution.workers import Batches, LocalExecutor
-from marsyard.campaigns.outcomes import CRASHED, CaseEndedError
 
 Result = TypeVar("Result")
 #: Seconds to wait for a scheduler, and for a first worker.

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from functools import partial
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.errors import UNFINISHED, CampaignError
 from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
 from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
-from marsyard.campaigns.outcomes import UNFINISHED
 from marsyard.campaigns.store.products import KEEP_ALL
 from marsyard.scenarios.interface import SelectsInputs
 from marsyard.scenarios.systems import scenario_paths

@@ -16,8 +16,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Requirement
-from marsyard.campaigns.errors import StoreError, writing
-from marsyard.campaigns.outcomes import UNFINISHED
+from marsyard.campaigns.errors import UNFINISHED, StoreError, writing
 
 #: Key in `products.json` that replaces an array by its name in `products.npz`.
 _ARRAY = "__array__"

@@ -21,8 +21,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.errors import StoreError
-from marsyard.campaigns.outcomes import UNFINISHED
+from marsyard.campaigns.errors import UNFINISHED, StoreError
 from marsyard.scenarios.interface import Scalar
 
 ROWS_FILE = "cases.sqlite"

@@ -67,7 +67,6 @@ def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> No
 def _columns(
     chunk: Sequence[tuple[int, list[Any]]], layouts: Mapping[int, Sequence[str]], columns: Sequence[str]
 ) -> Iterator[Sequence[Any]]:
-    """Values of each column in a chunk of rows; None where a row lacks it."""
     indices: dict[int, list[int]] = {}
     for index, (layout, _) in enumerate(chunk):
         indices.setdefault(layout, []).append(index)

@@ -19,7 +19,7 @@ from marsyard.cli.options import OverwriteOption, handle_user_errors, with_optio
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
-    from marsyard.scenarios.system import Ingested
+    from marsyard.scenarios.systems import Ingested
     from marsyard.scenarios.template import CampaignTemplate, Choices
 
 CAMPAIGN_FILE = "campaign.toml"
@@ -30,25 +30,15 @@ class NewOptions:
     """Arguments and options of `marsyard new`."""
 
     name: Annotated[str, Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")]
-    system: Annotated[
-        str | None, Option("--system", help="System under test, such as velocity; a wrong name lists all.")
-    ] = None
-    site: Annotated[str | None, Option("--site", help="One of `marsyard terrain list`.")] = None
-    camera: Annotated[
-        str | None, Option("--camera", metavar="FILE", help="Custom camera file (docs/custom-worlds.md).")
-    ] = None
-    detector: Annotated[str | None, Option("--detector", metavar="FILE", help="Custom detector datasheet in TOML.")] = (
-        None
-    )
-    flight: Annotated[
-        str | None, Option("--flight", metavar="FILE", help="Trajectory file in place of the dynamics.")
-    ] = None
-    axes: Annotated[str, Option("--axes", help="World axes of the trajectory: enu or ned.")] = "enu"
-    bound: Annotated[
-        float | None, Option("--bound", metavar="X", help="Requirement: maximum error or minimum fraction.")
-    ] = None
+    system: Annotated[str | None, Option(help="System under test, such as velocity; a wrong name lists all.")] = None
+    site: Annotated[str | None, Option(help="One of `marsyard terrain list`.")] = None
+    camera: Annotated[str | None, Option(metavar="FILE", help="Custom camera file (docs/custom-worlds.md).")] = None
+    detector: Annotated[str | None, Option(metavar="FILE", help="Custom detector datasheet in TOML.")] = None
+    flight: Annotated[str | None, Option(metavar="FILE", help="Trajectory file in place of the dynamics.")] = None
+    axes: Annotated[str, Option(help="World axes of the trajectory: enu or ned.")] = "enu"
+    bound: Annotated[float | None, Option(metavar="X", help="Requirement: maximum error or minimum fraction.")] = None
     cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24
-    out: Annotated[Path | None, Option("--out", metavar="FILE", help="Instead of NAME.toml.")] = None
+    out: Annotated[Path | None, Option(metavar="FILE", help="Instead of NAME.toml.")] = None
     overwrite: OverwriteOption = False
 
 
@@ -57,7 +47,7 @@ class NewOptions:
 def new(given: NewOptions) -> None:
     """Write a commented campaign of your own; at a terminal asks for what is not given."""
     from marsyard.campaigns.errors import CampaignError, not_allowed
-    from marsyard.cli.evidence import evidence_limits
+    from marsyard.cli.outcome import evidence_limits
     from marsyard.reports.wording import count
     from marsyard.scenarios.import_path import import_object
     from marsyard.scenarios.systems import template_paths
@@ -99,15 +89,14 @@ def _is_terminal() -> bool:
 def _write_and_load(path: Path, template: CampaignTemplate, choices: Choices) -> Campaign:
     """Write the campaign and load it; where it cannot be loaded, restore what the path held before."""
     from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.campaigns.errors import CampaignError
+    from marsyard.campaigns.errors import CampaignError, writing
 
     before = path.read_text(encoding="utf-8") if path.exists() else None
     try:
-        path.write_text(template.text(choices), encoding="utf-8")
+        with writing(f"{path}:"):
+            path.write_text(template.text(choices), encoding="utf-8")
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    except OSError as error:
-        raise CampaignError(f"{path}: cannot be written: {error.strerror or error}") from error
     try:
         return load_campaign(str(path))
     except CampaignError:
@@ -123,9 +112,9 @@ def _answer(question: str, default: str, asked: bool, find_problem: Callable[[st
             raise typer.BadParameter(problem)
         return answer
 
-    return str(
-        typer.prompt(question, default=default, show_default=bool(default), value_proc=check) if asked else default
-    )
+    if not asked:
+        return default
+    return str(typer.prompt(question, default=default, show_default=bool(default), value_proc=check))
 
 
 def _find_word_problem(allowed: Sequence[str], answer: str) -> str:
@@ -164,12 +153,12 @@ def ingest(
     folder: Annotated[
         Path, Argument(metavar="FOLDER", help="ingest.toml, pictures.csv and pictures (docs/real-pictures.md).")
     ],
-    out: Annotated[Path, Option("--out", metavar="DIR", help="New folder of the cases and their campaign.")],
-    system: Annotated[str | None, Option("--system", help="System of the cases; by default real pictures.")] = None,
+    out: Annotated[Path, Option(metavar="DIR", help="New folder of the cases and their campaign.")],
+    system: Annotated[str | None, Option(help="System of the cases; by default real pictures.")] = None,
 ) -> None:
     """Make a campaign of real cases from pictures with measured attitude and altitude."""
     from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.campaigns.errors import CampaignError, StoreError, not_allowed
+    from marsyard.campaigns.errors import CampaignError, StoreError, not_allowed, writing
     from marsyard.reports.wording import count
     from marsyard.scenarios.import_path import import_object
     from marsyard.scenarios.systems import systems
@@ -182,16 +171,15 @@ def ingest(
         raise StoreError(f"{out} is there already, and is not empty; name a new folder with --out")
     unfinished = out.with_name(f"{out.name}.part{os.getpid()}")
     try:
-        unfinished.mkdir(parents=True)
-        made: Ingested = import_object(known[chosen])(folder, unfinished, out.resolve())
-        (unfinished / CAMPAIGN_FILE).write_text(made.campaign, encoding="utf-8")
-        if out.exists():
-            out.rmdir()
-        unfinished.rename(out)
+        with writing(f"{out}:"):
+            unfinished.mkdir(parents=True)
+            made: Ingested = import_object(known[chosen])(folder, unfinished, out.resolve())
+            (unfinished / CAMPAIGN_FILE).write_text(made.campaign, encoding="utf-8")
+            if out.exists():
+                out.rmdir()
+            unfinished.rename(out)
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    except OSError as error:
-        raise StoreError(f"{out}: cannot be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
     try:

@@ -19,28 +19,20 @@ class RenderOptions:
     """Arguments and options of `marsyard render`."""
 
     site: SiteArgument
-    camera: Annotated[str, Option("--camera", metavar="NAME", help="Such as mer-navcam; a wrong name lists all.")]
-    out: Annotated[Path, Option("--out", metavar="PREFIX", help="Path of the files without extension.")]
-    scale: Annotated[
-        str | None, Option("--scale", metavar="SCALE", help="descent or ground; by default the camera's.")
-    ] = None
-    altitude: Annotated[
-        float | None, Option("--altitude", metavar="M", help="Height above the ground; by default the camera's.")
-    ] = None
-    east: Annotated[
-        float | None, Option("--east", metavar="M", help="By default 0, or the middle of a DTM; periodic.")
-    ] = None
-    north: Annotated[
-        float | None, Option("--north", metavar="M", help="By default 0, or the middle of a DTM; periodic.")
-    ] = None
-    azimuth: Annotated[float, Option("--azimuth", metavar="DEG", help="Viewing direction, clockwise from north.")] = 0.0
-    elevation: Annotated[float | None, Option("--elevation", metavar="DEG", help="Of the optical axis; -90: down.")] = (
+    camera: Annotated[str, Option(metavar="NAME", help="Such as mer-navcam; a wrong name lists all.")]
+    out: Annotated[Path, Option(metavar="PREFIX", help="Path of the files without extension.")]
+    scale: Annotated[str | None, Option(metavar="SCALE", help="descent or ground; by default the camera's.")] = None
+    altitude: Annotated[float | None, Option(metavar="M", help="Height above the ground; by default the camera's.")] = (
         None
     )
-    sun_azimuth: Annotated[float, Option("--sun-azimuth", metavar="DEG", help="Clockwise from north.")] = 250.0
-    sun_elevation: Annotated[float, Option("--sun-elevation", metavar="DEG", help="Above the horizon.")] = 35.0
+    east: Annotated[float | None, Option(metavar="M", help="By default 0, or the middle of a DTM; periodic.")] = None
+    north: Annotated[float | None, Option(metavar="M", help="By default 0, or the middle of a DTM; periodic.")] = None
+    azimuth: Annotated[float, Option(metavar="DEG", help="Viewing direction, clockwise from north.")] = 0.0
+    elevation: Annotated[float | None, Option(metavar="DEG", help="Of the optical axis; -90: down.")] = None
+    sun_azimuth: Annotated[float, Option(metavar="DEG", help="Clockwise from north.")] = 250.0
+    sun_elevation: Annotated[float, Option(metavar="DEG", help="Above the horizon.")] = 35.0
     detector: Annotated[bool, Option("--detector/--radiance", help="Detector counts, or radiance factor.")] = True
-    seed: Annotated[int, Option("--seed", metavar="S", min=0, help="Of the terrain and the noise.")] = 1
+    seed: Annotated[int, Option(metavar="S", min=0, help="Of the terrain and the noise.")] = 1
     overwrite: OverwriteOption = False
     max_holes: MaxHolesOption = None
 
@@ -78,7 +70,7 @@ def report_picture_errors(out: Path) -> Iterator[None]:
 
 
 def gallery(
-    out: Annotated[Path, Option("--out", metavar="DIR", help="Folder of the page and pictures.")] = Path("gallery"),
+    out: Annotated[Path, Option(metavar="DIR", help="Folder of the page and pictures.")] = Path("gallery"),
     overwrite: OverwriteOption = False,
 ) -> None:
     """Render every site through the cameras that fit it: one page, and a contact sheet. Takes about a minute."""

@@ -14,10 +14,9 @@ from rich.text import Text
 
 from marsyard.campaigns.definition.campaign import Campaign, leaves, value_at
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, description_at
-from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.errors import CampaignError, writing
 from marsyard.campaigns.sampling.design import describe_design
-from marsyard.reports.columns import split_unit
-from marsyard.reports.wording import asked_text, count
+from marsyard.reports.wording import asked_text, count, split_unit
 
 if TYPE_CHECKING:
     from marsyard.reports.section import Grid
@@ -128,10 +127,8 @@ def write_draws_figure(campaign: Campaign, cases: int, path: Path) -> None:
         if not dispersion.formulas:
             quantiles = [dispersion.quantile((index + 0.5) / _QUANTILES) for index in range(_QUANTILES)]
         of_each.append(Drawn(name, values, quantiles))
-    try:
+    with writing(f"--figure {path}:"):
         save_figure(draws_figure(campaign.configuration.name, of_each), path)
-    except OSError as error:
-        raise CampaignError(f"--figure {path}: cannot be written: {error.strerror or error}") from error
 
 
 def drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
@@ -187,7 +184,6 @@ def _dispersion_data(campaign: Campaign, path: str) -> dict[str, Any]:
 
 
 def _value(value: Any) -> str:
-    """A drawn value, numbers with five digits."""
     if isinstance(value, float):
         return f"{value:.5g}"
     return value if isinstance(value, str) else json.dumps(value, default=str)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from marsyard.sim.terrain import Surface
     from marsyard.sim.terrain.imported import Embedded, RealExtent
     from marsyard.sim.terrain.parameters import TerrainParameters
-    from marsyard.sim.terrain.statistics import TerrainStatistics
+    from marsyard.sim.terrain.surface import TerrainStatistics
 
 #: Longest side of a picture; colours are blue, green, red.
 MAX_PIXELS = 2048
@@ -37,10 +37,8 @@ def list_sites(as_json: JsonOption = False) -> None:
     for heading in ("site", "planet", "terrain", "description"):
         table.add_column(heading)
     for one in sites().values():
-        planet, scales = (
-            one.environment.planet,
-            [name for name in ("descent", "ground") if getattr(one, name) is not None],
-        )
+        planet = one.environment.planet
+        scales = [name for name in ("descent", "ground") if getattr(one, name) is not None]
         rows.append({"name": one.name, "planet": planet, "terrain": scales, "description": one.description})
         table.add_row(one.name, planet, ", ".join(scales), one.description)
     if as_json:
@@ -52,15 +50,11 @@ def list_sites(as_json: JsonOption = False) -> None:
 @app.command()
 def stats(
     site: SiteArgument,
-    scale: Annotated[
-        str | None, Option("--scale", metavar="SCALE", help="descent or ground; by default the coarser one.")
-    ] = None,
-    seed: Annotated[int, Option("--seed", metavar="S", min=0, help="Seed of the terrain.")] = 1,
+    scale: Annotated[str | None, Option(metavar="SCALE", help="descent or ground; by default the coarser one.")] = None,
+    seed: Annotated[int, Option(metavar="S", min=0, help="Seed of the terrain.")] = 1,
     as_json: JsonOption = False,
     max_holes: MaxHolesOption = None,
-    picture: Annotated[
-        Path | None, Option("--picture", metavar="PNG", help="Write a nadir picture; filled holes are red.")
-    ] = None,
+    picture: Annotated[Path | None, Option(metavar="PNG", help="Write a nadir picture; filled holes are red.")] = None,
 ) -> None:
     """Print albedo, slopes, relief and image contrast of a site's terrain next to the paper's figures."""
     import numpy as np
@@ -69,7 +63,7 @@ def stats(
     from marsyard.sim.terrain.bank import synthesise
     from marsyard.sim.terrain.imported import embed
     from marsyard.sim.terrain.sites import PAPER
-    from marsyard.sim.terrain.statistics import terrain_statistics
+    from marsyard.sim.terrain.surface import terrain_statistics
 
     try:
         known = site_or_file(site, MAX_HOLE_FRACTION if max_holes is None else max_holes)
@@ -116,7 +110,7 @@ def _print_statistics(
     from rich.table import Table
 
     from marsyard.sim.terrain.sites import PAPER
-    from marsyard.sim.terrain.statistics import CONTRAST_PIXEL_M, CONTRAST_SUN_ELEVATION_DEG
+    from marsyard.sim.terrain.surface import CONTRAST_PIXEL_M, CONTRAST_SUN_ELEVATION_DEG
 
     side, paper = parameters.samples * parameters.spacing_m, PAPER.get(name)
     albedo, slope, relief, contrast = "", "", "", ""
@@ -170,7 +164,7 @@ def write_terrain_picture(path: Path, surface: Surface, real: Embedded | None) -
     import cv2
     import numpy as np
 
-    from marsyard.sim.terrain.statistics import CONTRAST_SUN_ELEVATION_DEG, nadir_picture
+    from marsyard.sim.terrain.surface import CONTRAST_SUN_ELEVATION_DEG, nadir_picture
 
     if path.suffix.lower() != ".png":
         raise ValueError(f"--picture {path}: a file that ends in .png is needed")

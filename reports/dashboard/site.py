@@ -16,19 +16,9 @@ from typing import Any
 
 from marsyard.campaigns.definition.requirements import StatedRequirement, shipped_requirements
 from marsyard.reports.campaign import PAGE_FILE, TWIN_FILE, VERIFICATION_FILE, page_environment, write_whole
-from marsyard.reports.cases import shown_case
-from marsyard.reports.dashboard.entries import (
-    MAX_FURTHER_VERDICTS,
-    Entry,
-    RequirementRow,
-    basis_text,
-    coverage,
-    evidence_text,
-    find_campaigns,
-    margin_text,
-    read_entries,
-    requirement_rows,
-)
+from marsyard.reports.dashboard import entries as stored
+from marsyard.reports.dashboard.entries import Entry, RequirementRow, basis_text, evidence_text, margin_text
+from marsyard.reports.presentation import shown_case
 from marsyard.reports.sections import embedded, replay_command, script_hash
 from marsyard.reports.stored import read_run
 from marsyard.reports.traceability import algorithm_cells, verification_csv
@@ -56,8 +46,8 @@ def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, St
 
     `stated` are the requirements to be shown, by id; the shipped ones by default.
     """
-    entries, problems = read_entries(find_campaigns(sources))
-    rows = requirement_rows(entries, shipped_requirements() if stated is None else stated)
+    entries, problems = stored.read_entries(stored.find_campaigns(sources))
+    rows = stored.requirement_rows(entries, shipped_requirements() if stated is None else stated)
     (directory / "c").mkdir(parents=True, exist_ok=True)
     for entry in entries:
         _write_campaign(directory / "c" / entry.slug, entry)
@@ -74,8 +64,8 @@ def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, St
         entries=entries,
         problems=problems,
         filters=[(name.lower(), name, sorted(found - {""})) for name, found in values.items()],
-        most=MAX_FURTHER_VERDICTS,
-        coverage=coverage(rows),
+        most=stored.MAX_FURTHER_VERDICTS,
+        coverage=stored.coverage(rows),
         data=embedded(_data(rows)),
         script=script,
         hash=script_hash(script),
@@ -87,7 +77,6 @@ def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, St
 
 
 def _write_campaign(folder: Path, entry: Entry) -> None:
-    """Write a campaign's page, its report, and pages of its kept cases."""
     page, report = folder / INDEX, entry.directory / PAGE_FILE
     if page.is_file() and page.stat().st_mtime > (entry.directory / TWIN_FILE).stat().st_mtime:
         return
@@ -106,7 +95,6 @@ def _write_campaign(folder: Path, entry: Entry) -> None:
 
 
 def _write_cases(folder: Path, entry: Entry) -> list[dict[str, str]]:
-    """Write pages of the kept cases; return their entries for the campaign's page."""
     if not entry.kept:
         return []
     run, listed = read_run(entry.directory), []

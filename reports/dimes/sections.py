@@ -16,13 +16,24 @@ from matplotlib.patches import Circle
 from scipy import stats
 
 from marsyard.reports import kinds, rates
-from marsyard.reports.columns import axis_columns, label, magnitude_label, numbers, split_unit
-from marsyard.reports.papers import read_paper
+from marsyard.reports.charts import MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, SvgFigure, grid_of, plate
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.svg import MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
-from marsyard.reports.wording import NOTHING, count, note_text, number, percent, stated
+from marsyard.reports.tables import read_paper
+from marsyard.reports.wording import (
+    NOTHING,
+    axis_columns,
+    count,
+    label,
+    magnitude_label,
+    note_text,
+    number,
+    numbers,
+    percent,
+    split_unit,
+    stated,
+)
 
 #: Rows of the paper's Fig. 11 by (category, run).
 FIG_11: Mapping[tuple[str, str], Mapping[str, Any]] = {
@@ -141,7 +152,6 @@ def scatter_plates(subject: Subject) -> list[SvgFigure]:
 
 @in_page_style
 def _scatter(chosen: kinds.Rows, parts: Sequence[str], subject: Subject, reach: float) -> Figure:
-    """Errors of one category, marked by run."""
     figure, axes = new_axes(4.2, 4.4)
     runs = sorted(str(run) for run in subject.frame["run"].dropna().unique())
     for place, run in enumerate(runs):
@@ -204,7 +214,6 @@ def landing_shares(landed: kinds.Rows) -> dict[str, rates.Share]:
 
 
 def _speeds(landed: kinds.Rows, subject: Subject, key: str) -> kinds.Drawn:
-    """Table of mean, quantiles with bounds, and fractions above round speeds."""
     columns, groups = [numbers(landed, name) for name in (WITH, WITHOUT)], rates.terrain_groups(landed)
     change = columns[0] - columns[1]
     rows = [["mean (m/s)", *(number(float(values.mean())) for values in columns)]]

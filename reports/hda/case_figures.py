@@ -19,9 +19,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LightSource, LinearSegmentedColormap, ListedColormap, to_rgb
 from matplotlib.figure import Figure
 
+from marsyard.reports.charts import MUTED, in_page_style, show_picture
 from marsyard.reports.hda import products as stages
 from marsyard.reports.presentation import save_figures
-from marsyard.reports.svg import MUTED, in_page_style, show_picture
 
 T = TypeVar("T")
 
@@ -145,7 +145,6 @@ def draw_maps(products: Mapping[str, Any]) -> Figure:
 
 
 def _draw_safety(above: Axes, below: Axes, maps: stages.LandingMaps, truth: stages.TrueGround) -> None:
-    """Draw the safe landing map, and below it the true one with a legend."""
     scale: dict[str, Any] = {"vmin": 0, "vmax": 2, "cmap": SAFETY_COLOURS}
     above.imshow(maps.safety, interpolation="nearest", **scale)
     if (maps.safety > 1.5).any() and (maps.safety < 1.5).any():
@@ -236,7 +235,6 @@ def _draw_segments(axes: Axes, starts: stages.Pixels, ends: stages.Pixels, colou
 
 
 def _picture_pair(products: Mapping[str, Any]) -> tuple[Figure, Axes, Axes]:
-    """A figure of both pictures side by side."""
     shown = _require(stages.pictures(products), "pictures")
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)

@@ -12,15 +12,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from marsyard.reports.charts import RateLine, draw_rates
-from marsyard.reports.columns import numbers
+from marsyard.reports.charts import MUTED, REQUIREMENT, RateLine, draw_rates, in_page_style
 from marsyard.reports.hda.sections import PAPER, landing_rows
 from marsyard.reports.kinds import Drawn, Rows
 from marsyard.reports.rates import CONFIDENCE, PooledRate, flag, pooled_rate, rate_text
 from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
-from marsyard.reports.svg import MUTED, REQUIREMENT, in_page_style
-from marsyard.reports.wording import NOTHING, note_text, percent, stated
-from marsyard.scenarios.landing.confusion import CLASS_NAMES, CLASSES
+from marsyard.reports.wording import NOTHING, note_text, numbers, percent, stated
+from marsyard.scenarios.landing.relief import CLASS_NAMES, CLASSES
 
 
 @dataclass(frozen=True)

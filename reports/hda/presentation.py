@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from marsyard.reports.charts import draw_pictures
 from marsyard.reports.hda import products as stages
 from marsyard.reports.hda import sections
 from marsyard.reports.hda.case_figures import FIGURES, figures_reached, write_hda_figures
@@ -14,7 +15,6 @@ from marsyard.reports.hda.classes import draw_classes, limits_section
 from marsyard.reports.kinds import Distribution, MadeBy, RateTable, SectionDeclaration
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
 from marsyard.reports.section import plate
-from marsyard.reports.svg import draw_pictures
 from marsyard.reports.wording import note_text, number
 
 _CAPTIONS: Mapping[str, str] = {
@@ -42,7 +42,6 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
 
 
 def _stages(products: Mapping[str, Any]) -> tuple[list[str], list[TableRow]]:
-    """Table of the stages with their results."""
     tracks, motion = stages.tracked_features(products), stages.solved_motion(products)
     matches, maps = stages.epipolar_matches(products), stages.landing_maps(products)
     results = dict.fromkeys(("Features and tracks", "Motion", "Structure", "Map", "Site"), "")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from marsyard.reports.presentation import numbers, plane, read_arrays, shaped
+from marsyard.reports.presentation import numeric_product, plane, read_arrays, shaped
 
 Plane = Float[np.ndarray, "rows columns"]
 Pixels = Float[np.ndarray, "n 2"]
@@ -180,5 +180,5 @@ def true_ground(products: Mapping[str, Any]) -> TrueGround | None:
 
 
 def _positive(products: Mapping[str, Any], name: str) -> float | None:
-    value = numbers(products.get(name))
+    value = numeric_product(products.get(name))
     return float(value.item()) if value is not None and value.size == 1 and value.item() > 0.0 else None

@@ -11,12 +11,11 @@ import pandas as pd
 from jaxtyping import Bool, Float
 
 from marsyard.reports import kinds, rates
-from marsyard.reports.columns import numbers
-from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.statistics.samples import mean_interval, quantile_bounds
-from marsyard.reports.wording import NOTHING, count, note_text, number, stated
+from marsyard.reports.tables import read_paper
+from marsyard.reports.wording import NOTHING, count, note_text, number, numbers, stated
 from marsyard.scenarios.landing.parameters import LanderParameters
 
 PAPER = read_paper(Path(__file__).with_name("paper.toml"))

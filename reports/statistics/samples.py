@@ -12,7 +12,7 @@ Values that share terrains (`groups`) are correlated; the terrain is the samplin
 bootstrap of whole terrains (Davison & Hinkley, "Bootstrap methods and their application", 1997, section 3.8), widened
 for few of them as for single values; it contains Student's interval with the variance over terrains (Taylor
 linearisation; Cochran, "Sampling techniques", 1977, section 6). Quantiles: order statistics, with the counts of
-`marsyard.reports.statistics.clusters`: the effective number of values (Woodruff, J. Amer. Statist. Assoc. 47, 1952,
+`marsyard.reports.statistics.proportions`: the effective number of values (Woodruff, J. Amer. Statist. Assoc. 47, 1952,
 with Korn & Graubard's number), or whole terrains where too few of them lie on either side.
 
 `python -m benchmarks.validation --only intervals --only shared` measures the coverage of all of these.
@@ -32,8 +32,14 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
 
-from marsyard.reports.statistics.clusters import ClusterMethod, clustered_evidence, number_terrains
-from marsyard.reports.statistics.proportions import Interval, check_confidence, proportion_lower
+from marsyard.reports.statistics.proportions import (
+    ClusterMethod,
+    Interval,
+    check_confidence,
+    clustered_evidence,
+    number_terrains,
+    proportion_lower,
+)
 
 #: Number of values (or terrains) above which the bootstrap's interval equals the large-sample one as printed.
 _MAX_BOOTSTRAP = 2000

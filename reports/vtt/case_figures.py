@@ -22,8 +22,8 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle, Rectangle
 from scipy import ndimage
 
-from marsyard.reports.presentation import numbers, plane, save_figures, shaped
-from marsyard.reports.svg import GRID, INK, MUTED, SERIES, in_page_style, show_subframe
+from marsyard.reports.charts import GRID, INK, MUTED, SERIES, in_page_style, show_subframe
+from marsyard.reports.presentation import numeric_product, plane, save_figures, shaped
 
 Picture = Float[np.ndarray, "_ _"]
 Point = Float[np.ndarray, "2"]
@@ -106,7 +106,7 @@ def is_vtt_case(products: Mapping[str, Any]) -> bool:
 
 def template_px(products: Mapping[str, Any]) -> float | None:
     """Side of the template; None if unknown."""
-    side = numbers(products.get("template_px"))
+    side = numeric_product(products.get("template_px"))
     return float(side) if side is not None and side.ndim == 0 and np.isfinite(side) else None
 
 
@@ -114,7 +114,9 @@ def stops_of(products: Mapping[str, Any]) -> list[StopPictures]:
     """The stops in order, up to the first without a left subframe."""
     found: list[StopPictures] = []
     states, table = products.get("states"), products.get("figures")
-    columns = {str(name): numbers(values) for name, values in table.items()} if isinstance(table, Mapping) else {}
+    columns = (
+        {str(name): numeric_product(values) for name, values in table.items()} if isinstance(table, Mapping) else {}
+    )
     arrays = {name: values for name, values in columns.items() if values is not None and values.ndim == 1}
     for number in _STOPS:
         left = plane(products.get(f"stop_{number}_left"))
@@ -137,7 +139,7 @@ def stops_of(products: Mapping[str, Any]) -> list[StopPictures]:
 
 def path_of(products: Mapping[str, Any]) -> RoverPath | None:
     """The run seen from above; None if missing."""
-    target = numbers(products.get("target_m"))
+    target = numeric_product(products.get("target_m"))
     stops, believed = _positions(products.get("rover_true_m")), _positions(products.get("rover_believed_m"))
     estimates = _positions(products.get("target_believed_m"))
     if target is None or target.shape != (3,) or not stops.size or not stops.shape == estimates.shape == believed.shape:

@@ -10,12 +10,11 @@ import pandas as pd
 
 from marsyard.algorithms.vtt.accuracy import GOAL_M, NAVCAM, PANCAM, drift_error_m, stereo_range_error_m
 from marsyard.reports import rates
-from marsyard.reports.columns import numbers
 from marsyard.reports.kinds import Distribution, Drawn, MadeBy, Rows, SectionDeclaration
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Subject, grid_of
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.wording import NOTHING, note_text, number, stated
+from marsyard.reports.wording import NOTHING, note_text, number, numbers, stated
 
 #: Columns of every row of a tracking case.
 _TRACKING_COLUMNS = ("tracked", "drift_px", "position_error_m", "losses")

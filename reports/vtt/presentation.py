@@ -5,20 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from marsyard.reports.columns import label
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
 from marsyard.reports.section import plate
+from marsyard.reports.vtt import sections
 from marsyard.reports.vtt.case_figures import draw_path, draw_stops, is_vtt_case, path_of, stops_of, write_vtt_figures
 from marsyard.reports.vtt.goal import GOAL
-from marsyard.reports.vtt.sections import (
-    SINGLE_RUNS,
-    regression_section,
-    steps_section,
-    table_1_section,
-    terrains_section,
-    updates_section,
-)
-from marsyard.reports.wording import NOTHING, note_text, number
+from marsyard.reports.wording import NOTHING, label, note_text, number
 
 #: Maximum number of stops whose pictures the page shows.
 _MAX_STOPS = 8
@@ -46,6 +38,5 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
 
 
 VTT = Presentation(
-    cases=(CaseKind(is_vtt_case, view, write_vtt_figures, note_text("vtt.legend")),),
-    first=(table_1_section, SINGLE_RUNS, updates_section, steps_section, terrains_section, regression_section, GOAL),
+    cases=(CaseKind(is_vtt_case, view, write_vtt_figures, note_text("vtt.legend")),), first=(*sections.SECTIONS, GOAL)
 )

@@ -16,14 +16,13 @@ import pandas as pd
 from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, AccuracyRow, table_1, tracked_approach_error_m
 from marsyard.reports import rates
 from marsyard.reports.charts import RateLine, rate_figure
-from marsyard.reports.columns import numbers
 from marsyard.reports.kinds import Drawn, MadeBy, Rows
-from marsyard.reports.papers import PaperFacts, read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
 from marsyard.reports.stored import table
+from marsyard.reports.tables import PaperFacts, read_paper
 from marsyard.reports.vtt.goal import is_closed_loop, is_tracking, losses_grid, selectable
-from marsyard.reports.wording import NOTHING, note_text, number, percent, stated
+from marsyard.reports.wording import NOTHING, note_text, number, numbers, percent, stated
 
 _PAPER_FILE = Path(__file__).with_name("paper.toml")
 PAPER = read_paper(_PAPER_FILE)
@@ -373,3 +372,6 @@ def regression_section(subject: Subject) -> Section | None:
         blocks.append(Block(heading="Runs that lost the target", grid=lost))
     data = {"tracked": asdict(rates.flag_share(frame, "tracked"))}
     return Section("regression", "Regression", "Regression runs on the engineering model", blocks, data)
+
+
+SECTIONS = (table_1_section, SINGLE_RUNS, updates_section, steps_section, terrains_section, regression_section)

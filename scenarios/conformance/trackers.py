@@ -95,7 +95,6 @@ class TrackerSuite(Suite):
         return [designation()]
 
     def _call(self, algorithm: Any, case: PixelTarget, seed: int) -> Sequence[TargetUpdate]:
-        """A drive; the target is cleared afterwards."""
         updates = drive(algorithm)
         algorithm.clear()
         return updates

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float64
+from pydantic import Field
+from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.descent.faults import faulty_times
+from marsyard.scenarios.descent.measurement import faulty_times
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.descent.recorded import AFTER_S, check_looks_down
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.motions import CustomMotion, DescentPlace
+from marsyard.scenarios.user_files import RecordedAxes, UserFile
 from marsyard.sim.dynamics import State, SwingDescent, Trajectory
-from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError
+from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError, read_poses
+from marsyard.sim.parameters import bounded
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 
@@ -144,3 +148,78 @@ def true_velocity(
     if second.time_s == first.time_s:
         return np.asarray(first.velocity_m_s[:2])
     return np.asarray((second.position_m - first.position_m)[:2] / (second.time_s - first.time_s))
+
+
+#: Required duration of the flight after the last picture, s.
+AFTER_S = 0.5
+
+
+class FlightFile(UserFile, RecordedAxes):
+    """A recorded flight: a CSV, Parquet, TUM or EuRoC file of poses, or SPICE kernels.
+
+    Positions are the camera's, or with `lever_m` the vehicle's. The first picture is at the file's time
+    `first_picture_s`; others follow every `descent.interval_s`. Instruments measure it like a simulated one.
+    """
+
+    origin: Annotated[
+        Literal["place", "terrain"],
+        Field(description="origin of positions: ground at `place`, or the terrain's origin"),
+    ] = "place"
+    first_picture_s: Annotated[
+        float | None, Field(description="file's time of the first picture; default: `lead_s` after its beginning")
+    ] = None
+    lead_s: Annotated[float, bounded(0.2, 30.0, "start of the navigation before the first picture")] = 5.0
+    turn_deg: Annotated[float, bounded(-720.0, 720.0, "rotation about the vertical, clockwise from above")] = 0.0
+
+    @classmethod
+    def file_hash(cls, file: str) -> str:
+        """SHA-256 of the file; its poses are checked."""
+        return read_poses(file).sha256
+
+    @property
+    def start_s(self) -> float:
+        """File's time of the first picture."""
+        if self.first_picture_s is not None:
+            return self.first_picture_s
+        return float(read_poses(self.file).times_s[0]) + self.lead_s
+
+    def check(self, pictures_s: Sequence[float]) -> None:
+        """Raise ValueError where the flight does not cover the pictures, looks up, or is below the ground at one."""
+        motion = self.motion(np.zeros(3), 0.0)
+        first, last = motion.span_s
+        if first > -self.lead_s + 1e-9 or last < max(pictures_s) + AFTER_S:
+            begin, end = read_poses(self.file).times_s[[0, -1]]
+            raise TrajectoryFileError(
+                f"{self.file}: covers {begin:.3f} to {end:.3f} s; pictures from {self.start_s:.3f} to "
+                f"{self.start_s + max(pictures_s):.3f} s, lead_s {self.lead_s:g} s before and {AFTER_S:g} s after them "
+                "are needed"
+            )
+        check_looks_down(self.file, motion, pictures_s)
+        for number, position in enumerate(motion.motion(np.array(pictures_s)).positions_m, start=1):
+            if self.origin == "place" and position[2] <= 0.0:
+                raise TrajectoryFileError(
+                    f"{self.file}: at picture {number} the camera is {-position[2]:.1f} m below the ground at the "
+                    'place; allowed: above it (origin = "terrain" counts heights as the terrain does)'
+                )
+
+    def motion(self, ground_m: Float64[np.ndarray, "3"], gravity_m_s2: float) -> RecordedMotion:
+        """The flight in the terrain's world, time 0 at the first picture; `ground_m` is the ground at the place."""
+        poses = read_poses(self.file)
+        world = Rotation.from_rotvec(np.radians(-self.turn_deg) * np.array([0.0, 0.0, 1.0])) * self.world
+        recorded = world * Rotation.from_quat(poses.quaternions)
+        positions = world.apply(poses.positions_m) + self.levers(recorded)
+        if self.origin == "place":
+            positions = positions + ground_m
+        return RecordedMotion(poses.times_s - self.start_s, positions, self.bodies(recorded), gravity_m_s2)
+
+
+def check_looks_down(name: str, motion: RecordedMotion, pictures_s: Sequence[float]) -> None:
+    """Raise TrajectoryFileError where the camera of the named flight looks up at a picture."""
+    for number, attitude in enumerate(motion.motion(np.array(pictures_s)).attitudes, start=1):
+        axis = attitude.apply(np.array([0.0, 0.0, -1.0]))
+        if axis[2] >= 0.0:
+            elevation = np.degrees(np.arcsin(np.clip(axis[2], -1.0, 1.0)))
+            raise TrajectoryFileError(
+                f"{name}: at picture {number} the camera looks up, {elevation:.1f} deg above the horizon; "
+                "allowed: down (flight.axes, attitude_of and mounting say whose axes are meant)"
+            )

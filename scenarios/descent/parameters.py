@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import Field, Tag, field_validator, model_validator
+from pydantic import Field, Tag, model_validator
 
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
-from marsyard.scenarios.descent.faults import Faults, faulty_times
-from marsyard.scenarios.descent.recorded import FlightFile
+from marsyard.scenarios.algorithm_run import AlgorithmSelection
+from marsyard.scenarios.descent.flight import FlightFile
+from marsyard.scenarios.descent.measurement import Faults, faulty_times
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.parts.instruments import CustomAltimeter, CustomAttitudeSource
 from marsyard.scenarios.parts.motions import CustomMotion
 from marsyard.scenarios.parts.named import default_or_custom
 from marsyard.scenarios.parts.scores import CustomScores, ScoredDescent
-from marsyard.scenarios.terrain_files import CheckedTerrain
+from marsyard.scenarios.terrain_files import CheckedTerrain, check_site
 from marsyard.sim.dynamics import SwingParameters
-from marsyard.sim.parameters import Parameters, bounded
+from marsyard.sim.parameters import Parameters, bounded, merge_settings
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import (
     ApproachParameters,
@@ -106,9 +106,7 @@ class CameraParameters(Parameters):
 class RenderParameters(Parameters):
     """Rendering of the pictures."""
 
-    backend: Annotated[Backend, Field(description="library that provides OpenGL's context")] = Field(
-        default_factory=default_backend
-    )
+    backend: Backend = Field(default_factory=default_backend, description="library that provides OpenGL's context")
 
 
 Flight = Annotated[
@@ -131,7 +129,11 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     task = VELOCITY
     scored = ScoredDescent
 
-    site: Annotated[str | None, Field(description="preset of terrain, light and gravity; none: a plain terrain")] = None
+    site: Annotated[
+        str | None,
+        check_site("a descent", "descent"),
+        Field(description="preset of terrain, light and gravity; none: a plain terrain"),
+    ] = None
     terrain_site: Annotated[str | None, Field(description="site of the terrain; filled in with `site`, not set")] = None
     location: Location = Location()
     terrain: CheckedTerrain = TerrainParameters()
@@ -158,23 +160,17 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     landing: LandingParameters = LandingParameters()
     render: RenderParameters = Field(default_factory=RenderParameters)
 
-    @field_validator("site")
-    @classmethod
-    def _check_site(cls, name: str | None) -> str | None:
-        if name is not None and name not in descent_sites():
-            raise ValueError(f"no site for a descent is called '{name}'; allowed: {', '.join(descent_sites())}")
-        return name
-
     @model_validator(mode="before")
     @classmethod
     def _complete_terrain(cls, stated: Any) -> Any:
-        if not isinstance(stated, Mapping) or stated.get("site") not in descent_sites():
+        name = stated.get("site") if isinstance(stated, Mapping) else None
+        if not isinstance(name, str) or getattr(sites().get(name), "descent", None) is None:
             return stated
         changes = stated.get("terrain", {})
         if not isinstance(changes, Mapping):
             return stated
-        of_site = site(stated["site"]).terrain("descent").model_dump()
-        return {"terrain_site": stated["site"], **stated, "terrain": _merge(of_site, changes)}
+        of_site = site(name).terrain("descent").model_dump()
+        return {"terrain_site": name, **stated, "terrain": merge_settings(of_site, changes)}
 
     @model_validator(mode="after")
     def _check_consistency(self) -> DescentScenarioParameters:
@@ -241,16 +237,3 @@ def binned_size_for(columns: int, rows: int) -> tuple[int, int]:
     """Binned size for DIMES: square blocks that leave at least, and about, 256 columns."""
     factors = [f for f in range(1, max(columns // 256, 1) + 1) if columns % f == 0 and rows % f == 0]
     return columns // factors[-1], rows // factors[-1]
-
-
-def descent_sites() -> list[str]:
-    """Names of the sites with a terrain for descents."""
-    return [name for name, one in sites().items() if one.descent is not None]
-
-
-def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(base)
-    for key, value in changes.items():
-        inner = merged.get(key)
-        merged[key] = _merge(inner, value) if isinstance(inner, Mapping) and isinstance(value, Mapping) else value
-    return merged

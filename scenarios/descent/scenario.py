@@ -12,12 +12,10 @@ from pydantic import BaseModel
 
 from marsyard.algorithms.dimes import DimesDetails
 from marsyard.scenarios.algorithm_run import case_result
-from marsyard.scenarios.base import TerrainScenario, algorithm_result
-from marsyard.scenarios.conditions import picture_columns
+from marsyard.scenarios.conditions import deliver, faulty_detector, hash_images, picture_columns
 from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
-from marsyard.scenarios.descent.faults import faulty_terrain
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, picture_states, true_velocity
-from marsyard.scenarios.descent.measurement import Instruments, measure
+from marsyard.scenarios.descent.measurement import Instruments, faulty_terrain, measure
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.score import (
     Pictures,
@@ -29,8 +27,7 @@ from marsyard.scenarios.descent.score import (
 )
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import Optics, Sample, pixel_sample
-from marsyard.scenarios.faults import deliver, faulty_detector
-from marsyard.scenarios.interface import CaseResult, Scalar
+from marsyard.scenarios.interface import CaseResult, Scalar, TerrainScenario, algorithm_result
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredDescent, scored
 from marsyard.scenarios.velocity import (
@@ -56,7 +53,6 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
     name = "descent"
     parameters_type = DescentScenarioParameters
     task = VELOCITY
-    algorithm_table = ()
     part_keys: Mapping[str, Kind] = {
         "flight.motion": DYNAMICS,
         "altimeter.instrument": INSTRUMENT,
@@ -102,7 +98,13 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         """Simulate one descent and score all algorithms."""
         p = self.check_parameters(parameters)
         descent = Descent.simulate(p, streams)
-        shared = descent.conditions()
+        shared = {
+            **descent.overlap,
+            **conditions(p, descent.world, descent.states, descent.at_firing, descent.instruments),
+            **instrument_errors(descent.world, descent.states, descent.measurements),
+            **descent.flight.row,
+            **picture_columns(p.render.backend, hash_images(descent.pictures)),
+        }
         return case_result(p.algorithms, lambda algorithm: _score_algorithm(descent, algorithm, shared), shared)
 
 
@@ -153,16 +155,6 @@ class Descent:
     def at_firing(self) -> State:
         """True state at the thrusters' firing."""
         return self.flight.motion.state(self.flight.firing_s)
-
-    def conditions(self) -> dict[str, Scalar]:
-        """Columns independent of the algorithm."""
-        return {
-            **self.overlap,
-            **conditions(self.p, self.world, self.states, self.at_firing, self.instruments),
-            **instrument_errors(self.world, self.states, self.measurements),
-            **self.flight.row,
-            **picture_columns(self.p.render.backend, self.pictures),
-        }
 
     def truth(self, span_s: Span) -> Horizontal:
         """True horizontal velocity over a span of time tags."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float64, UInt16
+from jaxtyping import UInt16
 
 from marsyard.algorithms.dimes import DimesOptions, propagated
 from marsyard.algorithms.dimes.binning import View, altitudes_at_images, bin_factors, place_camera
@@ -19,13 +19,13 @@ from marsyard.scenarios.descent.flight import mean_velocities
 from marsyard.scenarios.descent.measurement import Instruments
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, LandingParameters
 from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.velocity import Horizontal
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import DescentMeasurements, DetectorCalibration
 from marsyard.sim.sensor import height_above_ground
 
 Pictures = Sequence[UInt16[np.ndarray, "rows columns"]]
-Horizontal = Float64[np.ndarray, "2"]
 
 #: Width of the ground patch whose mean height is the reference of DIMES' altitude, m.
 PATCH_M = 200.0

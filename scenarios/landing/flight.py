@@ -11,9 +11,14 @@ from jaxtyping import Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.exposure import draw_calibrated
-from marsyard.scenarios.landing.faults import arrived_numbers, faulty_helicopter, faulty_ranges
 from marsyard.scenarios.landing.helicopter import Transit
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters, PairParameters
+from marsyard.scenarios.landing.parameters import (
+    LandingScenarioParameters,
+    PairParameters,
+    arrived_numbers,
+    faulty_helicopter,
+    faulty_ranges,
+)
 from marsyard.scenarios.views import nadir_pose
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State

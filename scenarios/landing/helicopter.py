@@ -32,11 +32,16 @@ from marsyard.sim.dynamics.rotorcraft import (
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.parameters import Parameters
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
-from marsyard.sim.sensor.instrument import Clock, ClockParameters
+from marsyard.sim.sensor.instrument import (
+    Clock,
+    ClockParameters,
+    TiltCompass,
+    TiltCompassParameters,
+    TiltCompassReadings,
+)
 from marsyard.sim.sensor.navigation import FilterParameters, FilterState, NavigationFilter, NavigationSolution
 from marsyard.sim.sensor.ranging import RangingUnit
 from marsyard.sim.sensor.satellite_navigation import RtkParameters, RtkReceiver, RtkSolutions
-from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 from marsyard.sim.streams import Streams
 
 #: Maximum iterations of a landing, and the change of the path at convergence, metres.

@@ -9,12 +9,11 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8, UInt16
 from scipy.ndimage import distance_transform_edt
 
-from marsyard.scenarios.base import LoadGround
+from marsyard.scenarios.conditions import deliver, faulty_detector
 from marsyard.scenarios.exposure import Optics, camera_optics, draw_calibrated, render_state, sunlight_ratio
-from marsyard.scenarios.faults import deliver, faulty_detector
-from marsyard.scenarios.landing.faults import faulty_ranges, faulty_sun_deg
+from marsyard.scenarios.interface import LoadGround
 from marsyard.scenarios.landing.flight import Flight
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters, faulty_ranges, faulty_sun_deg
 from marsyard.scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
 from marsyard.scenarios.meshes import MeshParameters, add_meshes
 from marsyard.scenarios.views import Eye, SiteGround, site_scene

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 from pydantic import BaseModel
@@ -10,11 +10,10 @@ from pydantic import BaseModel
 from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
-from marsyard.scenarios.base import TerrainScenario, algorithm_result
-from marsyard.scenarios.conditions import picture_columns
+from marsyard.scenarios.conditions import hash_images, picture_columns
 from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.exposure import Sample, pixel_sample, summed_rows
-from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.interface import CaseResult, TerrainScenario, algorithm_result
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.pictures import KEPT_GROUNDS, RenderedFlight, measure
 from marsyard.scenarios.landing.score import (
@@ -27,7 +26,6 @@ from marsyard.scenarios.landing.score import (
     site_row,
     times_row,
 )
-from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.parts.scores import ScoredLanding, scored
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
@@ -39,8 +37,6 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
     name = "landing"
     parameters_type = LandingScenarioParameters
     task = LANDING
-    algorithm_table = ()
-    part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
     def __init__(self) -> None:
         super().__init__(KEPT_GROUNDS)
@@ -80,7 +76,8 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
         case = RenderedFlight.of(p, streams, self.load_ground)
         flight, truth = case.flight, case.truth
         measurements = measure(p, flight, case.pair, streams)
-        known = {**conditions(case, measurements), **picture_columns(p.render.backend, case.pair.counts)}
+        provenance = picture_columns(p.render.backend, hash_images(case.pair.counts))
+        known = {**conditions(case, measurements), **provenance}
 
         def judge(algorithm: str) -> CaseResult:
             attempt = run_algorithm_on_copy(

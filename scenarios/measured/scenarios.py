@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -16,14 +15,13 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.dimes import DimesDetails, DimesOptions
 from marsyard.algorithms.hda import HdaDetails, HdaOptions, hda_products
-from marsyard.algorithms.hda.view import camera_pose
+from marsyard.algorithms.hda.motion import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate
-from marsyard.scenarios.algorithm_run import AlgorithmRun, case_result, run_algorithm_on_copy
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
-from marsyard.scenarios.base import BaseScenario, algorithm_result
+from marsyard.scenarios.algorithm_run import AlgorithmRun, AlgorithmSelection, case_result, run_algorithm_on_copy
+from marsyard.scenarios.conditions import hash_images
 from marsyard.scenarios.descent.parameters import check_binning
 from marsyard.scenarios.estimators import LANDING, VELOCITY
-from marsyard.scenarios.interface import CaseResult, Scalar, record_conditions
+from marsyard.scenarios.interface import BaseScenario, CaseResult, Scalar, algorithm_result, record_conditions
 from marsyard.scenarios.landing.score import motion_errors, solved_row
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
@@ -82,9 +80,7 @@ class MeasuredVelocityParameters(AlgorithmSelection, CustomScores, MeasuredParam
     task = VELOCITY
     scored = ScoredVelocity
 
-    algorithm: Annotated[str, Field(description="the velocity estimator under test, whose answers are judged")] = (
-        "dimes"
-    )
+    algorithm: str = Field(default="dimes", description="the velocity estimator under test, whose answers are judged")
     dimes: Annotated[DimesOptions, Field(description="options of DIMES")] = DimesOptions()
 
     @model_validator(mode="after")
@@ -264,9 +260,6 @@ def _run_algorithms(
 def _case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[str, Scalar]:
     """Return the columns of the case: name, pictures, and the largest motion of the camera between two pictures."""
     poses = [picture.pose * camera_pose(image.camera) for picture, image in zip(p.case.pictures, images, strict=True)]
-    digest = hashlib.sha256()
-    for image in images:
-        digest.update(np.ascontiguousarray(image.counts).tobytes())
     steps = [before.inv() * after for before, after in itertools.pairwise(poses)]
     has_positions = all(picture.position_m is not None for picture in p.case.pictures)
     return {
@@ -275,7 +268,7 @@ def _case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[st
         "duration_s": images[-1].time_s - images[0].time_s,
         "max_rotation_deg": max(float(np.degrees(step.rotation.magnitude())) for step in steps),
         "max_translation_m": max(float(np.linalg.norm(step.translation)) for step in steps) if has_positions else NAN,
-        "image_hash": digest.hexdigest(),
+        "image_hash": hash_images(image.counts for image in images),
     }
 
 

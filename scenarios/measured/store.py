@@ -125,7 +125,6 @@ class CasesFile(UserFile):
 
 
 def _load(file: str) -> tuple[StoredCases, str]:
-    """Read the cases and the hash of the file; cached while the file does not change."""
     try:
         status = check_regular(file)
     except OSError as error:

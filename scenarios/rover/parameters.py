@@ -10,9 +10,10 @@ from jaxtyping import Float64
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.vtt import VttOptions
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
+from marsyard.scenarios.algorithm_run import AlgorithmSelection
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.parts.scores import CustomScores, ScoredRun
+from marsyard.scenarios.terrain_files import check_site
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import SlipParameters
 from marsyard.sim.frames import direction
@@ -33,7 +34,7 @@ from marsyard.sim.sensor import (
     preset,
     stereo_mast,
 )
-from marsyard.sim.terrain import site, sites
+from marsyard.sim.terrain import site
 
 #: Angles in degrees: relative, and azimuths.
 Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
@@ -51,7 +52,9 @@ class InclineParameters(Parameters):
 class WorldParameters(Parameters):
     """One terrain of a site's bank, cleared of rocks on the route."""
 
-    site: Annotated[str, Field(description="preset of terrain, rocks, texture and light")] = "mars-yard"
+    site: Annotated[
+        str, check_site("a rover", "ground"), Field(description="preset of terrain, rocks, texture and light")
+    ] = "mars-yard"
     bank: Annotated[int, Field(ge=1, le=100000, description="terrains in the bank")] = 8
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
     terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
@@ -66,14 +69,6 @@ class WorldParameters(Parameters):
     background_half_deg: Annotated[Positive, Field(le=180.0, description="half angle behind the target with rocks")] = (
         50.0
     )
-
-    @field_validator("site")
-    @classmethod
-    def _check_site(cls, name: str) -> str:
-        allowed = [one.name for one in sites().values() if one.ground is not None]
-        if name not in allowed:
-            raise ValueError(f"no site for a rover is called '{name}'; allowed: {', '.join(allowed)}")
-        return name
 
     @model_validator(mode="after")
     def _check_terrain(self) -> WorldParameters:
@@ -140,9 +135,7 @@ class LegParameters(Parameters):
     goal_m: Positive = Field(default=2.0, description="final horizontal distance of the rover's origin from the target")
     ends_with_steps: bool = Field(default=False, description="whether it may end short of goal_m, its steps done")
     offset_right_m: float = Field(default=0.0, description="offset of the goal to the right of the target's direction")
-    shuffle_m: Annotated[NonNegative, Field(description="drive of a step with a stuck motor, and back at the next")] = (
-        0.0
-    )
+    shuffle_m: NonNegative = Field(default=0.0, description="drive of a step with a stuck motor, and back at the next")
     visual_odometry: Annotated[bool, Field(description="whether the pose is corrected by visual odometry")] = False
     visual_odometry_step_m: Positive = Field(default=0.75, description="longest drive between pictures (60 % overlap)")
     autonav: bool = Field(default=False, description="whether the navigator avoids rocks in its map")
@@ -225,9 +218,7 @@ class CustomPair(Parameters):
 class CameraParameters(Parameters):
     """The stereo pair on the mast."""
 
-    preset: Annotated[str, Field(description="key of `marsyard.sim.sensor.mast.MASTS`: pair, mast, rover")] = (
-        "mer-navcam"
-    )
+    preset: str = Field(default="mer-navcam", description="key of `marsyard.sim.sensor.mast.MASTS`: pair, mast, rover")
     custom: Annotated[CustomPair | None, Field(description="a custom pair on the preset's mast")] = None
     detector: DetectorChoice | None = Field(default=None, description="of both cameras; by default the preset's")
     detector_noise: Annotated[bool, Field(description="whether pictures have detector noise and response")] = True

@@ -20,12 +20,11 @@ from marsyard.algorithms.navigation import NavigationOptions, NavigationOutcome,
 from marsyard.algorithms.vtt import GoalReached, HandOffOutcome, hand_off
 from marsyard.algorithms.vtt.pointing import box_around, mast_angles
 from marsyard.scenarios.algorithm_run import Handover, answer_time_s
-from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.estimators import TRACKING
+from marsyard.scenarios.interface import LoadGround
 from marsyard.scenarios.rover.parameters import LegParameters, RoverScenarioParameters
-from marsyard.scenarios.rover.points import cast_rover_shadow
+from marsyard.scenarios.rover.points import DesignatedTarget, cast_rover_shadow, choose_target
 from marsyard.scenarios.rover.stops import RunOutcome, StereoCamera, Stop, View
-from marsyard.scenarios.rover.target import DesignatedTarget, choose_target
 from marsyard.scenarios.rover.world import TARGET, Rig, RunWorld, Vehicle
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.dynamics import Drive

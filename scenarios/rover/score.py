@@ -10,13 +10,13 @@ from jaxtyping import Float64
 
 from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, stereo_range_error_m
 from marsyard.algorithms.vtt.stereo import disparity_px_m
+from marsyard.scenarios.conditions import sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.scores import ScoredRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.points import rover_shades_patch, template_patch
+from marsyard.scenarios.rover.points import evaluate_visibility, rover_shades_patch, template_patch
 from marsyard.scenarios.rover.run import Run
 from marsyard.scenarios.rover.stops import RunOutcome
-from marsyard.scenarios.rover.target import evaluate_visibility
 from marsyard.sim.measurements import RoverMeasurements
 
 NAN = float("nan")
@@ -122,8 +122,8 @@ def tracking(run: Run) -> dict[str, Scalar]:
 
 def update_figures(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
     """Figures of every update, one array each; NaN where a tracker reports no details, of a match also at the seed."""
-    figures = {name: np.full(len(run.stops), np.nan) for name in FIGURES}
-    for number, (stop, error) in enumerate(zip(run.stops, errors_px(run), strict=True)):
+    rows = []
+    for stop, error in zip(run.stops, errors_px(run), strict=True):
         azimuth, elevation = np.degrees(stop.angles_rad)
         row = {
             "range_m": stop.range_m,
@@ -146,9 +146,8 @@ def update_figures(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
             row["match_score"] = details.match.score
             if details.predicted_pixel is not None:
                 row["correction_px"] = float(np.max(np.abs(details.match.pixel - details.predicted_pixel)))
-        for name, value in row.items():
-            figures[name][number] = value
-    return figures
+        rows.append(row)
+    return {name: np.array([row.get(name, NAN) for row in rows], dtype=np.float64) for name in FIGURES}
 
 
 def stored_updates(run: Run, count: int) -> dict[str, Scalar]:
@@ -224,8 +223,7 @@ def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "pose_error_m": pose_error,
         "pose_error_fraction": pose_error / driven if driven > 0.0 else NAN,
         "duration_min": times[1] / 60.0,
-        "sun_azimuth_deg": float(np.degrees(np.arctan2(sun[0][0], sun[0][1])) % 360.0),
-        "sun_elevation_deg": float(np.degrees(np.arcsin(sun[0][2]))),
+        **sun_columns(sun[0]),
         "sun_motion_deg": float(np.degrees(np.arccos(np.clip(sun[0] @ sun[1], -1.0, 1.0)))),
         "exposure_min_s": -_max(-exposures),
         "exposure_max_s": _max(exposures),

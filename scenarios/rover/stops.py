@@ -38,10 +38,7 @@ class StereoPictures:
     @cached_property
     def digest(self) -> bytes:
         """Hash of both pictures' counts."""
-        digest = hashlib.sha256()
-        for image in (self.left, self.right):
-            digest.update(np.ascontiguousarray(image.counts).tobytes())
-        return digest.digest()
+        return hashlib.sha256(self.left.counts.tobytes() + self.right.counts.tobytes()).digest()
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.scenarios.base import LoadGround
+from marsyard.scenarios.interface import LoadGround
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters, SunParameters, WorldParameters
 from marsyard.scenarios.rover.points import RockOutline
 from marsyard.scenarios.views import Eye, SiteGround, site_scene
@@ -148,7 +148,6 @@ def place_rocks(p: RoverScenarioParameters, bare: SiteGround, rng: np.random.Gen
 
 
 def _distances(rocks: RockField, position: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "rocks"]:
-    """Horizontal distances of rocks from a position on the periodic ground."""
     away = rocks.position_m[:, :2] - position
     away -= rocks.period_m * np.round(away / rocks.period_m)
     return np.asarray(np.hypot(away[:, 0], away[:, 1]))

@@ -35,9 +35,9 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.sim.camera.assembly import Source
 from marsyard.sim.camera.base import CameraModel
 from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
+from marsyard.sim.camera.text_files import Source
 
 Array = NDArray[np.float64]
 C = TypeVar("C", bound=CameraModel)
@@ -380,7 +380,6 @@ def _fisheye_directions(points: Array, coefficients: Array) -> Array:
 
 
 def _in_world(directions: Array, camera_from_world: RigidTransform | None) -> Array:
-    """Rotate directions from OpenCV's axes to the camera's frame of reference."""
     return directions if camera_from_world is None else directions @ camera_from_world.as_matrix()[:3, :3]
 
 

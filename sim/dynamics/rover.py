@@ -332,7 +332,6 @@ class _StanceEquations:
 
     @cached_property
     def _tread(self) -> Float64[np.ndarray, "points 3"]:
-        """Sample points of a wheel's tread, from its centre."""
         angle, line = np.meshgrid(_TREAD_RAD, _TREAD_LINES)
         radius, width = self.rover.wheel_radius_m, self.rover.wheel_width_m
         return np.stack([radius * np.sin(angle), width * line, -radius * np.cos(angle)], axis=-1).reshape(-1, 3)

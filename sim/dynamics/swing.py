@@ -52,8 +52,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics.kernels import swing as kernels
 from marsyard.sim.dynamics.kernels.swing import CANOPY, Chain
-from marsyard.sim.dynamics.trajectory import Motion, Trajectory, check_times
-from marsyard.sim.dynamics.wind import Wind, WindParameters
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory, Wind, WindParameters, check_times
 from marsyard.sim.parameters import bounded
 
 Vector = Float64[np.ndarray, "3"]

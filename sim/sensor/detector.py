@@ -19,8 +19,14 @@ from scipy.optimize import brentq
 
 from marsyard.sim.measurements import DetectorCalibration
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive
-from marsyard.sim.sensor.motion import ImageMotion, moving_exposure
-from marsyard.sim.sensor.optics import OpticsParameters, Picture, apply_point_spread, dust_transmission
+from marsyard.sim.sensor.optics import (
+    ImageMotion,
+    OpticsParameters,
+    Picture,
+    apply_point_spread,
+    dust_transmission,
+    moving_exposure,
+)
 
 CODES = 256
 _RelativeError = Annotated[float, Field(ge=0.0, le=0.1)]

@@ -1,4 +1,4 @@
-"""Common parts of instruments: sampling times, time tags, readings and time-correlated errors."""
+"""Instruments: sampling times, time tags, readings, time-correlated errors, and the tilt compass."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from numpy.random import Generator
 from pydantic import Field
 from scipy.interpolate import make_interp_spline
 
-from marsyard.sim.parameters import Parameters
+from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.parameters import NonNegative, Parameters
+from marsyard.sim.sensor.imu import Vectors
 
 #: Knots per correlation time. Linear interpolation between them loses at most 1 % of the variance.
 KNOTS_PER_CORRELATION = 50
@@ -112,3 +114,136 @@ class GaussMarkov:
                 f"{self.knots_s[0]:.3f} s to {self.knots_s[-1]:.3f} s"
             )
         return np.asarray(make_interp_spline(self.knots_s, self.values, k=1)(times_s))
+
+
+Degrees = Annotated[NonNegative, Field(le=90.0)]
+LAG_STEPS_PER_S = 100.0  #: Steps of the lag per second: twenty within the default time constant.
+SETTLED = 12.0  #: Settling time in time constants: a residual of 6e-6.
+Samples = Float64[np.ndarray, "n *one"]
+
+
+class TiltCompassParameters(Parameters):
+    """A unit of the class of Precision Navigation's TCM2; spreads are one standard deviation.
+
+    Specification of the class: 0.2 deg in tilt, 1 deg in heading, 16 readings per second, counts of 0.1 deg. Assumed:
+    their split into error terms, the lag and the vehicle's effects.
+    """
+
+    rate_hz: Annotated[float, Field(gt=0.0, le=100.0, description="readings per second")] = 16.0
+    tilt_bias_deg: Annotated[Degrees, Field(description="constant error of each inclinometer, mounting included")] = 0.2
+    tilt_noise_deg: Annotated[Degrees, Field(description="of each inclinometer, new in every reading")] = 0.15
+    lag_s: Annotated[float, Field(gt=0.0, le=5.0, description="time constant of the inclinometers, s")] = 0.2
+    heading_bias_deg: Annotated[Degrees, Field(description="constant error, mounting and declination included")] = 0.8
+    hard_iron_deg: Annotated[Degrees, Field(description="amplitude of the error once round, per component")] = 0.5
+    soft_iron_deg: Annotated[Degrees, Field(description="amplitude of the error twice round, per component")] = 0.25
+    heading_noise_deg: Annotated[Degrees, Field(description="new in every reading")] = 0.3
+    dip_deg: Annotated[float, Field(ge=-85.0, le=85.0, description="of the magnetic field below the horizon")] = 59.0
+    count_deg: Annotated[Degrees, Field(description="of the heading, deg; 0: no rounding")] = 0.1
+    heading_stuck_s: Annotated[float | None, Field(description="true time after which the heading is stuck")] = None
+    tilt_stuck_s: Annotated[float | None, Field(description="true time after which the inclinometers are stuck")] = None
+    clock: ClockParameters = ClockParameters(offset_sd_s=0.005, jitter_sd_s=0.002)
+
+
+@dataclass(frozen=True)
+class TiltCompassReadings:
+    """Readings of a tilt compass.
+
+    - up_body: direction upwards by the inclinometers, unit vectors in body axes
+    - headings_rad: azimuth of the body's x axis, clockwise from north, in [0, 2 pi)
+    """
+
+    times_s: Times
+    up_body: Vectors
+    headings_rad: Float64[np.ndarray, "n"]
+
+
+@dataclass(frozen=True)
+class TiltCompass:
+    """A tilt compass with its constant errors drawn.
+
+    - tilt_bias_rad: error of the x and y components of the direction upwards
+    - iron_rad: amplitudes of the sine and cosine of the heading, then of twice the heading
+    """
+
+    parameters: TiltCompassParameters
+    sampling: Sampling
+    clock: Clock
+    tilt_bias_rad: Float64[np.ndarray, "2"]
+    heading_bias_rad: float
+    iron_rad: Float64[np.ndarray, "4"]
+
+    @classmethod
+    def drawn(cls, parameters: TiltCompassParameters, rng: np.random.Generator) -> TiltCompass:
+        """Draw the constant errors."""
+        p = parameters
+        iron = np.array([p.hard_iron_deg, p.hard_iron_deg, p.soft_iron_deg, p.soft_iron_deg])
+        return cls(
+            p,
+            Sampling.drawn(p.rate_hz, rng),
+            Clock.drawn(p.clock, rng),
+            tilt_bias_rad=np.radians(p.tilt_bias_deg) * rng.standard_normal(2),
+            heading_bias_rad=np.radians(p.heading_bias_deg) * float(rng.standard_normal()),
+            iron_rad=np.radians(iron) * rng.standard_normal(4),
+        )
+
+    def measure(self, trajectory: Trajectory, times_s: Times, rng: np.random.Generator) -> TiltCompassReadings:
+        """Measure one reading per true time; times must not decrease. The unit is settled at the trajectory's start."""
+        p = self.parameters
+        lagged = self._lagged_up(trajectory, times_s)
+        tags = self.clock.tags(times_s, rng)
+        shocks = rng.standard_normal((times_s.size, 3))
+        levelled = _add_offset(lagged, self.tilt_bias_rad)
+        # azimuths from the magnetic field, levelled by the measured directions
+        dip = np.radians(p.dip_deg)
+        attitudes = trajectory.motion(times_s).attitudes
+        magnetic = attitudes.inv().apply(np.array([0.0, np.cos(dip), -np.sin(dip)]))
+        north = _normalize(magnetic - np.sum(magnetic * levelled, axis=1)[:, None] * levelled)
+        azimuths = np.arctan2(np.cross(north, levelled)[:, 0], north[:, 0])
+        headings = azimuths + self.deviation_rad(azimuths) + np.radians(p.heading_noise_deg) * shocks[:, 2]
+        if p.count_deg > 0.0:
+            headings = np.radians(p.count_deg) * np.rint(headings / np.radians(p.count_deg))
+        up = _hold(_add_offset(levelled, np.radians(p.tilt_noise_deg) * shocks[:, :2]), times_s, p.tilt_stuck_s)
+        return TiltCompassReadings(tags, up, _hold(np.mod(headings, 2.0 * np.pi), times_s, p.heading_stuck_s))
+
+    def deviation_rad(self, azimuths_rad: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
+        """Noise-free heading error of a level unit at rest, at true azimuths."""
+        harmonics = np.stack([f(k * azimuths_rad) for k in (1.0, 2.0) for f in (np.sin, np.cos)])
+        return np.asarray(self.heading_bias_rad + self.iron_rad @ harmonics)
+
+    def _lagged_up(self, trajectory: Trajectory, times_s: Times) -> Vectors:
+        """Directions of the pendulums: the specific force's with a lag."""
+        if times_s.size == 0:
+            return np.zeros((0, 3))
+        lag = self.parameters.lag_s
+        start = max(trajectory.span_s[0], float(times_s[0]) - SETTLED * lag)
+        steps = max(int(np.ceil((times_s[-1] - start) * LAG_STEPS_PER_S)), 1)
+        grid = np.linspace(start, float(times_s[-1]), steps + 1) if times_s[-1] > start else np.array([start])
+        force = _normalize(trajectory.motion(grid).specific_forces_m_s2)
+        if grid.size == 1:
+            return np.repeat(force, times_s.size, axis=0)
+        # exact for a force that is constant in each step
+        decay = np.exp(-(grid[1] - grid[0]) / lag)
+        middle = 0.5 * (force[1:] + force[:-1])
+        filtered, _ = scipy.signal.lfilter([1.0 - decay], [1.0, -decay], middle, axis=0, zi=decay * force[:1])
+        filtered = np.concatenate([force[:1], filtered])
+        return _normalize(np.stack([np.interp(times_s, grid, column) for column in filtered.T], axis=1))
+
+
+def _normalize(vectors: Vectors) -> Vectors:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+def _add_offset(up: Vectors, offset: Float64[np.ndarray, "*any 2"]) -> Vectors:
+    tilted = up.copy()
+    tilted[:, :2] += offset
+    return _normalize(tilted)
+
+
+def _hold(values: Samples, times_s: Times, stuck_s: float | None) -> Samples:
+    """Repeat the last value before a time (or the first) at all later times."""
+    if stuck_s is None or values.size == 0:
+        return values
+    held = values.copy()
+    last = max(int(np.searchsorted(times_s, stuck_s, side="right")) - 1, 0)
+    held[last:] = values[last]
+    return held

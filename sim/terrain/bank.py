@@ -121,10 +121,8 @@ class TerrainBank:
         return cache_directory("terrain") / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.npy"
 
     def _sides(self) -> list[int]:
-        """Samples along a side of each level."""
         levels = (self.parameters.samples // SMALLEST_LEVEL).bit_length()
         return [self.parameters.samples >> level for level in range(levels)]
 
     def _size(self) -> int:
-        """Values in a terrain's file: height and albedo on every level."""
         return 2 * sum(side**2 for side in self._sides())

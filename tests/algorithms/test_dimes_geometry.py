@@ -11,9 +11,11 @@ from marsyard.algorithms.dimes.binning import (
     View,
     build_view,
     ground_from_pixels,
+    ground_lattice,
     inside_frame,
     pixel_angle_rad,
     pixels_from_ground,
+    rectify_patch,
     square,
     square_outline,
 )
@@ -30,7 +32,6 @@ from marsyard.algorithms.dimes.overlap import (
     template_candidates,
     zero_phase_pixel,
 )
-from marsyard.algorithms.dimes.rectification import ground_lattice, rectify_patch
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import DetectorImage
 from tests.algorithms.synthetic_descent import (

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.binning import View, bin_factors, bin_mean, build_view
-from marsyard.algorithms.dimes.rectification import correct_patch
+from marsyard.algorithms.dimes.binning import View, bin_factors, bin_mean, build_view, correct_patch
 from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
 from marsyard.sim.measurements import DetectorImage
 from tests.algorithms.synthetic_descent import (

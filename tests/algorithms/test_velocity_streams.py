@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.algorithms.answers import check_velocity
+from marsyard.algorithms.answers import AlgorithmError, Fault, check_velocity
 from marsyard.algorithms.dimes import DimesEstimator
 from marsyard.algorithms.exchange import (
     ExecutableLimits,
@@ -22,7 +22,6 @@ from marsyard.algorithms.exchange import (
     write_frame,
 )
 from marsyard.algorithms.exchange.serving import end_persistent
-from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.streams import StreamedEstimator, set_span
 from marsyard.scenarios.algorithm_run import hash_inputs

@@ -9,8 +9,7 @@ from pydantic import BaseModel
 
 from marsyard.algorithms.answers import check_velocity
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.algorithm_run import case_result, run_algorithm
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
+from marsyard.scenarios.algorithm_run import AlgorithmSelection, case_result, run_algorithm
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.estimators import VELOCITY, Task
 from marsyard.scenarios.interface import CaseResult

@@ -267,7 +267,7 @@ def test_negative_case_numbers_are_refused(finished: Path, marsyard: Command) ->
 
 
 def test_a_defect_of_ours_is_no_verdict(marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("marsyard.campaigns.definition.catalogue.catalogue", lambda: 1 / 0)
+    monkeypatch.setattr("marsyard.campaigns.definition.loading.catalogue", lambda: 1 / 0)
     ended = marsyard("list")
     assert ended.status == 2
     assert "ZeroDivisionError" in ended.err

@@ -17,10 +17,10 @@ from marsyard.campaigns.store import record
 from marsyard.cli.app import main
 from marsyard.reports.stored import read_run
 from marsyard.scenarios.systems import row_columns, scenario, scenario_names
-from marsyard.sim import renamed
-from marsyard.sim.renamed import RenamedWarning
+from marsyard.sim import parameters
+from marsyard.sim.parameters import RenamedWarning
 
-TABLE = tomllib.loads(Path(renamed.__file__).with_suffix(".toml").read_text())
+TABLE = tomllib.loads(Path(parameters.__file__).with_suffix(".toml").read_text())
 CAMPAIGN = """
 name = "former"
 scenario = "descent"

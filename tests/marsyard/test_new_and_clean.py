@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.cli.app import app
-from marsyard.cli.evidence import evidence_limits
+from marsyard.cli.outcome import evidence_limits
 from marsyard.reports.sampling_design import sampled
 from marsyard.reports.verdicts import Status, judge_campaign
 

@@ -22,10 +22,10 @@ from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.store import record
 from marsyard.cli import app as cli
-from marsyard.cli.evidence import run_until_decided
+from marsyard.cli.outcome import run_until_decided
 from marsyard.cli.site_server import server
-from marsyard.reports.cases import notable_cases
 from marsyard.reports.evaluation import next_look
+from marsyard.reports.presentation import notable_cases
 from marsyard.reports.sampling_design import SamplingDesign
 from marsyard.reports.stored import read_run
 from marsyard.reports.verdicts import judge_campaign

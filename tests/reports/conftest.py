@@ -104,10 +104,7 @@ def synthetic_products(seed: int = 1) -> dict[str, Any]:
         products[f"rectified_frame_{pair}"] = np.array([-64.0 - 128.0, 128.0 + 64.0, 383.0 / 16.0]) * 5.0
         products[f"gsd_{pair}"] = np.array([5.0])
     products |= {"tracks": np.array(rows), "tracks_columns": columns}
-    return products | {
-        "velocity_estimated_m_s": np.array([14.1, -8.9]),
-        "velocity_true_m_s": np.array([14.6, -9.2]),
-    }
+    return products | {"velocity_estimated_m_s": np.array([14.1, -8.9]), "velocity_true_m_s": np.array([14.6, -9.2])}
 
 
 def synthetic_record(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

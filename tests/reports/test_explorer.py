@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from marsyard.reports.cases import gallery_cases, notable_cases
+from marsyard.reports.presentation import gallery_cases, notable_cases
 from marsyard.reports.sections import MAX_POINTS, choose_points, embedded, explorer_data
 from marsyard.reports.stored import read_run
 

@@ -9,6 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
+from marsyard.reports.charts import svg_markup
 from marsyard.reports.figures import (
     count_beyond_axis,
     error_distribution,
@@ -17,7 +18,6 @@ from marsyard.reports.figures import (
     error_scatter_against,
     outcome_bars,
 )
-from marsyard.reports.svg import svg_markup
 
 Rows = Callable[..., pd.DataFrame]
 METRIC = "velocity_error_m_s"

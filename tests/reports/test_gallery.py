@@ -35,7 +35,7 @@ def test_rank_correlations_of_maps_have_intervals(maps: int, known: bool) -> Non
     rng = np.random.default_rng(1)
     texture = rng.uniform(0.1, 1.0, maps)
     frame = pd.DataFrame({"texture": texture, "rms_share": rng.uniform(0.0, 0.1, maps) / texture})
-    effect = next(one for one in MAP_EFFECTS.effects(frame) if one.error.startswith("elevation error"))
+    effect = next(one for one in MAP_EFFECTS.effects(frame) if one["error"].startswith("elevation error"))
     assert (" to " in correlation_text(effect)) == known
     assert known or correlation_text(effect) == NOTHING
 

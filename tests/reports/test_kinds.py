@@ -24,11 +24,11 @@ from marsyard.reports.kinds import (
     condition_bins,
     flagged,
 )
-from marsyard.reports.papers import PaperFacts
 from marsyard.reports.presentation import Presentation, presentations
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
-from marsyard.scenarios.system import System
+from marsyard.reports.tables import PaperFacts
+from marsyard.scenarios.systems import System
 
 ERROR = Quantity("altitude_error_m")
 ALTITUDE = SectionDeclaration(

@@ -11,18 +11,21 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from marsyard.reports.columns import (
-    axis_columns,
-    category_column,
-    driver_columns,
-    label,
-    magnitude_label,
-    primary_metric,
-)
 from marsyard.reports.rates import share_of
 from marsyard.reports.tables import outcome_counts, statistics_grid, verdict_table
 from marsyard.reports.verdicts import judge_campaign
-from marsyard.reports.wording import interval, number, percent, stated
+from marsyard.reports.wording import (
+    axis_columns,
+    category_column,
+    driver_columns,
+    interval,
+    label,
+    magnitude_label,
+    number,
+    percent,
+    primary_metric,
+    stated,
+)
 
 Rows = Callable[..., pd.DataFrame]
 

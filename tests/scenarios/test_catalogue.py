@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.campaigns.definition.catalogue import catalogue
-from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.loading import catalogue, load_campaign
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.campaigns.store.rows import Row
 from marsyard.scenarios.rover.scenario import SharedDriveParameters, SharedDriveScenario

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.campaigns.running.conformance import examine
+from marsyard.campaigns.running.replay import examine
 from marsyard.scenarios.conformance import Finding, Subject, check_names, determine_task, inputs, run_check, trackers
 from marsyard.scenarios.conformance.inputs import TexturedPlane
 from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY

@@ -17,12 +17,12 @@ from marsyard.scenarios.exposure import camera_optics
 from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters
 from marsyard.scenarios.fieldtest.run import (
     Category,
-    ElevationModel,
     Run,
     RunKey,
     field_camera,
     simulate_run,
     sun_direction,
+    survey_ground,
 )
 from marsyard.scenarios.fieldtest.scenario import (
     FieldTestScenario,
@@ -78,13 +78,11 @@ def test_drift_free_attitude_error_is_hundredths_of_a_degree() -> None:
     """Random walk of 0.07 deg/sqrt(h) over 40 min, fixed at both ends: 0.03 deg at the middle, a fifth of 0.15 deg."""
     run = make_ivanpah_run(drift={"change_k": 0.0})
     assert np.abs(attitude_errors_deg(run)).max() < 0.15
-    assert run.attitude_solution.residual_rad < 5e-4
 
 
 def test_fit_removes_a_constant_bias() -> None:
     run = make_ivanpah_run(drift={"change_k": 0.0}, imu={**IMU, "gyro_bias_deg_h": 5.0})
     assert np.abs(attitude_errors_deg(run)).max() < 0.15
-    assert np.degrees(np.linalg.norm(run.attitude_solution.bias_rad_s)) * 3600.0 > 2.0
 
 
 def test_fit_cannot_remove_drift_across_the_line() -> None:
@@ -110,8 +108,8 @@ def test_elevation_model_has_the_error_of_its_class() -> None:
     """Over flat ground the error is that of the posts, slightly smoothed by interpolation."""
     flat = Surface.from_samples(np.zeros((64, 64, 2), dtype=np.float32), 500.0)
     positions = np.random.default_rng(1).uniform(0.0, 30000.0, (4000, 2))
-    model = ElevationModel.surveyed(ElevationParameters(), flat, positions, np.random.default_rng(2))
-    assert model.heights(positions, np.random.default_rng(3)).std() == pytest.approx(np.hypot(6.0, 1.0), rel=0.06)
+    posts = survey_ground(ElevationParameters(), flat, positions, np.random.default_rng(2))
+    assert posts(positions).std() == pytest.approx(6.0, rel=0.06)
 
 
 def test_triples_match_their_category() -> None:

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.relief import Relief
-from marsyard.scenarios.meshes import MeshFileError, MeshParameters, read_mesh, standing
+from marsyard.scenarios.meshes import MeshFileError, MeshParameters, read_mesh
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.terrain import Surface, TerrainParameters, site, synthesise
 
@@ -66,7 +66,7 @@ def test_rocks_have_smooth_normals(tmp_path: Path, surface: Surface) -> None:
 
 def test_meshes_repeat_with_the_terrain_period(tmp_path: Path, surface: Surface) -> None:
     one = MeshParameters(file=write_box(tmp_path), east_m=2.0, north_m=60.0)
-    corners = standing([one, one], surface, (65.0, 3.0)).triangles.reshape(-1, 3)
+    corners = one.standing(surface, (65.0, 3.0)).triangles.reshape(-1, 3)
     assert np.allclose((corners.min(axis=0) + corners.max(axis=0))[:2] / 2.0, [66.0, -4.0])
 
 

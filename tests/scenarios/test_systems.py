@@ -11,9 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from marsyard.campaigns.definition import requirements
-from marsyard.campaigns.definition.catalogue import catalogue
 from marsyard.campaigns.definition.identity import custom_sources
-from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.loading import catalogue, load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli.app import app
 from marsyard.doctor import Verdict, check_systems
@@ -33,7 +32,7 @@ from marsyard.scenarios.systems import (
 )
 
 CACHED = (registry, row_columns, shipped_names, requirements.shipped_requirements, requirements._read_shipped)
-HEAD = "from pathlib import Path\nfrom marsyard.scenarios.system import System\nHERE = Path(__file__).parent\n"
+HEAD = "from pathlib import Path\nfrom marsyard.scenarios.systems import System\nHERE = Path(__file__).parent\n"
 Install = Callable[..., None]
 
 
@@ -127,7 +126,7 @@ def test_external_scenario_code_is_part_of_the_identity(install: Install, tmp_pa
         ("import absent_module\n", "it cannot be imported: No module named 'absent_module'"),
         ("raise RuntimeError('broken')\n", "it cannot be imported: RuntimeError: broken"),
         ("", "has no attribute 'SYSTEM'"),
-        ("SYSTEM = {'name': 'mine'}\n", "it is a dict; allowed: a marsyard.scenarios.system.System"),
+        ("SYSTEM = {'name': 'mine'}\n", "it is a dict; allowed: a marsyard.scenarios.systems.System"),
         (_format_system("dimes"), "the system 'dimes' already has the name 'dimes'"),
         (_format_system("descent").replace("-case", ""), "the system 'dimes' already has the scenario 'descent'"),
         (

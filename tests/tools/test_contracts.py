@@ -11,7 +11,7 @@ OPEN_TO_ALGORITHMS = {"marsyard.sim.frames", "marsyard.sim.camera", "marsyard.si
 #: What `marsyard.sim.camera` reads files with: checks of files, which hold no truth.
 BELOW_THE_CAMERAS = {"marsyard.sim.files"}
 #: The base class of parameters and its types of fields: no world, and no truth.
-BASE_OF_PARAMETERS = {"marsyard.sim.parameters", "marsyard.sim.renamed"}
+BASE_OF_PARAMETERS = {"marsyard.sim.parameters"}
 
 
 def test_all_of_sim_but_the_flight_interface_is_closed_to_algorithms() -> None:

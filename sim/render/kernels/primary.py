@@ -21,18 +21,7 @@ from marsyard.sim.render.kernels.strips import (
     spline,
     unpack_matrix,
 )
-from marsyard.sim.render.kernels.structs import (
-    Array32,
-    Ground,
-    GroundLevel,
-    Hits,
-    Ints,
-    Longs,
-    Pose,
-    Ray,
-    Rays,
-    Views,
-)
+from marsyard.sim.render.kernels.structs import Array32, Ground, GroundLevel, Hits, Ints, Longs, Pose, Ray, Rays, Views
 from marsyard.sim.terrain.kernels import Array, Level
 
 #: Smallest sine of the angle between ray and ground by which a footprint is elongated.

@@ -15,7 +15,7 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
 from marsyard.sim.cache import cache_directory, evict_files, load_array, save_array, touch
-from marsyard.sim.processor import processor_features
+from marsyard.sim.kernel_cache import processor_features
 
 SHAPES_OF_FORM = 16  #: Shapes of each form; the first blocks are angular, the last rounded.
 #: Forms in the order of their shapes' numbers: blocks, and the rough clinker of a'a.
@@ -86,7 +86,6 @@ def _max_pixels_per_deviation() -> Float64[np.ndarray, "shapes levels"]:
 
 @cache
 def _icosphere(detail: int) -> tuple[Float64[np.ndarray, "n 3"], Int32[np.ndarray, "faces 3"]]:
-    """Unit vectors and triangles of the subdivided icosahedron."""
     import trimesh  # here, as it is slow to import
 
     sphere = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS[detail])

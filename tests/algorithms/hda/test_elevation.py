@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import ElevationMap, HdaOptions, SurfaceFrame
+from marsyard.algorithms.hda.estimator import plane_normal, surface_from_camera, up_direction, world_from_surface
 from marsyard.algorithms.hda.hazards import elevation_map
-from marsyard.algorithms.hda.landing import plane_normal, surface_from_camera, up_direction, world_from_surface
-from marsyard.algorithms.hda.view import View, camera_pose
+from marsyard.algorithms.hda.motion import View, camera_pose
 from tests.algorithms.hda.relief_scene import camera, pose
 
 
@@ -93,9 +93,7 @@ def make_view(yaw: float, pitch: float, roll: float) -> View:
 
 
 @pytest.mark.parametrize("attitude", [(0.0, 0.0, 0.0), (40.0, 10.0, -15.0), (190.0, -20.0, 5.0)])
-def test_surface_frame_is_level_and_differs_from_world_by_yaw(
-    attitude: tuple[float, float, float],
-) -> None:
+def test_surface_frame_is_level_and_differs_from_world_by_yaw(attitude: tuple[float, float, float]) -> None:
     first = make_view(*attitude)
     up = first.world_from_camera.rotation.inv().apply(np.array([0.0, 0.0, 1.0]))
     to_surface = surface_from_camera(up)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import Fate, HdaDetails, HdaEstimator, HdaOptions
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.motion import Motion
+from marsyard.algorithms.hda.motion import LandingScene, Motion, build_scene, undistort
 from marsyard.algorithms.hda.structure import (
     clip_to_image,
     dense_structure,
@@ -22,7 +22,6 @@ from marsyard.algorithms.hda.structure import (
     scale_factor,
     triangulate,
 )
-from marsyard.algorithms.hda.view import LandingScene, build_scene, undistort
 from marsyard.sim.frames import rigid
 from tests.algorithms.hda.relief_scene import Pass, make_bumps, measure_pass, plane, pose
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from marsyard.algorithms.hda.view import flat_fielded
+from marsyard.algorithms.hda.motion import flat_fielded
 from marsyard.sim.measurements import DetectorImage
 from marsyard.sim.sensor import Detector, DetectorParameters, natural_fall_off
 from marsyard.sim.sensor.optics import OpticsParameters

@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.vtt.options import VttOptions
-from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position, mast_angles, middle
-from marsyard.algorithms.vtt.stereo import disparity_px_m, epipolar_pixels, search_ranges, triangulated
-from marsyard.algorithms.vtt.target import (
+from marsyard.algorithms.vtt.matching import (
     bearing_rad,
     designated_position_world,
     horizontal_axis,
@@ -20,6 +17,9 @@ from marsyard.algorithms.vtt.target import (
     predicted_position,
     roll_angle,
 )
+from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position, mast_angles, middle
+from marsyard.algorithms.vtt.stereo import disparity_px_m, epipolar_pixels, search_ranges, triangulated
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastCalibration, MastGeometry, PixelTarget, RoverTarget, SiteTarget

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from marsyard.algorithms.interface import TargetLoss, TargetUpdate, TrackingState
-from marsyard.algorithms.vtt.handoff import GoalReached, HandOffOutcome, hand_off
-from marsyard.algorithms.vtt.loss import Evidence, Journey, Tolerances, find_losses, next_state, tolerances
+from marsyard.algorithms.vtt.accuracy import GoalReached, HandOffOutcome, hand_off
 from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.algorithms.vtt.tracker import Evidence, Journey, Tolerances, find_losses, next_state, tolerances
 from marsyard.sim.measurements import MastCalibration
 from tests.algorithms.vtt.synthetic_drive import navcam, pancam
 

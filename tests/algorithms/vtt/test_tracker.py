@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.interface import TargetLoss, TargetTracker, TrackingState
-from marsyard.algorithms.vtt.lucas_kanade import lucas_kanade_tracker
+from marsyard.algorithms.vtt.matching import lucas_kanade_tracker
 from marsyard.algorithms.vtt.options import PURE_NCC, VttOptions
 from marsyard.algorithms.vtt.tracker import VisualTargetTracker
 from marsyard.sim.camera import Cahvor

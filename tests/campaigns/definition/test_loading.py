@@ -11,8 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from marsyard.campaigns.definition.catalogue import catalogue
-from marsyard.campaigns.definition.loading import find_campaign, load_campaign
+from marsyard.campaigns.definition.loading import catalogue, find_campaign, load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 
 CampaignFile = Callable[..., Path]
@@ -35,10 +34,7 @@ def test_parameters_come_complete_with_their_defaults(campaign_file: CampaignFil
     ("parameters", "message"),
     [
         ("altitud_m = 3", "parameters.altitud_m: unknown key (did you mean 'altitude_m'?); allowed: aborting"),
-        (
-            "wind = {est_m_s = 3}",
-            "parameters.wind.est_m_s: unknown key (did you mean 'east_m_s'?); allowed: east",
-        ),
+        ("wind = {est_m_s = 3}", "parameters.wind.est_m_s: unknown key (did you mean 'east_m_s'?); allowed: east"),
         ("altitude_m = -10", "parameters.altitude_m: input should be greater than 0, got -10"),
         ("altitude_m = 'high'", "parameters.altitude_m: input should be a valid number"),
         ("heights_m = [1]", "parameters.heights_m[1]: required, but missing"),
@@ -67,10 +63,7 @@ def test_parameters(campaign_file: CampaignFile, parameters: str, message: str) 
         ("altitude_m = {distribution='normal', mean=5, sd=0}", "altitude_m.sd: input should be greater than 0"),
         ("altitude_m = {distribution='normal', mean=5, sd=1, truncate=[9,8]}", "the first limit must be below"),
         ("altitude_m = {distribution='normal', mean=5, sd=1, truncate=[90,95]}", "no probability between the limits"),
-        (
-            "altitude_m = {distribution='normal', mean=500, sd=100}",
-            "which the parameter does not take: altitude_m",
-        ),
+        ("altitude_m = {distribution='normal', mean=500, sd=100}", "which the parameter does not take: altitude_m"),
         ("altitude_m = {distribution='cauchy', loc=2000}", "which the parameter does not take"),
         ("altitude_m = {distribution='gamma', scale=2}", "parameter 'a' is missing; gamma takes a, loc, scale"),
         ("altitude_m = {distribution='gamma', a=1, scal=2}", "unknown parameter 'scal' (did you mean 'scale'?)"),
@@ -94,10 +87,7 @@ def test_parameters(campaign_file: CampaignFile, parameters: str, message: str) 
         ("kind = {distribution='choice', values=['a', 'B']}", "reaches 'B', which the parameter does not take"),
         ("kind = {distribution='choice', values=['a'], weights=[1, 2]}", "2 weights for 1 values"),
         ("kind = {distribution='choice', values=[]}", "kind.values: list should have at least 1 item"),
-        (
-            "kind = {distribution='choice', values=['a'], weights=[0]}",
-            "kind.weights[0]: input should be greater",
-        ),
+        ("kind = {distribution='choice', values=['a'], weights=[0]}", "kind.weights[0]: input should be greater"),
     ],
 )
 def test_dispersions(campaign_file: CampaignFile, dispersion: str, message: str) -> None:
@@ -119,36 +109,15 @@ def test_draws_that_are_refused_only_together(campaign_file: CampaignFile) -> No
 @pytest.mark.parametrize(
     ("head", "message"),
     [
-        (
-            "name='a'\nscenario='descnt'\ncases=1",
-            "unknown scenario 'descnt' (did you mean 'descent'?)",
-        ),
+        ("name='a'\nscenario='descnt'\ncases=1", "unknown scenario 'descnt' (did you mean 'descent'?)"),
         ("name='a'\nscenario='no_such_module:X'\ncases=1", "scenario: no scenario at 'no_such_module:X': No module"),
-        (
-            f"name='a'\nscenario='{FAKE}:Wind'\ncases=1",
-            "is not a scenario: it has no parameters_type",
-        ),
-        (
-            f"name='a b'\nscenario='{FAKE}:FakeScenario'\ncases=1",
-            "name: string should match pattern",
-        ),
+        (f"name='a'\nscenario='{FAKE}:Wind'\ncases=1", "is not a scenario: it has no parameters_type"),
+        (f"name='a b'\nscenario='{FAKE}:FakeScenario'\ncases=1", "name: string should match pattern"),
         (f"scenario='{FAKE}:FakeScenario'\ncases=1", "name: required, but missing"),
-        (
-            f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=0",
-            "cases: input should be greater",
-        ),
-        (
-            f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=true",
-            "cases: input should be a valid integer",
-        ),
-        (
-            f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nseed=-1",
-            "seed: input should be greater than or",
-        ),
-        (
-            f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nsed=1",
-            "sed: unknown key (did you mean 'seed'?)",
-        ),
+        (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=0", "cases: input should be greater"),
+        (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=true", "cases: input should be a valid integer"),
+        (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nseed=-1", "seed: input should be greater than or"),
+        (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nsed=1", "sed: unknown key (did you mean 'seed'?)"),
         (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nx=", "not valid TOML"),
     ],
 )
@@ -166,10 +135,7 @@ def test_the_campaign_itself(campaign_file: CampaignFile, head: str, message: st
         ("bound = inf", "requirements[0].bound: input should be a finite number"),
         ("probability = 1.0", "requirements[0].probability: input should be less than 1, got 1.0"),
         ("confidence = 90", "requirements[0].confidence: input should be less than 1, got 90"),
-        (
-            "population = 'valid or not'",
-            "requirements[0].population: string should match pattern",
-        ),
+        ("population = 'valid or not'", "requirements[0].population: string should match pattern"),
         ("decide_by = 'luck'", "requirements[0].decide_by: input should be 'confidence' or 'estimate', got 'luck'"),
         ("metrik = 'x'", "requirements[0].metrik: unknown key (did you mean 'metric'?); allowed: accept_rate, bound"),
         ("accept_rate = true", 'accept_rate needs decide_by = "estimate"'),

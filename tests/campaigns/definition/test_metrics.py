@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from marsyard.campaigns.definition.catalogue import catalogue
-from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.loading import catalogue, load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli.app import app
 from marsyard.scenarios.descent.scenario import DescentScenario

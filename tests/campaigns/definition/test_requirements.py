@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.campaigns.definition.catalogue import catalogue
-from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.loading import catalogue, load_campaign
 from marsyard.campaigns.definition.requirements import read_requirements, select_applicable, shipped_requirements
 from marsyard.campaigns.errors import ConfigurationError
 from tests.campaigns.fake_campaign import write_campaign
@@ -35,7 +34,7 @@ def test_campaigns_state_every_requirement_that_names_them(name: str) -> None:
     """Both ways: a requirement's list of campaigns, and the campaigns' lists of requirements."""
     shipped = shipped_requirements()
     asked = {one.id for one in load_campaign(name).configuration.requirements if one.id in shipped}
-    assert asked == {one.id for one in shipped.values() if one.applies_to(name)}
+    assert asked == {one["id"] for one in select_applicable(list(shipped.values()), name)}
 
 
 @pytest.mark.parametrize("name", catalogue())
@@ -44,7 +43,7 @@ def test_campaigns_state_known_requirements(name: str) -> None:
         stated = shipped_requirements().get(asked.id)
         if stated is not None:
             assert (asked.metric, asked.bound, asked.kind) == (stated.metric, stated.bound, stated.kind)
-            assert stated.applies_to(name)
+            assert select_applicable([stated], name)
 
 
 def test_a_campaign_may_change_population_and_confidence(tmp_path: Path) -> None:

@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from marsyard.campaigns.errors import CRASHED, TIMED_OUT, CaseEndedError
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.cases import make_unfinished_row
 from marsyard.campaigns.execution.worker_process import TaskResult, Work, WorkLimits, request_fresh_worker
 from marsyard.campaigns.execution.workers import LocalExecutor
-from marsyard.campaigns.outcomes import CRASHED, TIMED_OUT, CaseEndedError
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 

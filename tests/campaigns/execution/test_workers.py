@@ -19,10 +19,9 @@ import numpy as np
 import pytest
 
 from marsyard.algorithms.processes import used_memory
-from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CampaignError, CaseEndedError
 from marsyard.campaigns.execution.worker_process import StatusBoard, TaskResult, Work, WorkLimits
 from marsyard.campaigns.execution.workers import MAX_BATCH, Batches, LocalExecutor
-from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CaseEndedError
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -15,7 +16,6 @@ from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.offline import (
-    Exported,
     cases_with_changed_pictures,
     export_campaign,
     scored_campaign,
@@ -40,12 +40,17 @@ confidence = 0.5
 """
 
 
+class Exported(NamedTuple):
+    directory: Path
+    truth: Path
+
+
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     folder = tmp_path_factory.mktemp("offline")
     (folder / "fake.toml").write_text(FILE)
     made = Exported(folder / "out", truth_folder(folder / "out"))
-    export_campaign(campaign(made), made, ExecutorConfig(1), Silence())
+    export_campaign(campaign(made), *made, ExecutorConfig(1), Silence())
     return made
 
 
@@ -77,7 +82,7 @@ def written(path: Path, answers: dict[int, VelocityEstimate]) -> Path:
 
 def test_answers_made_elsewhere_score_as_a_run(exported: Exported, tmp_path: Path) -> None:
     watch = Silence()
-    scored = scored_campaign(exported, written(tmp_path / "theirs.csv", answered(exported)))
+    scored = scored_campaign(*exported, written(tmp_path / "theirs.csv", answered(exported)))
     run_campaign(scored, tmp_path / "scored", ExecutorConfig(1), watch)
     own = load_campaign(str(exported.directory.parent / "fake.toml"))
     run_campaign(own, tmp_path / "own", ExecutorConfig(1), watch)
@@ -97,33 +102,33 @@ def test_truth_stays_in_its_own_folder(exported: Exported) -> None:
     assert not any("12.0" in path.read_text() for path in exported.directory.glob("*.*"))
     with pytest.raises(CampaignError, match="lies within"):
         export_campaign(
-            campaign(exported), Exported(exported.directory, exported.directory / "truth"), ExecutorConfig(1), Silence()
+            campaign(exported), exported.directory, exported.directory / "truth", ExecutorConfig(1), Silence()
         )
 
 
 def test_an_export_resumes_and_is_not_mixed_with_another(exported: Exported) -> None:
     times = {path: path.stat().st_mtime_ns for path in (exported.directory / "cases").rglob("*")}
-    export_campaign(campaign(exported), exported, ExecutorConfig(1), Silence())
+    export_campaign(campaign(exported), *exported, ExecutorConfig(1), Silence())
     assert {path: path.stat().st_mtime_ns for path in times} == times
     with pytest.raises(StoreError, match="holds the truth of another export"):
-        export_campaign(campaign(exported, "seed=4"), exported, ExecutorConfig(1), Silence())
+        export_campaign(campaign(exported, "seed=4"), *exported, ExecutorConfig(1), Silence())
     elsewhere = Exported(exported.directory, exported.truth.with_name("new-truth"))
     with pytest.raises(StoreError, match="is there already, and is not empty"):
-        export_campaign(campaign(exported), elsewhere, ExecutorConfig(1), Silence())
+        export_campaign(campaign(exported), *elsewhere, ExecutorConfig(1), Silence())
 
 
 def test_tables_that_do_not_answer_each_case_once(exported: Exported, tmp_path: Path) -> None:
     answers = answered(exported)
     few = written(tmp_path / "few.csv", {case: answers[case] for case in (0, 2)})
     with pytest.raises(CampaignError, match=r"no answer to 1 of 3 cases: 1; .*such as NO_TEMPLATE_AREA"):
-        scored_campaign(exported, few)
+        scored_campaign(*exported, few)
     many = written(tmp_path / "many.csv", {**answers, 7: answers[0]})
     with pytest.raises(CampaignError, match="there is no case 7; allowed: 0 to 2"):
-        scored_campaign(exported, many)
+        scored_campaign(*exported, many)
     with pytest.raises(CampaignError, match="No such file"):
-        scored_campaign(exported, tmp_path / "none.csv")
+        scored_campaign(*exported, tmp_path / "none.csv")
     with pytest.raises(StoreError, match="holds no finished export"):
-        scored_campaign(Exported(tmp_path, exported.truth), few)
+        scored_campaign(tmp_path, exported.truth, few)
 
 
 def test_closed_loops_cannot_be_exported(tmp_path: Path) -> None:

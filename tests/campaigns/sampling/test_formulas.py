@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marsyard.campaigns.sampling.formulas import MAX_LENGTH, formula
+from marsyard.campaigns.sampling.dispersion import MAX_LENGTH, formula
 
 VALUES = {"altitude_m": 2000.0, "wind.east_m_s": -3.0, "heights_m.1": 4, "on": True, "site": "gusev"}
 

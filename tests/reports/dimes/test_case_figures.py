@@ -11,7 +11,6 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from marsyard.reports.cases import write_case_figures
 from marsyard.reports.dimes.case_figures import (
     MATCH,
     TEMPLATE,
@@ -23,6 +22,7 @@ from marsyard.reports.dimes.case_figures import (
     write_dimes_figures,
 )
 from marsyard.reports.dimes.presentation import view
+from marsyard.reports.presentation import write_case_figures
 
 
 def _squares(figure: Figure, colour: str) -> list[Rectangle]:

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.reports.cases import write_case_figures
 from marsyard.reports.dimes.presentation import draw_stream_case, is_stream_case
 from marsyard.reports.dimes.presentation import view_stream as view
+from marsyard.reports.presentation import write_case_figures
 
 PICTURES = 4
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex, to_rgb
 
-from marsyard.reports.cases import write_case_figures
 from marsyard.reports.dimes.case_figures import is_dimes_case
 from marsyard.reports.hda.case_figures import (
     BLACK,
@@ -29,6 +28,7 @@ from marsyard.reports.hda.case_figures import (
 )
 from marsyard.reports.hda.presentation import view
 from marsyard.reports.hda.products import is_hda_case, landing_maps, true_ground
+from marsyard.reports.presentation import write_case_figures
 
 
 def test_every_figure_of_a_mapped_case_is_written(hda_products: dict[str, Any], tmp_path: Path) -> None:

@@ -185,12 +185,12 @@ def test_map_errors_follow_their_drivers() -> None:
     frame["elevation_rms_m"] = np.abs(frame["range_error_m"])
     mapped = map_rows(_subject(frame))
     assert mapped is not None
-    effects = {(one.driver, one.error): one for one in MAP_EFFECTS.effects(mapped)}
+    effects = {(one["driver"], one["error"]): one for one in MAP_EFFECTS.effects(mapped)}
     noise = effects["baseline over height", "elevation error rms without its plane (% of height)"]
-    assert noise.rank_correlation == pytest.approx(-1.0)
-    assert np.all(np.diff(noise.medians) < 0.0)
+    assert noise["rank_correlation"] == pytest.approx(-1.0)
+    assert np.all(np.diff(noise["medians"]) < 0.0)
     scale = effects["altimeter's error (% of the range)", "elevation error rms (% of height)"]
-    np.testing.assert_allclose(scale.centres, scale.medians)
+    np.testing.assert_allclose(scale["centres"], scale["medians"])
 
 
 def test_page_has_the_sections(make_run: Callable[..., Path]) -> None:

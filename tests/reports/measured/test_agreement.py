@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from marsyard.reports.measured.case_figures import matched_pairs
-from marsyard.reports.measured.presentation import MEASURED, agreement_section
+from marsyard.reports.measured.presentation import MEASURED, agreement_section, matched_pairs
 from marsyard.reports.presentation import case_kind
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun

@@ -3,8 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from marsyard.reports.statistics.clusters import ClusterMethod, clustered_evidence, number_terrains
-from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
+from marsyard.reports.statistics.proportions import (
+    ClusterMethod,
+    clustered_evidence,
+    number_terrains,
+    proportion_lower,
+    proportion_upper,
+)
 
 SIZE = 8
 

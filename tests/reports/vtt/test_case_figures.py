@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from marsyard.reports.cases import write_case_figures
+from marsyard.reports.presentation import write_case_figures
 from marsyard.reports.vtt.case_figures import TARGET, WINDOW, draw_path, draw_stops, is_vtt_case, path_of, stops_of
 from marsyard.reports.vtt.presentation import view
 from tests.reports.vtt.tracking_rows import products

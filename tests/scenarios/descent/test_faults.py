@@ -9,6 +9,7 @@ import pytest
 from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
 
+from marsyard.scenarios.conditions import deliver, faulty_detector
 from marsyard.scenarios.descent.exposure import (
     SHIELD_DIAMETER_M,
     HeatShield,
@@ -18,10 +19,15 @@ from marsyard.scenarios.descent.exposure import (
     camera_optics,
     take_exposures,
 )
-from marsyard.scenarios.descent.faults import Faults, faulty_altitudes, faulty_attitudes, faulty_terrain, faulty_times
 from marsyard.scenarios.descent.flight import create_flight, picture_states
+from marsyard.scenarios.descent.measurement import (
+    Faults,
+    faulty_altitudes,
+    faulty_attitudes,
+    faulty_terrain,
+    faulty_times,
+)
 from marsyard.scenarios.descent.parameters import CameraParameters
-from marsyard.scenarios.faults import deliver, faulty_detector
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
@@ -60,17 +66,17 @@ def test_disabled_faults_have_no_effect() -> None:
     assert faulty_terrain(none, terrain) == terrain
     assert faulty_detector(none, detector) == detector
     assert faulty_times(none, [0.0, 3.75, 7.5]) == [0.0, 3.75, 7.5]
-    assert none.name_and_size == ("none", 0.0)
+    assert none.columns == {"fault": "none", "fault_size": 0.0}
 
 
 @pytest.mark.parametrize(("name", "field"), Faults.model_fields.items())
 def test_fault_name_and_size_are_reported(name: str, field: FieldInfo) -> None:
     size = 2 if field.annotation is int else 0.25
-    assert Faults.model_validate({name: size}).name_and_size == (name, size)
+    assert Faults.model_validate({name: size}).columns == {"fault": name, "fault_size": size}
 
 
 def test_multiple_faults_have_no_size() -> None:
-    name, size = Faults(haze=1.0, dust_discs=3).name_and_size
+    name, size = Faults(haze=1.0, dust_discs=3).columns.values()
     assert name == "several"
     assert np.isnan(size)
 

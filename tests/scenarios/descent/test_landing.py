@@ -33,8 +33,7 @@ def test_wrong_answer_increases_the_velocity() -> None:
 
 
 @pytest.mark.parametrize(
-    ("estimate", "available_s"),
-    [(None, 17.0), (DRIFT, EXACT.computation_s - 0.1), (np.array([3.0, -4.0]), 17.0)],
+    ("estimate", "available_s"), [(None, 17.0), (DRIFT, EXACT.computation_s - 0.1), (np.array([3.0, -4.0]), 17.0)]
 )
 def test_late_or_missing_answer_disables_steering(estimate: np.ndarray | None, available_s: float) -> None:
     result = touchdown(EXACT, DRIFT, estimate, available_s, _rng())

@@ -12,9 +12,8 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.descent.exposure import World
-from marsyard.scenarios.descent.flight import create_flight
+from marsyard.scenarios.descent.flight import FlightFile, create_flight
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.sim.dynamics.recorded import COLUMNS
 from marsyard.sim.streams import Streams
 from tests.scenarios.descent.settings import parameters, run

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.campaigns.definition.catalogue import catalogue
-from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.loading import catalogue, load_campaign
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 from tests.scenarios.descent.settings import DESCENT, FLAT, PERFECT, WORLD, run

@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from marsyard.scenarios.faults import faulty_detector
-from marsyard.scenarios.landing.faults import Faults, arrived_numbers, faulty_helicopter, faulty_ranges, stuck_range_m
+from marsyard.scenarios.conditions import faulty_detector
 from marsyard.scenarios.landing.helicopter import HelicopterParameters, Transit
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.parameters import (
+    Faults,
+    LandingScenarioParameters,
+    arrived_numbers,
+    faulty_helicopter,
+    faulty_ranges,
+    stuck_range_m,
+)
 from marsyard.sim.sensor import preset
 from marsyard.sim.streams import Streams
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import Fate, HdaDetails, Matches
-from marsyard.algorithms.hda.view import View
+from marsyard.algorithms.hda.motion import View
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics

@@ -94,10 +94,7 @@ def test_truncated_image_is_rejected(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "min_count", "max_count", "mean"),
-    [
-        ("1F483288473EFFCMUFP1214L0M1.IMG", 5, 4046, 840.053),
-        ("1N491020376ILFCNY9P0706L0M1.IMG", 517, 4029, 1421.71),
-    ],
+    [("1F483288473EFFCMUFP1214L0M1.IMG", 5, 4046, 840.053), ("1N491020376ILFCNY9P0706L0M1.IMG", 517, 4029, 1421.71)],
 )
 def test_opportunity_images_match_label_statistics(
     shared_data: Path, name: str, min_count: int, max_count: int, mean: float

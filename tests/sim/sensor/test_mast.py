@@ -149,10 +149,7 @@ def test_row_errors_and_common_rotations_shift_images() -> None:
     rotated = StereoHead.drawn(design, PERFECT.model_copy(update={"alignment_deg": 1.0}), _rng(5))
     shifts = [
         one.project(point)[0] - other.project(point)[0]
-        for one, other in (
-            (rotated.calibrated.left, design.left),
-            (rotated.calibrated.right, design.right),
-        )
+        for one, other in ((rotated.calibrated.left, design.left), (rotated.calibrated.right, design.right))
     ]
     assert np.linalg.norm(shifts[0]) > 5.0
     assert shifts[0] == pytest.approx(shifts[1], abs=0.5)

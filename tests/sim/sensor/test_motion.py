@@ -15,7 +15,7 @@ from marsyard.sim.render.backend import default_backend
 from marsyard.sim.render.rays import PixelRays
 from marsyard.sim.sensor import ImageMotion, natural_fall_off
 from marsyard.sim.sensor.kernels import path_kernel
-from marsyard.sim.sensor.motion import moving_exposure
+from marsyard.sim.sensor.optics import moving_exposure
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from tests.sim.sensor.motions import uniform_motion
 

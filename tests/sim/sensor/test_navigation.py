@@ -19,10 +19,10 @@ from marsyard.sim.dynamics.rotorcraft import (
     transit_flight,
 )
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
+from marsyard.sim.sensor.instrument import TiltCompass, TiltCompassParameters
 from marsyard.sim.sensor.navigation import FilterParameters, NavigationFilter, NavigationSolution
 from marsyard.sim.sensor.navigation.kernels import POSITION_FIX, VELOCITY_FIX
 from marsyard.sim.sensor.satellite_navigation import Outage, RtkParameters, RtkReceiver
-from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters
 
 GRAVITY, FLIGHTS = 9.8, 50
 CRAFT, TRANSIT = RotorcraftParameters(), TransitParameters(hover_s=8.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
+from marsyard.sim.sensor.instrument import TiltCompass, TiltCompassParameters, TiltCompassReadings
 from tests.sim.sensor.motions import GRAVITY, Swaying
 
 PERFECT: dict[str, object] = dict.fromkeys(

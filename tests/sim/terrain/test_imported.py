@@ -8,7 +8,7 @@ import pytest
 
 from marsyard.sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
 from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, choose_grid, embed, fill_holes, read_rasters
-from marsyard.sim.terrain.statistics import terrain_statistics
+from marsyard.sim.terrain.surface import terrain_statistics
 
 ROWS, COLUMNS = 90, 110
 

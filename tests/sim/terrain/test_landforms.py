@@ -14,7 +14,7 @@ from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.landforms import Dunes, Fans, Ground, Gullies, Lava, Playa, Ramp, Swell
 from marsyard.sim.terrain.landforms.ground import draw_smooth_fields, refine, substream
 from marsyard.sim.terrain.landforms.kernels import Bedforms, add_cracks, add_dunes, stamp_craters
-from marsyard.sim.terrain.statistics import mean_slope_deg
+from marsyard.sim.terrain.surface import mean_slope_deg
 
 SMOOTH = TerrainParameters(samples=512, rms_slope_deg=0.0, craters_per_km2=0.0, albedo_contrast=0.0)
 

@@ -9,7 +9,7 @@ import pytest
 from marsyard.sim.terrain import Environment, Surface, TerrainParameters, site, sites, synthesise
 from marsyard.sim.terrain.rocks import RockField
 from marsyard.sim.terrain.sites import PAPER
-from marsyard.sim.terrain.statistics import TerrainStatistics, image_contrast, mean_slope_deg, terrain_statistics
+from marsyard.sim.terrain.surface import TerrainStatistics, image_contrast, mean_slope_deg, terrain_statistics
 
 FIELD = ("pisgah", "kelso", "ivanpah")
 MARS = ("gusev", "meridiani")
