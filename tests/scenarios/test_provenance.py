@@ -1,4 +1,4 @@
-"""What a row says of its pictures."""
+"""Tests of image hashes in rows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from marsyard.sim.kernel_cache import processor_features
 from marsyard.sim.render.backend import default_backend
 
 
-def test_a_hash_is_of_the_counts_in_order_however_they_lie_in_memory() -> None:
+def test_image_hash_does_not_depend_on_memory_layout() -> None:
     first, second = (np.arange(start, start + 12, dtype=np.uint16).reshape(3, 4) for start in (0, 50))
     columns = picture_columns(default_backend(), hash_images([first, second]))
     assert columns["image_hash"] == hashlib.sha256(first.tobytes() + second.tobytes()).hexdigest()
