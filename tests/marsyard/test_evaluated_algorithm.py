@@ -66,13 +66,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def _record(folder: Path) -> Mapping[str, Any]:
+def _read_record(folder: Path) -> Mapping[str, Any]:
     stored: Mapping[str, Any] = json.loads((folder / "run" / "campaign.json").read_text())
     return stored
 
 
 def test_record_describes_the_algorithms(folder: Path) -> None:
-    judged, compared = _record(folder)["algorithms"]
+    judged, compared = _read_record(folder)["algorithms"]
     assert (judged["spec"], judged["role"], judged["path"]) == ("mine:Mine", "judged", "mine:Mine")
     assert (judged["version"], judged["options"]) == ("3.1", {"gain": 0.5})
     assert re.fullmatch("[0-9a-f]{16}", judged["source_hash"])
@@ -83,7 +83,7 @@ def test_record_describes_the_algorithms(folder: Path) -> None:
 
 
 def test_reports_name_the_evaluated_algorithm(folder: Path) -> None:
-    source = _record(folder)["algorithms"][0]["source_hash"]
+    source = _read_record(folder)["algorithms"][0]["source_hash"]
     page = html.unescape((folder / "run" / "report.html").read_text())
     header = page.partition("<nav")[0]
     assert "mine:Mine" in header
@@ -109,7 +109,7 @@ def test_dashboard_names_the_evaluated_algorithm(folder: Path, tmp_path: Path) -
     assert evidence is not None
     assert "mine:Mine 3.1" in evidence[0]
     page = html.unescape(next((tmp_path / "site" / "c").glob("*/index.html")).read_text())
-    source = _record(folder)["algorithms"][0]["source_hash"]
+    source = _read_record(folder)["algorithms"][0]["source_hash"]
     assert all(text in page for text in ("mine:Mine 3.1", source, '{"gain": 0.5}'))
     matrix = list(csv.DictReader(io.StringIO((tmp_path / "site" / "verification.csv").read_text())))
     assert next(row for row in matrix if row["requirement"] == "v")["algorithm"] == "mine:Mine"
@@ -157,7 +157,7 @@ def test_records_of_earlier_versions_are_reported(folder: Path, tmp_path: Path) 
     old = tmp_path / "old"
     old.mkdir()
     (old / "cases.parquet").write_bytes((folder / "run" / "cases.parquet").read_bytes())
-    record = {key: value for key, value in _record(folder).items() if key not in ("command", "algorithms")}
+    record = {key: value for key, value in _read_record(folder).items() if key not in ("command", "algorithms")}
     (old / "campaign.json").write_text(json.dumps(record))
     result = CliRunner().invoke(app, ["report", str(old)])
     assert result.exit_code in (1, 3), result.output

@@ -276,11 +276,11 @@ low high choice values truncate norm gamma id
 _words = st.sampled_from(_WORDS.split())
 
 
-def _toml(value: object) -> str:
+def _to_toml(value: object) -> str:
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{_toml(str(key))} = {_toml(inner)}" for key, inner in value.items()) + "}"
+        return "{" + ", ".join(f"{_to_toml(str(key))} = {_to_toml(inner)}" for key, inner in value.items()) + "}"
     if isinstance(value, list):
-        return "[" + ", ".join(map(_toml, value)) + "]"
+        return "[" + ", ".join(map(_to_toml, value)) + "]"
     if isinstance(value, str):
         return '"' + "".join(f"\\u{ord(letter):04x}" for letter in value) + '"'
     return str(value).lower()
@@ -297,7 +297,7 @@ _values = st.recursive(
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_random_files_load_or_report_their_keys(tmp_path: Path, changes: dict[str, object]) -> None:
     base: dict[str, object] = {"name": "fake", "scenario": "tests.campaigns.fake_scenario:FakeScenario", "cases": 3}
-    text = "\n".join(f"{_toml(key)} = {_toml(value)}" for key, value in {**base, **changes}.items())
+    text = "\n".join(f"{_to_toml(key)} = {_to_toml(value)}" for key, value in {**base, **changes}.items())
     path = tmp_path / "fuzzed.toml"
     path.write_text(text)
     tomllib.loads(text)
@@ -336,7 +336,7 @@ def test_invalid_value_is_reported_by_its_key(
     tables = {name: dict(inner) for name, inner in _VALID_TABLES.items()}
     tables[table].pop(key) if is_removed else tables[table].update({key: value})
     head = 'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\ncases = 12\n'
-    texts = [f"{name} = {_toml([inner] if name == 'requirements' else inner)}" for name, inner in tables.items()]
+    texts = [f"{name} = {_to_toml([inner] if name == 'requirements' else inner)}" for name, inner in tables.items()]
     path = tmp_path / "invalid.toml"
     path.write_text(head + "\n".join(texts))
     reported_keys = find_error_keys(lambda: load_campaign(str(path)))

@@ -37,7 +37,7 @@ MAX_DURATION_S = 60.0
 _held_objects: list[object] = []
 
 
-def run(
+def run_items(
     task: Callable[[int], Any], items: Iterable[int], limits: WorkLimits | None = None
 ) -> dict[int, TaskResult[Any]]:
     """Run items in one worker; return their results after the worker has ended."""
@@ -62,7 +62,7 @@ def leave_running(kind: str, folder: str, item: int) -> int:
         threading.Thread(target=time.sleep, args=(3600,)).start()
     elif item == 0 and kind == "pool":
         pool = ProcessPoolExecutor(2, mp_context=get_context("fork"))
-        processes = list(pool.map(process_number, range(2)))
+        processes = list(pool.map(get_process_id, range(2)))
         _held_objects.append(pool)
     elif item == 0 and kind == "fork":
         processes = [fork_sleeping_child()]
@@ -83,7 +83,7 @@ def leave_running(kind: str, folder: str, item: int) -> int:
     return os.getpid()
 
 
-def process_number(_: int) -> int:
+def get_process_id(_: int) -> int:
     time.sleep(0.1)
     return os.getpid()
 
@@ -101,7 +101,7 @@ def fork_sleeping_child() -> int:
 @pytest.mark.parametrize("kind", ["thread", "pool", "fork", "session", "orphan"])
 def test_processes_left_by_case_end_with_it(kind: str, tmp_path: Path) -> None:
     start_s = time.monotonic()
-    results = run(partial(leave_running, kind, str(tmp_path)), range(3))
+    results = run_items(partial(leave_running, kind, str(tmp_path)), range(3))
     assert time.monotonic() - start_s < MAX_DURATION_S
     started = tmp_path / "processes"
     processes = list(map(int, started.read_text().split())) if started.exists() else []
@@ -124,7 +124,7 @@ def wait_for_session(folder: str, item: int) -> int:
 
 def test_child_in_own_session_respects_time_limit(tmp_path: Path) -> None:
     start_s = time.monotonic()
-    results = run(partial(wait_for_session, str(tmp_path)), range(4), WorkLimits(time_s=2.0))
+    results = run_items(partial(wait_for_session, str(tmp_path)), range(4), WorkLimits(time_s=2.0))
     assert time.monotonic() - start_s < MAX_DURATION_S
     error = results[1].error
     assert isinstance(error, CaseEndedError)
@@ -145,7 +145,7 @@ def signal_supervisor(kind: int, folder: str, item: int) -> int:
 @pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGSTOP])
 def test_signal_to_supervisor_ends_only_the_case(kind: int, tmp_path: Path) -> None:
     start_s = time.monotonic()
-    results = run(partial(signal_supervisor, kind, str(tmp_path)), range(3), WorkLimits(time_s=2.0))
+    results = run_items(partial(signal_supervisor, kind, str(tmp_path)), range(3), WorkLimits(time_s=2.0))
     assert time.monotonic() - start_s < MAX_DURATION_S
     error = results[1].error
     assert isinstance(error, CaseEndedError)
@@ -220,7 +220,7 @@ def read_state() -> tuple[object, ...]:
     )
 
 
-def alter(seconds: float, item: int) -> object:
+def read_and_change_state(seconds: float, item: int) -> object:
     """Return the process state; odd items then change one part of it."""
     process_state = read_state()
     if item % 2:
@@ -235,7 +235,7 @@ def alter(seconds: float, item: int) -> object:
 def test_process_state_does_not_reach_next_case(seconds: float) -> None:
     """The check also holds for short cases that run in one batch."""
     number = 2 * len(STATE_CHANGES)
-    run_results = run(partial(alter, seconds), range(number))
+    run_results = run_items(partial(read_and_change_state, seconds), range(number))
     results: list[Any] = [run_results[item].result for item in range(number)]
     # the last two entries are random numbers: they depend on the case, not on the worker
     assert len({str((result[1][:-2], result[2])) for result in results}) == 1
@@ -243,7 +243,7 @@ def test_process_state_does_not_reach_next_case(seconds: float) -> None:
     for position, name in enumerate(STATE_CHANGES):
         assert run_results[2 * position].changed == ()
         assert run_results[2 * position + 1].changed == (name,)
-    single_result: Any = run(partial(alter, 0.01), [5])[5].result
+    single_result: Any = run_items(partial(read_and_change_state, 0.01), [5])[5].result
     assert results[5][1][-2:] == single_result[1][-2:]
 
 
@@ -261,7 +261,7 @@ def import_and_alter(folder: Path, item: int) -> tuple[str | None, ...]:
 def test_environment_is_restored_after_import_in_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/somewhere")
     (tmp_path / "changes_environment.py").write_text("import os\nos.environ['SET_BY_MODULE'] = 'yes'\n")
-    results = run(partial(import_and_alter, tmp_path), range(3))
+    results = run_items(partial(import_and_alter, tmp_path), range(3))
     assert results[0].changed == ("environment variables", "sys.path")
     assert [results[item].result for item in (1, 2)] == [("yes", None, "/somewhere")] * 2
 
@@ -278,7 +278,7 @@ def crash_after_other_case(item: int) -> int:
 
 def test_crash_after_other_case_is_repeated_in_fresh_worker() -> None:
     _held_objects.clear()
-    results = run(crash_after_other_case, range(5))
+    results = run_items(crash_after_other_case, range(5))
     assert {item: result.result for item, result in results.items()} == {0: 0, 1: 1, 2: 2, 3: -1, 4: 4}
     # spoiled_by names the earlier case; case 3 crashes in a fresh worker too
     assert [results[item].spoiled_by for item in range(5)] == [None, 0, 1, None, None]
@@ -292,7 +292,7 @@ def close_files(item: int) -> int:
 
 
 def test_closing_worker_files_crashes_only_that_case() -> None:
-    results = run(close_files, range(4))
+    results = run_items(close_files, range(4))
     assert str(results[1].error) == "the case closed or replaced the worker's file descriptors"
     assert {item: result.result for item, result in results.items() if item != 1} == {0: 0, 2: 2, 3: 3}
 
@@ -312,7 +312,7 @@ def share_memory(item: int) -> int:
 
 
 def test_memory_shared_by_forked_children_counts_once() -> None:
-    results = run(share_memory, [0], WorkLimits(memory_bytes=0.3e9))
+    results = run_items(share_memory, [0], WorkLimits(memory_bytes=0.3e9))
     assert results[0].error is None
     assert results[0].result == 1
 

@@ -27,13 +27,13 @@ from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_M
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
 
-def run(
+def run_items(
     workers: LocalExecutor, task: Callable[[int], Any], items: Iterable[int], limits: WorkLimits | None = None
 ) -> Iterator[TaskResult[Any]]:
     return chain.from_iterable(workers.run(Work(task, items, limits or WorkLimits())))
 
 
-def process_number(_: int) -> int:
+def get_process_id(_: int) -> int:
     return os.getpid()
 
 
@@ -44,7 +44,7 @@ def abort_once(marker: str, item: int) -> int:
     return item
 
 
-def misbehave(item: int) -> object:
+def raise_or_exit(item: int) -> object:
     if item == 0:
         raise LookupError("nothing there")
     if item == 1:
@@ -59,32 +59,32 @@ def sleep_and_return(seconds: float, item: int) -> int:
 
 def test_number_of_worker_processes_is_respected() -> None:
     with LocalExecutor(1) as workers:
-        assert {result.result for result in run(workers, process_number, range(5))} != {os.getpid()}
+        assert {result.result for result in run_items(workers, get_process_id, range(5))} != {os.getpid()}
     with LocalExecutor(2) as workers:
-        assert len({result.result for result in run(workers, process_number, range(20))}) == 2
+        assert len({result.result for result in run_items(workers, get_process_id, range(20))}) == 2
 
 
 def test_task_of_killed_worker_is_repeated(tmp_path: Path) -> None:
     with LocalExecutor(2) as workers:
-        results = list(run(workers, partial(abort_once, str(tmp_path / "marker")), range(6)))
+        results = list(run_items(workers, partial(abort_once, str(tmp_path / "marker")), range(6)))
     assert sorted(result.item for result in results if result.result == result.item) == list(range(6))
     assert all(result.error is None for result in results)
 
 
 def test_errors_are_assigned_to_their_tasks() -> None:
     with LocalExecutor(2) as workers:
-        results = {result.item: result for result in run(workers, misbehave, range(3))}
+        results = {result.item: result for result in run_items(workers, raise_or_exit, range(3))}
         assert isinstance(results[0].error, LookupError)
         assert isinstance(results[1].error, CaseEndedError)
         assert str(results[1].error) == "the worker process died: EXIT (3)"
         assert callable(results[2].result)
         # the pool still works
-        assert [result.result for result in run(workers, partial(sleep_and_return, 0.0), [7])] == [7]
+        assert [result.result for result in run_items(workers, partial(sleep_and_return, 0.0), [7])] == [7]
 
 
 def run_and_interrupt() -> None:
     with LocalExecutor(1) as workers:
-        for _ in run(workers, lambda item: sleep_and_return(60.0 * item, item), range(2)):
+        for _ in run_items(workers, lambda item: sleep_and_return(60.0 * item, item), range(2)):
             raise KeyboardInterrupt
 
 
@@ -105,7 +105,7 @@ def test_items_are_read_as_needed() -> None:
             yield item
 
     with LocalExecutor(2) as workers:
-        for number, _ in enumerate(run(workers, partial(sleep_and_return, 0.0), items())):  # type: ignore[arg-type]
+        for number, _ in enumerate(run_items(workers, partial(sleep_and_return, 0.0), items())):  # type: ignore[arg-type]
             if number == 10:
                 break
     # batches double: after 1, 2, 4 and 8, one of 16 and one of 32 may be running
@@ -135,7 +135,9 @@ def test_only_tasks_over_a_limit_are_ended(tmp_path: Path) -> None:
     with LocalExecutor(1) as workers:
         results = {
             result.item: result
-            for result in run(workers, partial(exceed_limit, str(tmp_path)), [0, 5, 6, 7, 1, 2, 3, 4, 8, 9], limits)
+            for result in run_items(
+                workers, partial(exceed_limit, str(tmp_path)), [0, 5, 6, 7, 1, 2, 3, 4, 8, 9], limits
+            )
         }
     errors = {item: result.error for item, result in results.items() if result.error is not None}
     assert all(isinstance(error, CaseEndedError) for error in errors.values())
@@ -171,7 +173,7 @@ def leak_memory(item: int, arrays: list[object] = []) -> int:  # noqa: B006  (th
 def test_memory_leak_does_not_end_the_task_at_the_limit() -> None:
     limits = WorkLimits(memory_bytes=0.2e9)
     with LocalExecutor(1) as workers:
-        results = list(run(workers, leak_memory_slowly, range(12), limits))
+        results = list(run_items(workers, leak_memory_slowly, range(12), limits))
     assert sorted(result.item for result in results if result.error is None) == list(range(12))
 
 
@@ -182,7 +184,7 @@ def leak_memory_slowly(item: int) -> int:
     return item
 
 
-def spawn(item: int) -> int:
+def start_endless_process(item: int) -> int:
     subprocess.Popen(["sleep", "3600"])
     time.sleep(3600)
     return item
@@ -190,7 +192,7 @@ def spawn(item: int) -> int:
 
 def test_processes_started_by_a_task_end_with_it() -> None:
     with LocalExecutor(1) as workers:
-        (result,) = run(workers, spawn, [0], WorkLimits(time_s=1.0))
+        (result,) = run_items(workers, start_endless_process, [0], WorkLimits(time_s=1.0))
         assert isinstance(result.error, CaseEndedError)
         processes = subprocess.run(["ps", "-eo", "ppid,args"], capture_output=True, text=True, check=True).stdout
     # process 1 adopts orphans
@@ -207,7 +209,7 @@ def test_workers_that_die_at_start_are_a_campaign_error(monkeypatch: pytest.Monk
     with LocalExecutor(1) as workers:
         monkeypatch.setattr("marsyard.campaigns.execution.workers.run_batch", exit_at_start)
         with pytest.raises(CampaignError, match="worker processes die before they begin a case"):
-            list(workers.run(Work(process_number, range(3))))
+            list(workers.run(Work(get_process_id, range(3))))
 
 
 def test_memory_counts_private_pages(tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ error_scale = {distribution = "grid", values = [0.5, 2.0]}
 """
 
 
-def load(
+def load_design(
     file: CampaignFile,
     kind: str,
     cases: int,
@@ -64,7 +64,7 @@ def read_probabilities(campaign: Campaign, cases: range) -> np.ndarray:
 def test_each_latin_hypercube_stratum_has_one_case(campaign_file: CampaignFile, cases: int, seed: int) -> None:
     for dispersions in (DISPERSIONS, DISPERSIONS + GROUP):
         points = read_probabilities(
-            load(campaign_file, "latin-hypercube", cases, dispersions=dispersions, seed=seed), range(cases)
+            load_design(campaign_file, "latin-hypercube", cases, dispersions=dispersions, seed=seed), range(cases)
         )
         assert points.shape == (cases, 4)
         for column in points.T:
@@ -72,7 +72,7 @@ def test_each_latin_hypercube_stratum_has_one_case(campaign_file: CampaignFile, 
 
 
 def test_drawn_values_are_stratified(campaign_file: CampaignFile) -> None:
-    campaign = load(campaign_file, "latin-hypercube", 200, dispersions=DISPERSIONS + GROUP)
+    campaign = load_design(campaign_file, "latin-hypercube", 200, dispersions=DISPERSIONS + GROUP)
     draws = [campaign.draws(case) for case in range(200)]
     normal = stats.norm.cdf([draw["wind.north_m_s"] for draw in draws])
     assert sorted(np.floor(200 * normal).astype(int).tolist()) == list(range(200))
@@ -80,7 +80,7 @@ def test_drawn_values_are_stratified(campaign_file: CampaignFile) -> None:
 
 
 def test_latin_hypercube_columns_are_uncorrelated(campaign_file: CampaignFile) -> None:
-    points = read_probabilities(load(campaign_file, "latin-hypercube", 2000), range(2000))
+    points = read_probabilities(load_design(campaign_file, "latin-hypercube", 2000), range(2000))
     difference = stats.spearmanr(points).statistic - np.eye(4)
     # maximum of six pairs of random orders: below 4.5 standard errors
     assert np.abs(difference).max() < 4.5 / np.sqrt(1999)
@@ -88,7 +88,7 @@ def test_latin_hypercube_columns_are_uncorrelated(campaign_file: CampaignFile) -
 
 def test_sobol_design_is_a_digital_net(campaign_file: CampaignFile) -> None:
     """The first two dimensions of 2^m points have one point per elementary interval of volume 2^-m (t = 0)."""
-    points = read_probabilities(load(campaign_file, "sobol", 256), range(256))[:, :2]
+    points = read_probabilities(load_design(campaign_file, "sobol", 256), range(256))[:, :2]
     for rows in range(9):
         boxes = np.floor(points * [2**rows, 2 ** (8 - rows)]).astype(int)
         assert len({tuple(box) for box in boxes.tolist()}) == 256
@@ -97,8 +97,8 @@ def test_sobol_design_is_a_digital_net(campaign_file: CampaignFile) -> None:
 
 
 def test_sobol_discrepancy_is_below_random_draws(campaign_file: CampaignFile) -> None:
-    sobol = read_probabilities(load(campaign_file, "sobol", 512), range(512))
-    random = read_probabilities(load(campaign_file, "random", 512), range(512))
+    sobol = read_probabilities(load_design(campaign_file, "sobol", 512), range(512))
+    random = read_probabilities(load_design(campaign_file, "random", 512), range(512))
     assert qmc.discrepancy(sobol) < 0.1 * qmc.discrepancy(random)
 
 
@@ -107,11 +107,11 @@ def test_sobol_discrepancy_is_below_random_draws(campaign_file: CampaignFile) ->
 def test_single_case_equals_case_of_full_design(campaign_file: CampaignFile, kind: str, nominal: bool) -> None:
     cases = 6 * 16 + nominal
     design: dict[str, Any] = {"dispersions": DISPERSIONS + GRID + GROUP, "nominal": nominal}
-    forward = load(campaign_file, kind, cases, **design)
+    forward = load_design(campaign_file, kind, cases, **design)
     draws = [forward.draws(case) for case in range(cases)]
     for case in (cases - 1, 17, 3, 0):
         build_stratified_design.cache_clear()
-        assert load(campaign_file, kind, cases, **design).draws(case) == draws[case]
+        assert load_design(campaign_file, kind, cases, **design).draws(case) == draws[case]
     assert len({str(draw) for draw in draws}) == cases
 
 
@@ -124,22 +124,22 @@ def test_added_dispersion_does_not_change_other_draws(
     """The position in the file is arbitrary; in a Sobol design the new dispersion must be the last."""
     others = DISPERSIONS.replace('"wind.east_m_s" = {distribution = "uniform", low = 0, high = 1}', "")
     entry = f'"{name}" = {{distribution = "uniform", low = 0, high = 1}}\n'
-    without = load(campaign_file, kind, 64, dispersions=others).draws(case)
+    without = load_design(campaign_file, kind, 64, dispersions=others).draws(case)
     texts = (
         [others + entry]
         if kind == "sobol"
         else [others + entry, others.replace("[dispersions]", f"[dispersions]\n{entry}")]
     )
     for text in texts:
-        draw = load(campaign_file, kind, 64, dispersions=text).draws(case)
+        draw = load_design(campaign_file, kind, 64, dispersions=text).draws(case)
         assert 0.0 < draw.pop(name) < 1.0
         assert draw == without
 
 
 @pytest.mark.parametrize("kind", ["random", "latin-hypercube", "sobol"])
 def test_appended_block_keeps_earlier_cases(campaign_file: CampaignFile, kind: str) -> None:
-    before = load(campaign_file, kind, 33, nominal=True)
-    after = load(campaign_file, kind, 33, nominal=True, more="appended = [16, 8]")
+    before = load_design(campaign_file, kind, 33, nominal=True)
+    after = load_design(campaign_file, kind, 33, nominal=True, more="appended = [16, 8]")
     assert after.configuration.total_cases == 57
     assert [after.draws(case) for case in range(33)] == [before.draws(case) for case in range(33)]
     points = read_probabilities(after, range(1, 57))
@@ -150,14 +150,14 @@ def test_appended_block_keeps_earlier_cases(campaign_file: CampaignFile, kind: s
 
 
 def test_latin_hypercube_depends_on_the_number_of_cases(campaign_file: CampaignFile) -> None:
-    small, large = (load(campaign_file, "latin-hypercube", cases) for cases in (10, 11))
+    small, large = (load_design(campaign_file, "latin-hypercube", cases) for cases in (10, 11))
     assert small.draws(3) != large.draws(3)
-    assert load(campaign_file, "random", 10).draws(3) == load(campaign_file, "random", 11).draws(3)
+    assert load_design(campaign_file, "random", 10).draws(3) == load_design(campaign_file, "random", 11).draws(3)
 
 
 def test_grid_is_a_full_factorial_in_all_designs(campaign_file: CampaignFile) -> None:
     for kind in ("random", "latin-hypercube", "sobol"):
-        campaign = load(campaign_file, kind, 48, dispersions=DISPERSIONS + GRID)
+        campaign = load_design(campaign_file, kind, 48, dispersions=DISPERSIONS + GRID)
         draws = [campaign.draws(case) for case in range(48)]
         points = [(draw["terrain"], draw["error_scale"]) for draw in draws]
         assert points[:6] == [(0.0, 0.5), (0.0, 2.0), (3.0, 0.5), (3.0, 2.0), (6.0, 0.5), (6.0, 2.0)]
@@ -172,7 +172,7 @@ def test_nominal_case_uses_no_draws(campaign_file: CampaignFile) -> None:
     derived = 'altitude_m = {distribution = "derived", formula = "1000 + 100 * heights_m[1]"}\n'
     fixed = 'lowest_altitude_m = {distribution = "fixed", value = 7.0}\n'
     text = DISPERSIONS + GRID + derived + fixed
-    campaign = load(campaign_file, "random", 7, dispersions=text, nominal=True)
+    campaign = load_design(campaign_file, "random", 7, dispersions=text, nominal=True)
     assert campaign.probabilities(0) is None
     nominal = campaign.parameters(0).model_dump()
     assert nominal["wind"] == {"east_m_s": 0.0, "north_m_s": 0.0}
@@ -198,5 +198,5 @@ def test_invalid_designs_are_rejected(
     campaign_file: CampaignFile, kind: str, cases: int, more: dict[str, object], message: str
 ) -> None:
     with pytest.raises(ConfigurationError) as raised:
-        load(campaign_file, kind, cases, **more)  # type: ignore[arg-type]
+        load_design(campaign_file, kind, cases, **more)  # type: ignore[arg-type]
     assert message in str(raised.value)
