@@ -26,7 +26,7 @@ PICTURES, SIDE_PX = 3, 1024
 SPLINES = 2
 #: Mean electrons of a pixel; above about ten, the cost of a Poisson number does not depend on the mean.
 ELECTRONS = 3e4
-#: Calls of libraries in cases.
+#: Library calls in cases.
 CALLS: Stages = {
     "triangles drawn and read back by OpenGL": (("render/backend.py", "draw"),),
     "transforms of DIMES' correlations": (("image/correlation.py", "cross_sums"),),
@@ -34,7 +34,7 @@ CALLS: Stages = {
 
 
 def bounds(run_case: Callable[[], object], repeats: int) -> list[Figure]:
-    """Lower bounds of the parts of a case, core-seconds, and their sum."""
+    """Lower bounds of the parts of a case and their sum, in core-seconds."""
     calls = profiled(run_case, repeats, CALLS)
     parts = {
         "splines where rays meet the ground and are shaded": core_seconds(_splines(), repeats),

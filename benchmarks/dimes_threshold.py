@@ -19,10 +19,10 @@ from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.reports.statistics.samples import quantile_bounds
 
 STORED = Path(options.__file__).with_name("imu_threshold.json")
-#: Raised when the derivation changes in a way that its inputs do not tell.
+#: Increased if the derivation changes without a change of its inputs.
 VERSION = 1
 QUANTILES = (0.5, 0.9, 0.95, 0.99, 0.995, 0.999)
-#: How wrong the wrong track is, m/s, between two bounds: at the bar itself, and anywhere up to the search range.
+#: Range of the velocity error of the wrong track, m/s: minimum error, and errors up to the search range.
 WRONG_BY_M_S = ((10.0, 10.0), (10.0, 60.0))
 
 

@@ -16,7 +16,7 @@ from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator, V
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.sim.measurements import DescentMeasurements
 
-#: By name: what is compared.
+#: Compared estimators, by name.
 ESTIMATORS: Mapping[str, VelocityEstimator] = {
     "DIMES": DimesEstimator(),
     "DIMES, peaks by a quadric alone": DimesEstimator(DimesOptions(align=False)),
@@ -24,7 +24,7 @@ ESTIMATORS: Mapping[str, VelocityEstimator] = {
     "OpenCV's phase correlation": PhaseCorrelationEstimator(),
     "OpenCV's ORB and homography": HomographyEstimator(),
 }
-#: Runs of each estimate, of which the fastest counts: others on the machine make it slower, never faster.
+#: Runs of each estimate; the fastest counts, because other programs only add time.
 REPEATS = 3
 
 

@@ -1,8 +1,7 @@
 """Growth of costs with size: ``python -m benchmarks.growth`` draws docs/images/growth.svg.
 
-Frame over pixels and over triangles, case over the terrain's size, campaign over cases and workers (light ones, as
-many as a cluster's would be here, and by Dask), report over cases. Core-seconds, but for workers: what they are for
-is wall-clock time.
+Frame over pixels and triangles, case over terrain size, campaign over cases and workers (local workers and Dask, with
+cases that wait), report over cases. Core-seconds; wall-clock time for the number of workers.
 """
 
 from __future__ import annotations
@@ -50,10 +49,12 @@ class Curve:
 
     Attributes
     ----------
-    name, size, cost
-        Of the curve, and of its axes with their units.
+    name
+        Name of the curve.
+    size, cost
+        Labels of the axes with units.
     points
-        (size, cost) each.
+        Pairs (size, cost).
     """
 
     name: str
@@ -69,7 +70,7 @@ class Curve:
 
 
 class LightScenario(BusyScenario):
-    """Wait without computing: with more workers than cores the time is the engine's, not the cores'."""
+    """Wait without computing, so that the number of cores does not limit the number of workers."""
 
     name = "light"
 
@@ -110,7 +111,7 @@ def _frames_of_meshes(lines: Sequence[int]) -> list[tuple[float, float]]:
     renderer = process_renderer(default_backend())
     found = []
     for count in lines:
-        # as far as the frame's own mesh reaches, with lines further apart where they are fewer
+        # same extent as the default mesh, with wider spacing for fewer lines
         finest = scene.mesh_finest_m * (scene.mesh_lines - 1) / (count - 1)
         of_count = replace(scene, mesh_lines=count, mesh_finest_m=finest)
         cost = _minimum(partial(renderer.render, of_count, rays, pose))
@@ -122,7 +123,7 @@ def _cases_over_terrains(samples: Sequence[int]) -> list[tuple[float, float]]:
     found = []
     for count in samples:
         campaign = load_campaign("dimes-smoke", [f"terrain.samples={count}", "retain.showcase=none"])
-        # one case again and again: cases differ by more than terrains do
+        # always the same case, because run times differ between cases
         parameters = campaign.with_values({**campaign.draws(0), "location.terrain": 0})
         run = partial(campaign.scenario.run, parameters, campaign.streams(0))
         found.append((float(count**2), _minimum(run)))
@@ -166,7 +167,7 @@ def _minimum(run: Callable[[], object]) -> float:
 
 
 def drawn(found: Sequence[Curve]) -> Figure:
-    """One panel per curve, logarithmic axes with at least a decade of cost, so that slow growth looks slow."""
+    """Draw one panel per curve, with logarithmic axes that span at least one decade of cost."""
     figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     panels = figure.subplots(2, 4).ravel()
     for axes, curve in zip(panels, found, strict=False):

@@ -22,7 +22,7 @@ from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DetectorCalibration, DetectorImage, LandingMeasurements, PoseMeasurement
 
-#: The XC-55's picture. A block of 73 px gives about the paper's 59 tracks, a grid of 20 px its 600 structure pixels.
+#: XC-55 camera. Blocks of 73 px give about 59 tracks and a grid of 20 px gives 600 points, as in the paper.
 CAMERA = Cahv.from_focal_length(0.006, 7.4e-6, (640, 480), axis=(0.0, 0.0, -1.0), right=(0.0, -1.0, 0.0))
 PAPER = HdaOptions(block_px=73, grid_px=20)
 #: 160 x 120 structure pixels.
@@ -31,7 +31,7 @@ TEXEL_M = 0.005
 
 
 def measurements() -> LandingMeasurements:
-    """Two pictures of textured level ground from 10 m, 0.36 m apart."""
+    """Two images of textured level ground from a height of 10 m with a baseline of 0.36 m."""
     values = np.random.default_rng(1).standard_normal((2400, 2400)).astype(np.float32)
     texture = sum(
         sigma * ndimage.gaussian_filter(values, sigma, mode="wrap", truncate=3.0) * sigma**0.5 for sigma in (4, 12, 36)

@@ -99,7 +99,7 @@ def rover_pictures(repeats: int) -> list[Figure]:
     ]
 
 
-#: Pictures of each scene of the memory's measurement, and of how many scenes one has rocks.
+#: Images per scene in the measurement of memory; one of `ROCKY_OF` scenes has rocks.
 PICTURES_OF_A_SCENE, ROCKY_OF = 5, 4
 
 
@@ -125,7 +125,7 @@ def memory(frames: int) -> list[Figure]:
             renderer.render(scene, optics.rays, nadir_pose(ground, east, 0.0, 2000.0 - 150.0 * picture))
             sizes.append(used_memory([os.getpid()]) / 1e9)
     quarter = len(sizes) // 4
-    # medians: what a scene with rocks takes while it is loaded depends on its rocks
+    # medians, because the memory of scenes with rocks varies
     growth = float(np.median(sizes[-quarter:]) - np.median(sizes[quarter : 2 * quarter]))
     return [
         Figure(f"own memory, most over {len(sizes)} frames of {scenes} scenes, GB", [max(sizes)], bar=1.2),

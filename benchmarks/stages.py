@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 from benchmarks.timing import Figure
 
-#: Stages by their functions: the end of the file's name, and the function. What a stage calls counts as its own.
+#: Functions of each stage, as end of the file name and function name; callees are included.
 Stages = Mapping[str, tuple[tuple[str, str], ...]]
 STAGES: Stages = {
     "terrain, its rocks": (("descent/world.py", "of"), ("descent/world.py", "scene")),
@@ -28,7 +28,7 @@ STAGES: Stages = {
     "feasible overlap": (("descent/score.py", "feasible_overlap_row"),),
 }
 
-#: What belongs to no stage.
+#: Name of the remainder.
 REST = "all else"
 
 

@@ -1,4 +1,4 @@
-"""The bars on campaigns: rows that do not depend on how they were run, and algorithms that do their worst."""
+"""Checks of campaigns: rows do not depend on the executor or on interruptions, and misbehaving cases are isolated."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ case_time_s = 6
 memory_gb = 0.4
 """
 
-#: Seconds between kills, drawn evenly: from before the first row to well into the cases.
+#: Minimum and maximum of the uniform time between kills, seconds.
 KILLED_AFTER_S = (0.2, 6.0)
 
 
 class Silence:
-    """A watch that says nothing."""
+    """A progress watch without output."""
 
     def begin(self, stage: str, total: int) -> None:
         pass
@@ -50,7 +50,7 @@ class Silence:
 
 
 def same_rows(quick: bool) -> Iterator[Measure]:
-    """Rows of campaigns run in every way, against those of one worker: cases that misbehave, and rendered ones."""
+    """Compare rows of all ways to run a campaign with rows of one worker, for misbehaving and rendered cases."""
     share, cases, kills = (0.03, 60, 3) if quick else (0.03, 400, 10)
     with TemporaryDirectory() as name:
         folder = Path(name)
@@ -82,7 +82,7 @@ def _in_every_way(campaign: str, folder: Path, settings: Sequence[str], kills: i
 
 
 def survival(quick: bool) -> Iterator[Measure]:
-    """An algorithm that misbehaves at random, next to one that does not."""
+    """Compare a campaign with randomly misbehaving cases with an undisturbed one."""
     cases, share = (60, 0.15) if quick else (400, 0.03)
     with TemporaryDirectory() as name:
         folder = Path(name)
@@ -131,7 +131,7 @@ def _rows_of(
 
 
 def _killed(campaign: str, directory: Path, settings: Sequence[str], kills: int) -> list[dict[str, Any]]:
-    """The rows of a campaign whose runner is killed at random moments, and resumed each time."""
+    """Rows of a campaign that is killed at random times and resumed each time."""
     rng = np.random.default_rng(7)
     program = [sys.executable, "-m", "marsyard"]
     command = [*program, "run", campaign, "--out", str(directory), "--jobs", "2"]
@@ -144,7 +144,7 @@ def _killed(campaign: str, directory: Path, settings: Sequence[str], kills: int)
         runner.kill()
         runner.wait()
         command = [*program, "resume", str(directory), "--jobs", "2", "--allow-changed"]
-    # cases crash, as they are to: status 1
+    # exit status 1 because some cases crash
     subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
     return read_rows(directory / "cases.parquet")
 

@@ -1,4 +1,4 @@
-"""The bars on DIMES' IMU check, and DIMES next to ready-made registration on the same descents."""
+"""Checks of DIMES' IMU check, and comparison of DIMES with standard registration methods on the same descents."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ REQUIREMENT_M_S = 5.0
 
 
 def imu_check(quick: bool) -> Iterator[Measure]:
-    """The threshold against a second implementation of the Monte Carlo from which it was derived."""
+    """Compare the threshold with a second implementation of its Monte Carlo derivation."""
     inputs, descents = ThresholdInputs(), 300 if quick else 3000
     rng = np.random.default_rng(SEED)
     reference = Reference.drawn(inputs, descents, rng)
     threshold = DimesOptions().imu_threshold_m_s
     single = reference.single()
     how = f"{descents} descents of a second implementation by first-order propagation; threshold {threshold:g} m/s"
-    # bars: three standard errors of the quantiles of so many draws, sqrt(q (1 - q) / n) over density and quantile; the
-    # density times the quantile is 0.44 at the median and 0.03 at 99.5 %
+    # bounds: three standard errors of the quantiles, sqrt(q (1 - q) / n) divided by density times quantile, which is
+    # 0.44 at the median and 0.03 at 99.5 %
     median = float(np.median(single)) / _stored_median_m_s() - 1.0
     bar = 3.4 / math.sqrt(descents)
     yield Measure("right tracks' discrepancy, median, from the stored derivation's", abs(median), "", bar, how)
@@ -57,7 +57,7 @@ def imu_check(quick: bool) -> Iterator[Measure]:
 
 
 def _stored_median_m_s() -> float:
-    """Median discrepancy of one right track in each pair, as the threshold's derivation found it."""
+    """Median discrepancy of one correct track in each pair, from the stored derivation."""
     quantiles = json.loads(STORED.read_text())["discrepancy_quantiles_m_s"]
     return float(quantiles["one right track in each pair"]["0.5"])
 

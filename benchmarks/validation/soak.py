@@ -1,4 +1,4 @@
-"""A campaign of cases that misbehave in every way, killed and resumed, against an undisturbed one of healthy cases."""
+"""Soak test: a campaign with misbehaving cases, killed and resumed, compared with an undisturbed campaign."""
 
 from __future__ import annotations
 
@@ -41,34 +41,34 @@ confidence = 0.9
 population = "all"
 """
 
-#: Variable in the environment of the runner, by which the processes that it starts are found.
+#: Environment variable that marks the processes of the campaign.
 _MARK = "MARSYARD_SOAK"
 
-#: Seconds that the whole may take for each case; it takes a tenth of that where nothing waits for ever.
+#: Maximum time per case, seconds; normally it takes a tenth of this.
 _GUARD_S = 20.0
 
-#: Seconds for processes to go once their runner was killed.
+#: Maximum time until processes of a killed campaign have ended, seconds.
 _GOING_S = 10.0
 
 
 @dataclass(frozen=True)
 class Soak:
-    """What came of a soak.
+    """Result of a soak test.
 
     Attributes
     ----------
     kills
-        How often the runner was killed before it had ended.
+        Number of kills before the end of a run.
     ended
-        Whether the last runner ended by itself.
+        Whether the last run ended by itself.
     seconds
-        That the whole took.
+        Duration of all runs.
     deeds
-        What each case did; empty where it was healthy.
+        Fault of each case; empty for healthy cases.
     wrong_outcomes, changed
-        Cases with another outcome than their deed's; cases that answered with another row than the undisturbed ones.
+        Cases with an unexpected outcome; valid cases whose row differs from the undisturbed campaign.
     processes, files
-        Processes alive, and temporary files there, once the last runner had ended.
+        Remaining processes and temporary files after the last run.
     """
 
     kills: int
@@ -82,16 +82,16 @@ class Soak:
 
 
 def soak(folder: Path, cases: int, kills: int, misbehaving: float, killed_after_s: tuple[float, float]) -> Soak:
-    """Runs the campaign in a folder.
+    """Run the soak test in a folder.
 
     Parameters
     ----------
     folder
-        An empty one.
+        Empty folder.
     cases, misbehaving
-        How many cases, and the fraction of them that misbehave.
+        Number of cases, and fraction of misbehaving cases.
     kills, killed_after_s
-        How often the runner is killed, and after how long: drawn evenly between two times.
+        Number of kills, and minimum and maximum of the uniform time before each kill.
     """
     temporary = folder / "tmp"
     temporary.mkdir()
@@ -139,7 +139,7 @@ def _command(folder: Path, name: str, misbehaving: float | None) -> list[str]:
 
 
 def _run(folder: Path, name: str, misbehaving: float | None, environment: Mapping[str, str], cases: int) -> int:
-    """Exit status of a runner that is left alone; it ends with 1 where cases did not come to their end."""
+    """Exit status of an uninterrupted run; 1 if cases did not finish."""
     silent = subprocess.DEVNULL
     command = _command(folder, name, misbehaving)
     return subprocess.run(
@@ -150,7 +150,7 @@ def _run(folder: Path, name: str, misbehaving: float | None, environment: Mappin
 def _killed(
     folder: Path, misbehaving: float, kills: int, after_s: tuple[float, float], environment: Mapping[str, str]
 ) -> int:
-    """Runs and resumes the campaign, killing each runner; returns how many had not ended by themselves."""
+    """Run and resume the campaign, killing each run; return the number of runs killed before their end."""
     rng = np.random.default_rng(21)
     killed = 0
     for number in range(kills):
@@ -166,7 +166,7 @@ def _killed(
 
 
 def _processes(folder: Path) -> list[int]:
-    """Processes that live and were started by a runner of the soak, or by one of those."""
+    """Ids of living processes that carry the mark of the soak test."""
     mark = f"{_MARK}={folder}".encode()
     found = []
     for process in Path("/proc").glob("[1-9]*"):
@@ -183,7 +183,7 @@ def _deed(campaign: Any, case: int) -> str:
 
 
 def isolation(quick: bool) -> Iterator[Measure]:
-    """Cases that misbehave in every way among healthy ones; the runner killed three times, and resumed."""
+    """Run the soak test with misbehaving and healthy cases, and compare it with healthy cases."""
     cases, kills, share = (60, 1, 0.4) if quick else (300, 3, 0.4)
     with TemporaryDirectory() as name:
         found = soak(Path(name), cases, kills, share, (5.0, 40.0))

@@ -1,4 +1,4 @@
-"""The bars on statistics: coverage of every interval, error rates of the sequential stop, alarms of the nightly."""
+"""Checks of statistics: coverage of intervals, error rates of sequential stopping, false alarms of nightly runs."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from marsyard.reports.statistics.proportions import (
 from marsyard.reports.statistics.samples import error_ellipse, mean_interval, quantile_bounds, spread_interval
 
 CONFIDENCE = 0.9
-#: Cases on a terrain, and what is asked and risked in simulated campaigns.
+#: Cases per terrain.
 _ON_TERRAIN = 8
 
 
 def _min_coverage(nominal: float, trials: int) -> float:
-    """Bound on a simulated coverage: the nominal one less three standard deviations of the simulation."""
+    """Bound of a simulated coverage: nominal coverage minus three standard deviations of the simulation."""
     return nominal - 3.0 * math.sqrt(nominal * (1.0 - nominal) / trials)
 
 
@@ -77,7 +77,7 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
 
 
 def _cases(rng: np.random.Generator, rate: float, correlation: float, terrains: int) -> tuple[np.ndarray, np.ndarray]:
-    """Successes on terrains whose own rates are beta distributed."""
+    """Draw successes on terrains with beta-distributed rates."""
     weight = (1.0 - correlation) / correlation
     rates = rng.beta(rate * weight, (1.0 - rate) * weight, terrains)
     terrain = np.repeat(np.arange(terrains), _ON_TERRAIN)
@@ -119,14 +119,14 @@ def run_shared(quick: bool) -> Iterator[Measure]:
 
 
 def _errors(rng: np.random.Generator, correlation: float, terrains: int) -> tuple[np.ndarray, np.ndarray]:
-    """Standard normal errors, alike on a terrain, and the terrain of each."""
+    """Draw standard normal errors that are correlated within a terrain, and their terrains."""
     terrain = np.repeat(np.arange(terrains), rng.integers(1, 15, terrains))
     shared, own = rng.normal(size=terrains)[terrain], rng.normal(size=terrain.size)
     return math.sqrt(correlation) * shared + math.sqrt(1.0 - correlation) * own, terrain
 
 
 def _covered(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, float]) -> dict[str, tuple[bool, ...]]:
-    """Whether each interval holds the truth; of the quantile the lower and the upper bound apart."""
+    """Whether each interval contains the true value; the bounds of the quantile are separate."""
     lower, upper = quantile_bounds(errors, 0.95, CONFIDENCE, terrain)
     covered: dict[str, tuple[bool, ...]] = {
         "95 % quantile": (lower <= truths["95 % quantile"], upper >= truths["95 % quantile"])
@@ -138,7 +138,7 @@ def _covered(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, float]) 
 
 
 def run_sequential(quick: bool) -> Iterator[Measure]:
-    """Error rates of campaigns that stop themselves, at the rate asked, where every verdict is wrong one way."""
+    """Error rates of adaptive campaigns whose true rate equals the required rate, so that every verdict is false."""
     trials = 300 if quick else 2000
     rng = np.random.default_rng(3)
     for asked, max_cases in ((0.9, 512), (0.99, 1000)):
@@ -152,7 +152,7 @@ def run_sequential(quick: bool) -> Iterator[Measure]:
 
 
 def _decided(rng: np.random.Generator, asked: float, max_cases: int, correlation: float | None) -> tuple[bool, bool]:
-    """Whether the first look at a campaign that decides its requirement finds it met, and whether not met."""
+    """Simulate a campaign; return whether its first deciding look gives PASS, and whether FAIL."""
     if correlation is None:
         success, terrain = rng.random(max_cases) < asked, np.arange(max_cases)
     else:
@@ -173,7 +173,7 @@ def _decided(rng: np.random.Generator, asked: float, max_cases: int, correlation
 
 
 def run_nights(quick: bool) -> Iterator[Measure]:
-    """False alarms of nights in which nothing changed, and regressions found where one was planted."""
+    """False alarms of nights without a change, and detection of planted regressions."""
     in_a_row, planted = (100, 100) if quick else (2000, 1000)
     alarms = quiet_nights(in_a_row, seed=4)
     what = f"three campaigns of {CASES} cases: {', '.join(KINDS)}"

@@ -1,4 +1,4 @@
-"""The bars on target tracking over rendered rocks: drift without noise, and stereo's range error."""
+"""Checks of target tracking on rendered rocks: drift without noise, and range error of stereo."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from marsyard.sim.streams import Streams
 
 SEED = 20061108
 DRIFT_RMS_BAR_PX, DRIFT_WORST_BAR_PX, RANGE_BAR = 1.0, 2.5, 0.15
-#: Fraction of targets that may be lost: 2 of 100 were when it was set, and three deviations of that number are 4 more.
+#: Maximum fraction of lost targets: 2 of 100 measured, plus three standard deviations (4).
 LOST_BAR = 0.06
 CAMERAS = ("research-navcam", "research-pancam")
-#: No detector noise, calibrated cameras and mast as they are.
+#: Parameters without errors of cameras, mast and odometry.
 NO_ERRORS: dict[str, Any] = {
     "stereo": dict.fromkeys(
         ("disparity_error_px", "epipolar_error_px", "alignment_deg", "roll_deg", "focal_error"), 0.0
@@ -43,21 +43,21 @@ def exact(number: int, camera: str) -> RoverScenarioParameters:
     return RoverScenarioParameters.model_validate(
         stated
         | NO_ERRORS
-        # visual odometry without errors sees the slip; it takes no time, so that the sun moves as in the campaign
+        # error-free visual odometry measures the slip; it takes no time, so that the sun moves as in the campaign
         | {"legs": [leg | {"visual_odometry": True}], "timing": stated["timing"] | {"visual_odometry_s": 0.0}}
         | {"camera": stated["camera"] | {"detector_noise": False}}
     )
 
 
 def driven(number: int, camera: str) -> dict[str, Scalar]:
-    """Its row."""
+    """Row of a run without errors."""
     p = exact(number, camera)
     run = run_case(p, Streams(SEED, "validation tracking", number))
     return {**score(p, run), **fixed_conditions(p, run), **run_conditions(p, run)}
 
 
 def drift(quick: bool) -> Iterator[Measure]:
-    """Drift at 2 m of targets that operators would have chosen, designated at 10 m."""
+    """Drift at 2 m of selectable targets (unoccluded and lit) that are designated at 10 m."""
     wanted = 3 if quick else 50
     found: list[dict[str, Scalar]] = []
     for camera in CAMERAS:
@@ -86,7 +86,7 @@ def _drifts(rows: list[dict[str, Scalar]], name: str, *, judged: bool) -> Iterat
 
 
 def _lost(claim: str, lost: int, cases: int, how: str) -> Measure:
-    """A row on how many cases a check loses, which its other figures leave out; a single case may always be lost."""
+    """Row of the fraction of lost cases, which other figures exclude; one lost case is always allowed."""
     return Measure(claim, lost / cases, "", max(LOST_BAR, 1.0 / cases), how)
 
 
@@ -95,7 +95,7 @@ def _sun_moved_deg(rows: list[dict[str, Scalar]]) -> float:
 
 
 def stereo(quick: bool) -> Iterator[Measure]:
-    """Range error of the first pair at 10 m over Eq. 1's, for the disparity errors that the pairs had."""
+    """Ratio of the range error of the first pair at 10 m to Eq. 1 with the true disparity errors."""
     for camera in CAMERAS:
         rows = [_designated(number, camera) for number in range(10 if quick else 60)]
         pairs = [row for row in rows if row is not None]
@@ -111,12 +111,12 @@ def stereo(quick: bool) -> Iterator[Measure]:
 
 
 def _designated(number: int, camera: str) -> tuple[float, float] | None:
-    """A first pair's range error (NaN where the target is not found) and Eq. 1's for its disparity error, metres.
+    """Range error of a first pair (NaN if the target is not found) and its value from Eq. 1, metres.
 
-    None where the target is not one that operators would have chosen.
+    None if the target is not selectable.
     """
     campaign = load_campaign("vtt-accuracy")
-    # the template shows the rock alone: over a small rock's edge it shows the ground a metre behind it too
+    # large rock: the template contains only the rock and no ground behind it
     rock = {"target.diameter_m": 1.5, "target.up": 0.5, "camera.preset": camera, "world.terrain": number % 8}
     drawn = campaign.with_values(campaign.draws(number) | rock)
     p = RoverScenarioParameters.model_validate(drawn.model_dump() | {"legs": [{"motion": "stay", "steps": 1}]})
@@ -129,7 +129,7 @@ def _designated(number: int, camera: str) -> tuple[float, float] | None:
 
 
 def _range_error_m(run: Run) -> float:
-    """The first reported position less the designated point along the line of sight."""
+    """First reported position minus the designated point, along the line of sight."""
     stop = run.stops[0]
     eye = stop.stance.world_from_rover.inv().apply(run.rig.eyes(stop.world_from_head)[0])
     sight = (stop.point_rover - eye) / np.linalg.norm(stop.point_rover - eye)

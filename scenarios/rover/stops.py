@@ -1,4 +1,4 @@
-"""Stops of a run: stereo subframes through the true cameras, poses, and the tracker's answer at each; choice of the target."""
+"""Stops of a run: stereo subframes through the true cameras, poses, and the tracker's answer; choice of the target."""
 
 from __future__ import annotations
 
