@@ -20,7 +20,7 @@ import numpy as np
 SIDE_PX, SAMPLES = 1024, 16
 
 
-def prepared(given: Mapping[str, Any]) -> Callable[[], object]:
+def prepare_frame(given: Mapping[str, Any]) -> Callable[[], object]:
     """Return a function that renders a frame."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
@@ -56,7 +56,7 @@ def prepared(given: Mapping[str, Any]) -> Callable[[], object]:
 def main(file: Path, repeats: int) -> None:
     """Render the frames and print their core-seconds."""
     with np.load(file) as stored:
-        draw = prepared({name: stored[name] for name in stored.files})
+        draw = prepare_frame({name: stored[name] for name in stored.files})
     draw()
     times = []
     for _ in range(repeats):

@@ -26,7 +26,7 @@ QUANTILES = (0.5, 0.9, 0.95, 0.99, 0.995, 0.999)
 WRONG_BY_M_S = ((10.0, 10.0), (10.0, 60.0))
 
 
-def derived(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
+def derive_threshold(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
     """Threshold, distribution of discrepancies, and effect of the check on one wrong track."""
     rng = np.random.default_rng(inputs.seed)
     errors = derivation.right_track_errors(inputs, rng)
@@ -67,7 +67,7 @@ def _quantiles(values: np.ndarray) -> dict[str, float]:
 
 
 def main() -> None:
-    record = derived(derivation.ThresholdInputs())
+    record = derive_threshold(derivation.ThresholdInputs())
     STORED.write_text(json.dumps(record, indent=1) + "\n")
     print(json.dumps(record, indent=1))
     print(f"kept in {STORED}; the option's default is {DimesOptions().imu_threshold_m_s} m/s")

@@ -73,7 +73,7 @@ class Tried:
         return self.errors_m_s[np.isfinite(self.errors_m_s)]
 
 
-def tried(estimator: VelocityEstimator, descents: list[Descent]) -> Tried:
+def run_estimator(estimator: VelocityEstimator, descents: list[Descent]) -> Tried:
     """Run an estimator on descents."""
     errors, seconds = [], []
     for descent in descents:
@@ -93,6 +93,6 @@ def side_by_side(cases: int) -> list[Figure]:
     descents = recorded("dimes-smoke", cases)
     bars = {"DIMES": 0.015}
     return [
-        Figure(f"a triple: {name}", tried(estimator, descents).seconds.tolist(), bar=bars.get(name))
+        Figure(f"a triple: {name}", run_estimator(estimator, descents).seconds.tolist(), bar=bars.get(name))
         for name, estimator in ESTIMATORS.items()
     ]

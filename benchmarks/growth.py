@@ -100,7 +100,7 @@ def _frames_of_sizes(sides: Sequence[int]) -> list[tuple[float, float]]:
     found = []
     for side in sides:
         corner = (camera.size[0] - side) // 2
-        rays = PixelRays.of(camera.cropped(corner, corner, (side, side)))
+        rays = PixelRays.of(camera.crop(corner, corner, (side, side)))
         found.append((float(side**2), _minimum(partial(renderer.render, scene, rays, pose))))
     return found
 
@@ -166,7 +166,7 @@ def _minimum(run: Callable[[], object]) -> float:
     return min(core_seconds(run, 3))
 
 
-def drawn(found: Sequence[Curve]) -> Figure:
+def draw(found: Sequence[Curve]) -> Figure:
     """Draw one panel per curve, with logarithmic axes that span at least one decade of cost."""
     figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     panels = figure.subplots(2, 4).ravel()
@@ -201,7 +201,7 @@ def main() -> None:
         print(f"{curve.name:<32}{points} {curve.cost}; size^{curve.power:.2f} at the end")
     KEPT.parent.mkdir(exist_ok=True)
     KEPT.write_text(json.dumps([asdict(curve) for curve in found], indent=1) + "\n")
-    drawn(found).savefig(FIGURE, metadata={"Date": None})
+    draw(found).savefig(FIGURE, metadata={"Date": None})
     print(f"kept in {KEPT}, drawn as {FIGURE}")
 
 

@@ -53,7 +53,7 @@ def measurements() -> LandingMeasurements:
 
 
 def _picture(texture: np.ndarray, pose: RigidTransform) -> np.ndarray:
-    camera = CAMERA.moved(pose)
+    camera = CAMERA.transform(pose)
     rays = camera.rays(camera.pixel_grid())[1]
     ground = camera.c[:2] - camera.c[2] * rays[..., :2] / rays[..., 2:]
     places = (ground / TEXEL_M + 1200.0).astype(np.float32)

@@ -44,7 +44,7 @@ def descent_exposure() -> Callable[[], object]:
     optics = camera_optics(CameraParameters())
     renderer = process_renderer(default_backend())
     pose = descent_pose(surface)
-    detector = Detector.drawn(optics.fall_off, DetectorParameters(), np.random.default_rng(0))
+    detector = Detector.draw(optics.fall_off, DetectorParameters(), np.random.default_rng(0))
     return lambda: detector.expose(renderer.render(scene, optics.rays, pose).radiance, np.random.default_rng(0))
 
 
@@ -83,7 +83,7 @@ def rover_pictures(repeats: int) -> list[Figure]:
         right=np.array([1.0, 0.0, 0.0]),
     )
     navcam = Cahvor.from_cahv(pinhole, r=np.array([0.00096, -0.002183, 0.018547]))
-    full, small = PixelRays.of(navcam), PixelRays.of(navcam.cropped(430, 560, (161, 161)))
+    full, small = PixelRays.of(navcam), PixelRays.of(navcam.crop(430, 560, (161, 161)))
     eye = np.array([50.0, 50.0, float(surface.height(50.0, 50.0)) + 1.5])
     looking = Rotation.from_euler("x", -18.0, degrees=True)
     left, right = rigid(looking, eye), rigid(looking, eye + np.array([0.2, 0.0, 0.0]))

@@ -49,7 +49,7 @@ def figures(cases: int = 1_000_000, campaigns: int = 1_000) -> list[Figure]:
         fresh = marsyard("dashboard", str(site.parent / "runs"), "--out", str(site))
         again = marsyard("dashboard", str(site.parent / "runs"), "--out", str(site))
         index = site / "index.html"
-        shown, filtered = opened(page, hover_a_case), opened(index, filter_campaigns)
+        shown, filtered = time_page(page, hover_a_case), time_page(index, filter_campaigns)
         return [
             Figure(f"report of {cases:,} cases", [of_large.core_s], bar=30.0),
             Figure(f"report of {cases:,} cases: memory (GB)", [of_large.memory_gb], bar=2.0),
@@ -164,7 +164,7 @@ print(json.dumps([os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_sti
 """
 
 
-def opened(path: Path, done: Callable[[Page], None], repeats: int = 5) -> list[float]:
+def time_page(path: Path, done: Callable[[Page], None], repeats: int = 5) -> list[float]:
     """Time from opening a page in Debian's Chromium to the end of an action."""
     browser = next((found for name in ("chromium", "chromium-browser") if (found := shutil.which(name))), None)
     times = []

@@ -37,11 +37,11 @@ def stages(run: Callable[[], object], repeats: int) -> list[Figure]:
 
     Python's profiler slows stages with many small calls (flight, instruments) by up to a half.
     """
-    found = profiled(run, repeats, STAGES)
+    found = profile_stages(run, repeats, STAGES)
     return [Figure(f"  of a case, profiled: {name}", values) for name, values in found.items()]
 
 
-def profiled(run: Callable[[], object], repeats: int, stages: Stages) -> dict[str, list[float]]:
+def profile_stages(run: Callable[[], object], repeats: int, stages: Stages) -> dict[str, list[float]]:
     """The same as `stages` for given stages, by name."""
     run()
     found: dict[str, list[float]] = {name: [] for name in (*stages, REST)}

@@ -127,13 +127,13 @@ def _descent_errors(
             return None
         heights = inputs.feature_height_sd_m * rng.standard_normal(2)
         moved = velocity * inputs.interval_s
-        pixels = _seen_again(true[pair], true[pair + 1], places.pixels[chosen], heights, moved)
+        pixels = _project_again(true[pair], true[pair + 1], places.pixels[chosen], heights, moved)
         ground, _ = ground_from_pixels(second, pixels, options.max_off_nadir_rad)
         errors[pair] = (places.ground[chosen] - ground - moved) / inputs.interval_s
     return np.asarray(errors + inputs.match_sd_m_s * rng.standard_normal((2, 2, 2)))
 
 
-def _seen_again(
+def _project_again(
     first: View,
     second: View,
     pixels: Float[np.ndarray, "n 2"],
@@ -174,7 +174,7 @@ def _attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotation:
 
 def _view(camera: CameraModel, attitude: Rotation, altitude_m: float, time_s: float) -> View:
     centre = np.array([0.0, 0.0, altitude_m])
-    return View(_NOTHING, _NOTHING, camera.moved(rigid(attitude, centre)), centre, time_s, _UNUSED, 1)
+    return View(_NOTHING, _NOTHING, camera.transform(rigid(attitude, centre)), centre, time_s, _UNUSED, 1)
 
 
 def _direction(rng: np.random.Generator) -> Float[np.ndarray, "2"]:

@@ -17,7 +17,7 @@ class StoreError(CampaignError):
 
 
 @contextmanager
-def writing(what: object) -> Iterator[None]:
+def report_write_errors(what: object) -> Iterator[None]:
     """Raise StoreError that names `what` where the system refuses to write it inside the context."""
     try:
         yield
@@ -53,7 +53,7 @@ def near_match(word: str, allowed: Iterable[str]) -> str:
     return f" (did you mean '{matches[0]}'?)" if matches else ""
 
 
-def not_allowed(what: str, word: str, allowed: Iterable[str], listed_only: Iterable[str] | None = None) -> str:
+def unknown_name_message(what: str, word: str, allowed: Iterable[str], listed_only: Iterable[str] | None = None) -> str:
     """Message that a word is unknown, with a similar word and the allowed ones, or those of `listed_only`."""
     known = sorted(allowed)
     listed = ", ".join(known if listed_only is None else sorted(listed_only)) or "none"

@@ -114,10 +114,10 @@ def results(directory: str | Path) -> pd.DataFrame:
 def verdicts(directory: str | Path) -> Sequence[Verdict]:
     """Evaluate the requirements of a finished campaign."""
     from marsyard.campaigns.store.table import refresh_table
-    from marsyard.reports.evaluation import judged
+    from marsyard.reports.evaluation import evaluate_run
 
     refresh_table(Path(directory))
-    return judged(Path(directory)).verdicts
+    return evaluate_run(Path(directory)).verdicts
 
 
 def score(campaign: Campaign, rows: Sequence[CaseResult], metric: str) -> pd.Series[Any]:

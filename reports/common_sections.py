@@ -19,7 +19,7 @@ from marsyard.reports.comparison import compared_names, select_algorithm
 from marsyard.reports.figures import ELLIPSE
 from marsyard.reports.kinds import OutcomesBySize, Rows, SectionDeclaration
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.sampling_design import sampled
+from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import (
     REQUIREMENT,
     SERIES,
@@ -27,7 +27,7 @@ from marsyard.reports.section import (
     Grid,
     Section,
     Subject,
-    grid_of,
+    build_grid,
     in_page_style,
     new_axes,
     plate,
@@ -42,6 +42,7 @@ from marsyard.reports.wording import (
     axis_columns,
     coefficient,
     driver_columns,
+    format_fraction,
     interval,
     label,
     magnitude_label,
@@ -51,7 +52,6 @@ from marsyard.reports.wording import (
     p_text,
     percent,
     split_unit,
-    stated,
 )
 
 #: Column of true and false: whether the geometry leaves a feasible overlap for the algorithm.
@@ -63,13 +63,13 @@ def answers_section(subject: Subject) -> Section | None:
     shares = answer_shares(subject)
     if not shares:
         return None
-    grid = grid_of(
+    grid = build_grid(
         shares.items(),
         {
             "": lambda pair: pair[0],
             "Cases": lambda pair: f"{pair[1].hits:,} of {pair[1].n:,}",
             "Share": lambda pair: percent(pair[1].share),
-            f"{stated(CONFIDENCE)} interval": lambda pair: rates.range_text(pair[1].lower, pair[1].upper),
+            f"{format_fraction(CONFIDENCE)} interval": lambda pair: rates.range_text(pair[1].lower, pair[1].upper),
             "Allowing for shared terrains": lambda pair: (
                 NOTHING if pair[1].shared_lower is None else rates.interval_text(pair[1], shared=True)
             ),
@@ -86,15 +86,15 @@ def answer_shares(subject: Subject) -> Mapping[str, rates.Share]:
     if not rates.is_flag(frame, "answered") or frame.empty:
         return {}
     answered = rates.members(frame, "valid")
-    shares = {"answered, of all cases": rates.share_of(answered, frame)}
+    shares = {"answered, of all cases": rates.fraction_of(answered, frame)}
     if rates.is_flag(frame, ROOM):
         room, completed = rates.members(frame, ROOM), rates.members(frame, "completed")
-        shares["answered, of cases with feasible overlap"] = rates.share_of(answered[room], frame[room])
-        shares["no feasible overlap, of completed cases"] = rates.share_of(~room[completed], frame[completed])
+        shares["answered, of cases with feasible overlap"] = rates.fraction_of(answered[room], frame[room])
+        shares["no feasible overlap, of completed cases"] = rates.fraction_of(~room[completed], frame[completed])
     if subject.metric is not None and subject.bound is not None:
-        wrong = ~rates.succeeded(frame[answered], subject.metric, subject.bound)
+        wrong = ~rates.success_mask(frame[answered], subject.metric, subject.bound)
         name = f"wrong by more than {subject.bound:g} {split_unit(subject.metric)[1]}, of answers"
-        shares[name] = rates.share_of(wrong, frame[answered])
+        shares[name] = rates.fraction_of(wrong, frame[answered])
     return shares
 
 
@@ -119,12 +119,13 @@ def scatter_section(subject: Subject) -> Section | None:
     unit = split_unit(metric)[1]
     x, y = (number(value) for value in ellipse.centre)
     text = (
-        f"{stated(ELLIPSE)} ellipse, for normal errors: centre {x}, {y} {unit}, half axes {number(ellipse.semi_major)} "
-        f"and {number(ellipse.semi_minor)} {unit}, major axis at {number(ellipse.angle_deg)} deg from "
-        f"{label(parts[0])} towards {label(parts[1])}. {percent(ellipse.inside)} of these errors lie inside."
+        f"{format_fraction(ELLIPSE)} ellipse, for normal errors: centre {x}, {y} {unit}, half axes "
+        f"{number(ellipse.semi_major)} and {number(ellipse.semi_minor)} {unit}, major axis at "
+        f"{number(ellipse.angle_deg)} deg from {label(parts[0])} towards {label(parts[1])}. "
+        f"{percent(ellipse.inside)} of these errors lie inside."
     )
-    rows = [[stated(one.probability), number(one.estimate), interval(one.lower, one.upper)] for one in circles]
-    grid = Grid(["Fraction of errors", f"Radius ({unit})", f"Bounds, {stated(CONFIDENCE)} each"], rows)
+    rows = [[format_fraction(one.probability), number(one.estimate), interval(one.lower, one.upper)] for one in circles]
+    grid = Grid(["Fraction of errors", f"Radius ({unit})", f"Bounds, {format_fraction(CONFIDENCE)} each"], rows)
     note = note_text("common.scatter")
     data = {"ellipse": asdict(ellipse), "circles": [asdict(one) for one in circles]}
     return Section("scatter", "Scatter", "Scatter of the errors", [Block(text=text, grid=grid, note=note)], data)
@@ -142,12 +143,12 @@ def drivers_section(subject: Subject) -> Section | None:
     frame = subject.frame.head(MAX_CASES)
     responses = {"the size of errors": np.abs(numbers(frame, metric))}
     if subject.bound is not None:
-        responses["failures"] = (~rates.succeeded(frame, metric, subject.bound)).astype(np.float64)
+        responses["failures"] = (~rates.success_mask(frame, metric, subject.bound)).astype(np.float64)
     ranked = {name: ranked_drivers(frame, metric, response) for name, response in responses.items()}
     known = {name: found for name, found in ranked.items() if found}
     if not known:
         return None
-    note = note_text("common.drivers", confidence=stated(CONFIDENCE))
+    note = note_text("common.drivers", confidence=format_fraction(CONFIDENCE))
     head = ["Condition", "Cases", "Rank correlation", "Interval", "Share", "Interval", "p"]
     blocks = []
     for name, found in known.items():
@@ -225,7 +226,7 @@ def sizes(cases: int) -> list[int]:
 
 def requirement_curves(subject: Subject) -> list[tuple[str, float, list[Point]]]:
     """Name, rate asked and success rates of the first cases of each requirement that can be judged."""
-    how = sampled(subject.run.configuration)
+    how = read_sampling_design(subject.run.configuration)
     frame, requirements = subject.whole, subject.run.requirements
     judged = [(size, judge_campaign(frame.head(size), requirements, how)) for size in sizes(len(frame))]
     curves = []
@@ -336,7 +337,7 @@ def consistency_section(subject: Subject) -> Section | None:
 
 def _fault_outcomes(rows: Rows, subject: Subject) -> dict[str, Bool[np.ndarray, " n"]]:
     answered = rates.members(rows, "valid")
-    within = rates.succeeded(rows, str(subject.metric), math.nan if subject.bound is None else subject.bound)
+    within = rates.success_mask(rows, str(subject.metric), math.nan if subject.bound is None else subject.bound)
     return {"valid": answered & within, "invalid": ~answered, "wrong": answered & ~within}
 
 
@@ -364,6 +365,9 @@ def faults_section(subject: Subject) -> Section | None:
     if subject.metric is None or subject.bound is None or not rates.is_flag(subject.frame, "answered"):
         return None
     note = note_text(
-        "common.faults", bound=f"{subject.bound:g}", unit=split_unit(subject.metric)[1], confidence=stated(CONFIDENCE)
+        "common.faults",
+        bound=f"{subject.bound:g}",
+        unit=split_unit(subject.metric)[1],
+        confidence=format_fraction(CONFIDENCE),
     )
     return SectionDeclaration("faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), note=note)(subject)

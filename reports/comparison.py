@@ -19,13 +19,14 @@ import pandas as pd
 from jaxtyping import Float
 
 from marsyard.reports import rates
-from marsyard.reports.rates import CONFIDENCE, succeeded
-from marsyard.reports.sampling_design import sampled
-from marsyard.reports.section import Block, Grid, Section, Subject, grid_of
+from marsyard.reports.rates import CONFIDENCE, success_mask
+from marsyard.reports.sampling_design import read_sampling_design
+from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
 from marsyard.reports.statistics.changes import Sample, compare_errors, compare_successes, difference_p, holm
 from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.wording import (
     NOTHING,
+    format_fraction,
     label,
     note_text,
     number,
@@ -34,7 +35,6 @@ from marsyard.reports.wording import (
     percent,
     primary_metric,
     split_unit,
-    stated,
 )
 
 
@@ -98,7 +98,7 @@ def contender(frame: pd.DataFrame, name: str, metric: str | None, bound: float |
     known = magnitude[np.isfinite(magnitude)]
     within = None
     if metric is not None and bound is not None:
-        within = int(succeeded(frame, metric, bound).sum()) if metric in frame else 0
+        within = int(success_mask(frame, metric, bound).sum()) if metric in frame else 0
     return Contender(
         name=name,
         cases=len(frame),
@@ -152,7 +152,7 @@ def comparison_section(subject: Subject) -> Section | None:
         return None
     grids = comparison_grids(contenders, differences, subject.metric)
     judged = contenders[0].name
-    note = note_text("common.comparison", judged=judged, confidence=stated(CONFIDENCE))
+    note = note_text("common.comparison", judged=judged, confidence=format_fraction(CONFIDENCE))
     blocks = [Block(grid=grids[0])]
     if differences:
         blocks.append(Block(heading=f"Against {judged}", grid=grids[1], note=note))
@@ -169,7 +169,7 @@ def comparison_grids(
 ) -> tuple[Grid, Grid]:
     """Tables of results and of differences."""
     unit = f" ({split_unit(metric)[1]})" if metric is not None and split_unit(metric)[1] else ""
-    first = grid_of(
+    first = build_grid(
         contenders,
         {
             "Algorithm": lambda one: one.name,
@@ -241,9 +241,9 @@ class Contrast:
     p_value: float
 
 
-def figures_of(run: StoredRun) -> tuple[pd.DataFrame, list[Figure]]:
+def list_figures(run: StoredRun) -> tuple[pd.DataFrame, list[Figure]]:
     """The drawn cases of a campaign, and its figures: success by requirement, answers, completion, and magnitudes."""
-    frame = sampled(run.configuration).drawn(run.frame)
+    frame = read_sampling_design(run.configuration).draw(run.frame)
     found: dict[str, Figure] = {}
     metrics = dict.fromkeys([primary_metric(frame, run.requirements)])
     for asked in run.requirements:
@@ -256,7 +256,7 @@ def figures_of(run: StoredRun) -> tuple[pd.DataFrame, list[Figure]]:
         except ValueError:
             continue
         limit, scale = (float(x) if isinstance(x, int | float) else math.nan for x in (bound, asked.get("scale", 1)))
-        success = succeeded(frame, metric, limit, scale)
+        success = success_mask(frame, metric, limit, scale)
         found[name] = Figure(name, True, np.where(chosen, success.astype(np.float64), np.nan))
         if is_bounded:
             metrics[metric] = None
@@ -271,7 +271,7 @@ def figures_of(run: StoredRun) -> tuple[pd.DataFrame, list[Figure]]:
 
 def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[Contrast]]:
     """Whether the campaigns' cases are pairs, and the contrasts of the figures that both have."""
-    frames, of_each = zip(*(figures_of(run) for run in (first, second)), strict=True)
+    frames, of_each = zip(*(list_figures(run) for run in (first, second)), strict=True)
     paired = same_draws(first, second)
     theirs = {figure.name: figure for figure in of_each[1]}
     both = [(figure, theirs[figure.name]) for figure in of_each[0] if figure.name in theirs]
@@ -320,7 +320,7 @@ def campaign_diff_data(found: Sequence[Contrast]) -> list[dict[str, Any]]:
     ]
 
 
-def sample_of(frame: pd.DataFrame, figure: Figure) -> Sample:
+def build_sample(frame: pd.DataFrame, figure: Figure) -> Sample:
     """A figure with the stored terrain number of each case, which is comparable between campaigns."""
     groups = rates.terrain_groups(frame)
     if groups is None:
@@ -332,7 +332,7 @@ def sample_of(frame: pd.DataFrame, figure: Figure) -> Sample:
 
 
 def _unpaired_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Figure, *, common: bool) -> float:
-    here, there = sample_of(first, mine), sample_of(second, other)
+    here, there = build_sample(first, mine), build_sample(second, other)
     if not common:  # equal numbers are other terrains, so renumber them
         if not here.terrains.size or not there.terrains.size:
             return math.nan

@@ -18,6 +18,7 @@ from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.statistics.samples import quantile_bounds
 from marsyard.reports.wording import (
     axis_columns,
+    format_fraction,
     label,
     note_text,
     number,
@@ -25,7 +26,6 @@ from marsyard.reports.wording import (
     percent,
     plain_value,
     split_unit,
-    stated,
 )
 
 #: Prefixes of the condition columns in the order of the page; the first column of each prefix counts.
@@ -58,7 +58,7 @@ def conditions_section(subject: Subject) -> Section | None:
             texts = [label(one["part"]), f"{one['terrains']:,}", *deviations, percent(one["share"])]
             rows.append([*texts, number(one["p_value"])])
         blocks.append(Block(heading="By terrain", grid=Grid(head, rows), note=_SPREAD_NOTE))
-    note = note_text("common.conditions", confidence=stated(CONFIDENCE), quantile=stated(QUANTILE))
+    note = note_text("common.conditions", confidence=format_fraction(CONFIDENCE), quantile=format_fraction(QUANTILE))
     data: dict[str, Any] = {
         column: [one | {"answered": asdict(one["answered"])} for one in bins] for column, bins in tables.items()
     }
@@ -132,7 +132,7 @@ def _bin(chosen: pd.DataFrame, metric: str, name: str) -> dict[str, Any]:
     parts = [part[np.isfinite(part)] for part in parts]
     return {
         "name": name,
-        "answered": rates.share_of(answered, chosen),
+        "answered": rates.fraction_of(answered, chosen),
         "means": [float(part.mean()) if part.size else float("nan") for part in parts],
         "sds": [float(part.std(ddof=1)) if part.size > 1 else float("nan") for part in parts],
         "quantile_bound": quantile_bounds(magnitude, QUANTILE, CONFIDENCE, shared)[1],
@@ -146,7 +146,7 @@ def _grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]]) -
     unit = split_unit(metric)[1]
     head = ["", "Cases", "Answered", "Interval"]
     head += [f"{what}{axis} ({unit})" for axis in axes for what in ("Mean", "SD")]
-    head += [f"{stated(QUANTILE)} bound", "Largest"]
+    head += [f"{format_fraction(QUANTILE)} bound", "Largest"]
     rows = []
     for one in bins:
         of_parts = [number(value) for pair in zip(one["means"], one["sds"], strict=True) for value in pair]

@@ -84,15 +84,15 @@ def draws_figure(title: str, drawn: Sequence[Drawn]) -> Figure:
     for place, one in enumerate(drawn):
         row, column = divmod(place, in_row)
         box = (_MARGIN + column * width / in_row + 0.3, lower + (rows - 1 - row) * _HEIGHT + 0.45)
-        _marginal(_placed(figure, box, (width / in_row - 0.55, _HEIGHT - 0.85)), one)
+        _marginal(_add_axes(figure, box, (width / in_row - 0.55, _HEIGHT - 0.85)), one)
     if side:
         _heading(figure, lower, "Pairs: below, one against the other; above, Spearman's rank correlation")
         left = _MARGIN + 0.5 * (width - side)
-        _pairs(_placed(figure, (left, 0.5 * _MARGIN), (side, side)), varying)
+        _pairs(_add_axes(figure, (left, 0.5 * _MARGIN), (side, side)), varying)
     return figure
 
 
-def _placed(figure: Figure, corner: tuple[float, float], size: tuple[float, float]) -> Axes:
+def _add_axes(figure: Figure, corner: tuple[float, float], size: tuple[float, float]) -> Axes:
     """Axes at a position in inches, which is much faster than a layout engine for many panels."""
     width, height = figure.get_size_inches()
     return figure.add_axes((corner[0] / width, corner[1] / height, size[0] / width, size[1] / height))

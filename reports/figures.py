@@ -23,12 +23,12 @@ from marsyard.reports.tables import answered_outcomes, outcome_counts
 from marsyard.reports.wording import (
     axis_columns,
     category_column,
+    format_fraction,
     label,
     magnitude_label,
     numbers,
     plain_value,
     split_unit,
-    stated,
 )
 from marsyard.reports.wording import count as counted
 
@@ -106,7 +106,7 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
         outline: dict[str, Any] = {"fill": False, "color": INK, "linewidth": 1.4, "linestyle": ":", "zorder": 3}
         size = (2.0 * ellipse.semi_major, 2.0 * ellipse.semi_minor)
         axes.add_patch(Ellipse(ellipse.centre, *size, angle=ellipse.angle_deg, **outline))
-        axes.plot([], [], ":", color=INK, label=f"{stated(ELLIPSE)} ellipse")
+        axes.plot([], [], ":", color=INK, label=f"{format_fraction(ELLIPSE)} ellipse")
     axes.axhline(0.0, color=MUTED, linewidth=0.8, zorder=1)
     axes.axvline(0.0, color=MUTED, linewidth=0.8, zorder=1)
     axes.set(xlim=(-reach * 1.04, reach * 1.04), ylim=(-reach * 1.04, reach * 1.04), aspect="equal")

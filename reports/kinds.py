@@ -21,7 +21,7 @@ from marsyard.reports.rates import CONFIDENCE, PooledRate, Share, known, varies
 from marsyard.reports.section import Block, Grid, Section, Subject, plate
 from marsyard.reports.statistics.drivers import MIN_CASES, driver
 from marsyard.reports.tables import error_summaries, statistics_grid
-from marsyard.reports.wording import NOTHING, coefficient, label, number, numbers, percent, stated
+from marsyard.reports.wording import NOTHING, coefficient, format_fraction, label, number, numbers, percent
 
 Rows = pd.DataFrame
 Drawn = tuple[Sequence[Block], Mapping[str, Any]]
@@ -103,18 +103,18 @@ class Quantity:
         return np.asarray(self.scale * numbers(frame, self.column))
 
 
-def flagged(name: str, *among: str, wanted: bool = True) -> RateOf:
+def flag_rate(name: str, *among: str, wanted: bool = True) -> RateOf:
     """Fraction of rows whose flag is as wanted, among the rows with all of the other flags."""
 
     def rate(frame: Rows) -> Share:
         every = np.ones(len(frame), dtype=np.bool_)
         chosen = frame[np.logical_and.reduce([every, *(rates.flag(frame, one) for one in among)])]
-        return rates.share_of(rates.flag(chosen, name) == wanted, chosen)
+        return rates.fraction_of(rates.flag(chosen, name) == wanted, chosen)
 
     return rate
 
 
-def pooled(hits: str, of: str) -> RateOf:
+def pooled_fraction(hits: str, of: str) -> RateOf:
     """Fraction of one column of counts in another, pooled over the rows."""
     return lambda frame: rates.pooled_rate(frame, hits, of)
 
@@ -148,11 +148,11 @@ class RateTable:
         """The rates that have cases."""
         found = self.rates(frame) if callable(self.rates) else {one.name: one.of(frame) for one in self.rates}
         rows = [
-            [name, rates.share_text(one), rates.interval_text(one, shared=self.shared)]
+            [name, rates.fraction_text(one), rates.interval_text(one, shared=self.shared)]
             for name, one in found.items()
             if isinstance(one, Share) and one.n
         ]
-        grid = Grid(["", self.cases, f"{stated(CONFIDENCE)} interval"], rows)
+        grid = Grid(["", self.cases, f"{format_fraction(CONFIDENCE)} interval"], rows)
         blocks = [Block(heading=self.heading, grid=grid, note=self.note)] if rows else []
         return blocks, {self.data: {name: asdict(one) for name, one in found.items()}}
 
@@ -193,7 +193,7 @@ class RateByCondition:
         rows = []
         for value, n, of_bin in records:
             texts = [
-                rates.share_text(one) if isinstance(one, Share) else rates.rate_text(one) for one in of_bin.values()
+                rates.fraction_text(one) if isinstance(one, Share) else rates.rate_text(one) for one in of_bin.values()
             ]
             rows.append([f"{value:.4g}", f"{n:,}", *texts])
         grid = Grid([self.by.title, self.cases, *(one.name for one in self.rates)], rows)
@@ -247,7 +247,7 @@ class OutcomesBySize:
         records = []
         for kind, size, chosen in rates.by_size(frame, self.kind, self.size, self.none):
             ended = self.outcomes(chosen, subject)
-            worst = rates.share_of(ended[[*self.styles][-1]], chosen)
+            worst = rates.fraction_of(ended[[*self.styles][-1]], chosen)
             counts = {name: int(mask.sum()) for name, mask in ended.items()}
             values = {name: value(chosen) for _, name, value, _ in self.further}
             key = f"{[*self.styles][-1]}_share"
@@ -393,7 +393,9 @@ class Scatter:
         head = ["Rank correlation", *(one.title for one in self.y)]
         grid = Grid(head, [[name, *cells] for name, cells in texts.items()])
         figure = scatter_panels(panels, logarithmic=self.logarithmic)
-        note = f"Intervals at {stated(CONFIDENCE)} confidence; a dash for fewer than {MIN_CASES} cases or constants."
+        note = (
+            f"Intervals at {format_fraction(CONFIDENCE)} confidence; a dash below {MIN_CASES} cases or for constants."
+        )
         plates = [plate(figure, key, self.caption, wide=len(effects) > 1)]
         return [Block(heading=self.heading, plates=plates, grid=grid, note=note)], {"effects": effects}
 

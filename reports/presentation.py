@@ -128,7 +128,7 @@ def plane(value: object) -> Float[np.ndarray, "_ _"] | None:
     return values if values is not None and values.ndim == 2 and values.size else None
 
 
-def shaped(value: object, *shape: int | None) -> Float[np.ndarray, "..."] | None:
+def check_shape(value: object, *shape: int | None) -> Float[np.ndarray, "..."] | None:
     """A product of a shape, where None is any length; None otherwise."""
     values = numeric_product(value)
     if values is None or values.ndim != len(shape):
@@ -141,7 +141,7 @@ def read_arrays(
     products: Products, shapes: Mapping[str, tuple[int | None, ...]], *, finite: bool = False
 ) -> list[Float[np.ndarray, "..."]] | None:
     """Products by name and shape, optionally finite; None if one of them is something else."""
-    found = [shaped(products.get(name), *shape) for name, shape in shapes.items()]
+    found = [check_shape(products.get(name), *shape) for name, shape in shapes.items()]
     known = [one for one in found if one is not None and (not finite or np.isfinite(one).all())]
     return known if len(known) == len(shapes) else None
 

@@ -58,11 +58,11 @@ def in_page_style(draw: Callable[P, R]) -> Callable[P, R]:
     """Decorate a drawing function to use the page's style instead of the user's matplotlib settings."""
 
     @functools.wraps(draw)
-    def styled(*args: P.args, **kwargs: P.kwargs) -> R:
+    def apply_style(*args: P.args, **kwargs: P.kwargs) -> R:
         with _page_style():
             return draw(*args, **kwargs)
 
-    return styled
+    return apply_style
 
 
 @contextmanager
@@ -153,7 +153,7 @@ class Grid:
     left_out: int = 0
 
 
-def grid_of(records: Iterable[T], columns: Mapping[str, Callable[[T], str]]) -> Grid:
+def build_grid(records: Iterable[T], columns: Mapping[str, Callable[[T], str]]) -> Grid:
     """A table of records; `columns` maps headings to functions that make the texts."""
     return Grid([*columns], [[text(record) for text in columns.values()] for record in records])
 

@@ -20,25 +20,25 @@ from matplotlib.figure import Figure
 
 from marsyard.reports import figures
 from marsyard.reports.rates import CONFIDENCE, engine_failed, members, terrain_groups
-from marsyard.reports.sampling_design import sampled
+from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Grid, SvgFigure, plate
 from marsyard.reports.statistics.drivers import Driver, driver
 from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.tables import outcome_counts
-from marsyard.reports.traceability import algorithms_of
+from marsyard.reports.traceability import judged_algorithms
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import (
     NOTHING,
-    asked_text,
     axis_columns,
     coefficient,
     count,
     driver_columns,
+    format_fraction,
     label,
     number,
     numbers,
     percent,
-    stated,
+    requirement_text,
 )
 
 #: Maximum number of rows of the tables of single cases.
@@ -80,7 +80,7 @@ def verdict_row(verdict: Verdict) -> dict[str, Any]:
         strip = {"left": f"{100.0 * left:.3g} %"} | {name: scale * (rate - left) for name, rate in rates.items()}
     return {
         "verdict": verdict,
-        "asked": asked_text(verdict, label(verdict.metric)),
+        "asked": requirement_text(verdict, label(verdict.metric)),
         "evidence": [count(verdict.n, "case"), f"{verdict.failures:,} failed"],
         "bounds": bounds,
         "risk": "" if math.isnan(verdict.consumer_risk) else f"consumer's risk {percent(verdict.consumer_risk)}",
@@ -162,7 +162,7 @@ def provenance(run: StoredRun) -> list[tuple[str, str]]:
     environment, times = table(run.recorded("environment")), numbers(run.frame, "cpu_time_s")
     times = times[np.isfinite(times)]
     algorithms: list[tuple[str, Any]] = []
-    for one in algorithms_of(run.record):
+    for one in judged_algorithms(run.record):
         head = "Algorithm judged" if one.judged else "Algorithm compared"
         algorithms += [(head, one.name), (f"{head}: class or file", one.path), (f"{head}: version", one.version)]
         algorithms += [(f"{head}: sources", one.source_hash), (f"{head}: options", one.options_text)]
@@ -172,7 +172,7 @@ def provenance(run: StoredRun) -> list[tuple[str, str]]:
         *algorithms,
         ("State", run.recorded("state")),
         ("Root seed", run.recorded("seed")),
-        ("Sampling", sampled(run.configuration).text),
+        ("Sampling", read_sampling_design(run.configuration).text),
         ("Cases asked", run.recorded("cases")),
         ("Cases stored", len(run.whole)),
         ("Started", run.recorded("started_utc")),
@@ -270,7 +270,7 @@ def driver_plates(frame: pd.DataFrame, metric: str, bound: float | None) -> list
 def rank_text(found: Driver) -> str:
     """A rank correlation with its interval: ``0.310 (0.120 to 0.480 at 90 % confidence)``."""
     lower, upper = coefficient(found.lower), coefficient(found.upper)
-    return f"{coefficient(found.correlation)} ({lower} to {upper} at {stated(CONFIDENCE)} confidence)"
+    return f"{coefficient(found.correlation)} ({lower} to {upper} at {format_fraction(CONFIDENCE)} confidence)"
 
 
 def outcome_plates(frame: pd.DataFrame) -> list[SvgFigure]:
@@ -337,7 +337,7 @@ def script_hash(text: str) -> str:
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
 
 
-def embedded(data: Any) -> Markup:
+def embed_json(data: Any) -> Markup:
     """Data as JSON, escaped for a script element."""
     text = json.dumps(data, allow_nan=False, separators=(",", ":"))
     for letter in "<>&\u2028\u2029":

@@ -123,7 +123,7 @@ def _frames(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.Dat
     stored = file.schema_arrow.names
     renamed = stored_columns_now(stored, str(table(record.get("configuration")).get("scenario")))
     if file.metadata.num_rows <= LARGEST_WHOLE:
-        frame = _ordered(pd.read_parquet(path).rename(columns=renamed))
+        frame = _sort_columns(pd.read_parquet(path).rename(columns=renamed))
         return frame, frame
     first = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas().rename(columns=renamed)
     asked, names = record.get("requirements"), [renamed.get(name, name) for name in stored]
@@ -135,10 +135,10 @@ def _frames(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.Dat
     if metric is not None:
         wanted.update([metric, *axis_columns(metric, names), *driver_columns(first, metric, max_columns=3)])
     whole = pd.read_parquet(path, columns=[name for name in stored if renamed.get(name, name) in wanted])
-    return _ordered(first), _ordered(whole.rename(columns=renamed))
+    return _sort_columns(first), _sort_columns(whole.rename(columns=renamed))
 
 
-def _ordered(frame: pd.DataFrame) -> pd.DataFrame:
+def _sort_columns(frame: pd.DataFrame) -> pd.DataFrame:
     if "case" not in frame or frame["case"].is_monotonic_increasing:
         return frame
     return frame.sort_values("case", kind="stable").reset_index(drop=True)

@@ -46,7 +46,7 @@ class Algorithm:
         return json.dumps(self.options, ensure_ascii=False) if self.options else ""
 
 
-def algorithms_of(record: Mapping[str, Any]) -> list[Algorithm]:
+def judged_algorithms(record: Mapping[str, Any]) -> list[Algorithm]:
     """Read the algorithms from a campaign's record, the judged one first; old records give names alone."""
     stored = record.get("algorithms")
     entries = [table(one) for one in stored] if isinstance(stored, list) else []
@@ -112,7 +112,7 @@ _EVIDENCE = {
 COLUMNS = (*_REQUIREMENT, "campaign", *algorithm_cells(()), *_EVIDENCE)
 
 
-def evidence_of(
+def requirement_evidence(
     campaign: str, verdicts: Iterable[Verdict], algorithms: Sequence[Algorithm] = ()
 ) -> list[dict[str, Any]]:
     """Rows of the traceability matrix: the evidence of a campaign for each requirement."""

@@ -30,7 +30,7 @@ from marsyard.reports.statistics.proportions import (
     clustered_evidence,
     confidence_at,
 )
-from marsyard.reports.wording import count, percent, stated
+from marsyard.reports.wording import count, format_fraction, percent
 
 #: Value of a requirement's `decide_by` that has the rate seen compared with the probability.
 ESTIMATE = "estimate"
@@ -135,7 +135,7 @@ class Verdict:
     def _basis(self) -> str:
         if self.decide_by != ESTIMATE or self.n == 0:
             return ""
-        at = f"at {stated(self.confidence)} confidence"
+        at = f"at {format_fraction(self.confidence)} confidence"
         if self.status is Status.PASS:
             return f"Decided by the rate; met {at} as well."
         if self.status is Status.INSUFFICIENT:
@@ -164,7 +164,7 @@ class Verdict:
         if math.isnan(self.bounds_confidence) or self.bounds_confidence == self.upper_confidence == self.confidence:
             return ""
         lower, upper = (f"{100.0 * level:.4g} %" for level in (self.bounds_confidence, self.upper_confidence))
-        kept = f"so that all looks together keep {stated(self.confidence)}"
+        kept = f"so that all looks together keep {format_fraction(self.confidence)}"
         if lower == upper:
             return f"The campaign is judged more than once: its bounds are at {lower} confidence, {kept}."
         return (
@@ -247,11 +247,11 @@ def judge_campaign(
 
     how: the sampling design; without independent random draws, verdicts have no bounds
     """
-    return [_judge(how.drawn(frame), requirement, how) for requirement in requirements]
+    return [_judge(how.draw(frame), requirement, how) for requirement in requirements]
 
 
 def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: SamplingDesign) -> Verdict:
-    verdict = _unjudged(requirement)
+    verdict = _empty_verdict(requirement)
     fault = _requirement_fault(frame, verdict)
     if fault:
         return replace(verdict, reason=fault)
@@ -286,7 +286,7 @@ def _withhold(verdict: Verdict, suspected: Verdict) -> Verdict:
 def _decide(verdict: Verdict, chosen: pd.DataFrame, how: SamplingDesign, frame: pd.DataFrame) -> Verdict:
     """The verdict by the members of its population, at least one, among all cases."""
     _, unknown = rates.members_and_unknown(chosen, verdict.population.split(" and "))
-    success = np.asarray(rates.succeeded(chosen, verdict.metric, verdict.bound, verdict.scale) & ~unknown)
+    success = np.asarray(rates.success_mask(chosen, verdict.metric, verdict.bound, verdict.scale) & ~unknown)
     n, failures, groups = success.size, int((~success).sum()), rates.terrain_groups(chosen)
     rate, by_rate = (n - failures) / n, verdict.decide_by == ESTIMATE
     terrains = None if groups is None else int(chosen["terrain"].nunique())
@@ -348,7 +348,7 @@ def _requirement_fault(frame: pd.DataFrame, verdict: Verdict) -> str:
     return ""
 
 
-def _unjudged(requirement: Mapping[str, Any]) -> Verdict:
+def _empty_verdict(requirement: Mapping[str, Any]) -> Verdict:
     """The requirement without evidence; a decision by rate is added to its statement."""
     decide_by, statement = str(requirement.get("decide_by", "confidence")), str(requirement.get("statement", ""))
     if decide_by == ESTIMATE:

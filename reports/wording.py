@@ -24,14 +24,14 @@ _ROUNDING = 1e-9
 _POPULATIONS = {"all": "all cases", "completed": "completed cases", "valid": "valid answers"}
 
 
-def asked_text(asked: Any, metric: str) -> str:
+def requirement_text(asked: Any, metric: str) -> str:
     """A requirement (of a campaign, or repeated by a verdict) in words, with the metric's name for readers."""
     unbounded = asked.bound is None or math.isnan(asked.bound)
     scaled = "" if asked.scale == 1.0 else f"{asked.scale:g} × "
     what = metric if unbounded else f"{scaled}|{metric}| ≤ {asked.bound:g}"
-    confidence = f"{stated(asked.confidence)} confidence"
+    confidence = f"{format_fraction(asked.confidence)} confidence"
     how = f"decided by rate, bounds at {confidence}" if asked.decide_by == "estimate" else f"at {confidence}"
-    return f"{what} in at least {stated(asked.probability)} of {population_text(asked.population)}, {how}"
+    return f"{what} in at least {format_fraction(asked.probability)} of {population_text(asked.population)}, {how}"
 
 
 def population_text(population: str) -> str:
@@ -101,7 +101,7 @@ def percent(fraction: float) -> str:
     return "< 0.0000001 %" if fraction < 0.5 else "> 99.9999999 %"
 
 
-def stated(fraction: float) -> str:
+def format_fraction(fraction: float) -> str:
     """A given fraction in per cent, with all its digits."""
     return NOTHING if math.isnan(fraction) else f"{100.0 * fraction:.10g} %"
 

@@ -113,8 +113,8 @@ def add_meshes(scene: Scene, meshes: Sequence[MeshParameters], near: tuple[float
     """Add meshes to a scene, each at its repetition nearest to a point (x, y)."""
     if not meshes:
         return scene
-    standing = Objects.joined([one.standing(scene.surface, near) for one in meshes])
-    return scene.with_objects(Objects.joined([scene.objects, standing]))
+    standing = Objects.join([one.standing(scene.surface, near) for one in meshes])
+    return scene.with_objects(Objects.join([scene.objects, standing]))
 
 
 def read_mesh(path: str) -> Mesh:

@@ -201,7 +201,7 @@ def template_paths() -> Mapping[str, str]:
     return {name: path for system in systems() for name, path in system.templates.items()}
 
 
-def system_of(scenario: str) -> System | None:
+def find_system(scenario: str) -> System | None:
     """Return the system with a scenario of this name or ``module:Class``; None without one."""
     return next((one for one in systems() if scenario in {*one.scenarios, *one.scenarios.values()}), None)
 
@@ -255,7 +255,7 @@ class RowColumns:
 @cache
 def row_columns(scenario: str) -> RowColumns | None:
     """Return the columns of a scenario; None where its system does not state them. Raises ValueError for a bad file."""
-    system = system_of(scenario)
+    system = find_system(scenario)
     if system is None or system.columns is None:
         return None
     try:

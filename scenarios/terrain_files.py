@@ -295,11 +295,11 @@ def site_or_file(name: str, max_hole_fraction: float = MAX_HOLE_FRACTION) -> Sit
     path = Path(name)
     source = RealTerrain(dtm=path, max_hole_fraction=max_hole_fraction)
     check_source(source)
-    return _imported(source, path.stat().st_mtime_ns)
+    return _import_site(source, path.stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=4)
-def _imported(source: RealTerrain, _changed_ns: int) -> Site:
+def _import_site(source: RealTerrain, _changed_ns: int) -> Site:
     samples, spacing_m = choose_grid(source)
     terrain = TerrainParameters(samples=samples, spacing_m=spacing_m, craters_per_km2=0.0, source=source)
     changes = {

@@ -29,7 +29,7 @@ def current_key(name: str, known: Collection[str], given: Collection[str] = ()) 
     current = _names("keys").get(name)
     if current is None or name in known or current not in known or current in given:
         return name
-    return _warned(name, current)
+    return _warn_former(name, current)
 
 
 def current_column(name: str, exists: Callable[[str], bool]) -> str:
@@ -39,13 +39,13 @@ def current_column(name: str, exists: Callable[[str], bool]) -> str:
         match = re.fullmatch(former.replace("*", r"(\d+)"), column)
         renamed = current.replace("*", match[1]) if match and match.groups() else current
         if match and exists(renamed):
-            return algorithm + dot + _warned(column, renamed)
+            return algorithm + dot + _warn_former(column, renamed)
     return name
 
 
 def current_options(words: Sequence[str]) -> list[str]:
     """Words of a command line with the current names of options."""
-    return [_warned(word, _names("options").get(word, word)) for word in words]
+    return [_warn_former(word, _names("options").get(word, word)) for word in words]
 
 
 def stream_name(path: str) -> str:
@@ -53,7 +53,7 @@ def stream_name(path: str) -> str:
     return _names("streams").get(path, path)
 
 
-def _warned(former: str, current: str) -> str:
+def _warn_former(former: str, current: str) -> str:
     if former != current:
         warnings.warn(f"'{former}' is now '{current}'; the former name is accepted until 0.2", RenamedWarning, 3)
     return current
@@ -64,7 +64,7 @@ NonNegative = Annotated[float, Field(ge=0.0)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
-def bounded(low: float, high: float, description: str) -> Any:
+def bounded_field(low: float, high: float, description: str) -> Any:
     """Field of a number from `low` to `high`, both included."""
     return Field(ge=low, le=high, description=description)
 

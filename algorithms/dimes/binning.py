@@ -86,7 +86,7 @@ def place_camera(camera: CameraModel, world_from_body: Rotation, altitude_m: flo
     """
     lever = world_from_body.as_matrix() @ camera.c
     placed = rigid(world_from_body, np.array([-lever[0], -lever[1], altitude_m]))
-    return camera.moved(placed), np.array([0.0, 0.0, altitude_m + lever[2]])
+    return camera.transform(placed), np.array([0.0, 0.0, altitude_m + lever[2]])
 
 
 def build_view(
@@ -101,7 +101,7 @@ def build_view(
     """
     columns, rows = bin_factors(image.counts.shape, binned_size)
     known = image.calibration
-    camera, centre = place_camera(image.camera.binned(columns, rows), world_from_body, altitude_m)
+    camera, centre = place_camera(image.camera.bin(columns, rows), world_from_body, altitude_m)
     shared = before.flat_field if before is not None and before.calibration is known else None
     return View(
         signal=bin_mean(image.counts.astype(np.float32), columns, rows) - np.float32(known.offset_dn),

@@ -93,7 +93,9 @@ def combinations(
     return tuple(sorted(found, key=lambda c: c.discrepancy_m_s))
 
 
-def propagated(velocity_m_s: Horizontal, inertial_then_m_s: Horizontal, inertial_now_m_s: Horizontal) -> Vector2:
+def propagate_velocity(
+    velocity_m_s: Horizontal, inertial_then_m_s: Horizontal, inertial_now_m_s: Horizontal
+) -> Vector2:
     """Propagate a velocity by the inertial unit, for example to thruster firing near 100 m (section I), m/s.
 
     `inertial_then_m_s` is the inertial mean velocity over the second pair's interval. The unknown error common to both

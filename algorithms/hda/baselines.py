@@ -99,7 +99,7 @@ def essential_motion(scene: LandingScene, tracks: Tracks, options: HdaOptions) -
     if len(ahead) == 0:
         return None
     motion = assess_motion(first, second, focal, moved, depths, True, options)
-    return motion.scaled(scene.range_m / float(np.median(ahead)))
+    return motion.scale(scene.range_m / float(np.median(ahead)))
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ class HdaDetails:
     ground: Ground | None = None
     ends_s: tuple[float, ...] = field(default_factory=lambda: (time.process_time(),))
 
-    def ended(self, **found: Any) -> HdaDetails:
+    def end_stage(self, **found: Any) -> HdaDetails:
         """These details with the products of a stage that ends now."""
         return replace(self, **found, ends_s=(*self.ends_s, time.process_time()))
 

@@ -63,42 +63,42 @@ def find_site(
     """Run all stages, with the given solvers for motion and structure."""
     details = HdaDetails(scene.views)
     if not (np.isfinite(scene.range_m) and scene.range_m > 0.0):
-        return _unconverged(SiteOutcome.NO_RANGE, scene, details)
+        return _report_unconverged(SiteOutcome.NO_RANGE, scene, details)
     features = select_features(scene.views[0].counts, options)
     if len(features) < options.min_tracks:
-        return _unconverged(SiteOutcome.NO_FEATURES, scene, details)
+        return _report_unconverged(SiteOutcome.NO_FEATURES, scene, details)
     tracks = track_features(
         scene.views[0].counts, scene.views[1].counts, features, expected_pixels(scene, features, options), options
     )
-    details = details.ended(tracks=tracks)
+    details = details.end_stage(tracks=tracks)
     if np.count_nonzero(tracks.accepted) < options.min_tracks:
-        return _unconverged(SiteOutcome.NO_TRACKS, scene, details)
+        return _report_unconverged(SiteOutcome.NO_TRACKS, scene, details)
     motion = solve_motion(scene, tracks, options)
     details = replace(details, motion=motion)
     failure = motion_failure(motion, options)
     if motion is None or failure is not None:
-        return _unconverged(failure or SiteOutcome.NO_MOTION, scene, details)
+        return _report_unconverged(failure or SiteOutcome.NO_MOTION, scene, details)
     places = undistort(scene.views[0].camera, tracks.first[tracks.accepted])
     factor = scale_factor(scene.views, motion, places, scene.range_m, options)
     if not (np.isfinite(factor) and factor > 0.0):
-        return _unconverged(SiteOutcome.NO_MOTION, scene, details)
-    motion = motion.scaled(factor)
-    details = details.ended(motion=motion)
+        return _report_unconverged(SiteOutcome.NO_MOTION, scene, details)
+    motion = motion.scale(factor)
+    details = details.end_stage(motion=motion)
     matches = solve_structure(scene, motion, options)
-    details = details.ended(matches=matches)
+    details = details.end_stage(matches=matches)
     if len(matches.points) < options.min_points:
-        return _unconverged(SiteOutcome.NO_STRUCTURE, scene, details)
+        return _report_unconverged(SiteOutcome.NO_STRUCTURE, scene, details)
     resolution = hazards.map_resolution(motion, scene.views[0].focal_px, options)
     ground = map_ground(scene, matches.points, resolution, options)
     if ground is None:
-        return _unconverged(SiteOutcome.NO_STRUCTURE, scene, details)
+        return _report_unconverged(SiteOutcome.NO_STRUCTURE, scene, details)
     site = site_world(scene, ground)
-    details = details.ended(ground=ground)
+    details = details.end_stage(ground=ground)
     outcome = SiteOutcome.NO_SAFE_SITE if site is None else SiteOutcome.SAFE_SITE
     return SiteEstimate(outcome, site, details)
 
 
-def _unconverged(outcome: SiteOutcome, scene: LandingScene, details: HdaDetails) -> SiteEstimate:
+def _report_unconverged(outcome: SiteOutcome, scene: LandingScene, details: HdaDetails) -> SiteEstimate:
     return SiteEstimate(outcome, scene.apriori_site_world, details)
 
 

@@ -48,7 +48,7 @@ def build_view(image: DetectorImage, pose: PoseMeasurement) -> View:
     if image.counts.shape != image.camera.size[::-1]:
         raise ValueError(f"the picture has (rows, columns) {image.counts.shape}, its camera {image.camera.size[::-1]}")
     body_from_camera = camera_pose(image.camera)
-    camera = image.camera.moved(body_from_camera.inv())
+    camera = image.camera.transform(body_from_camera.inv())
     return View(flat_fielded(image), camera, pose.world_from_body * body_from_camera)
 
 
@@ -155,7 +155,7 @@ class Motion:
     parallax_px: float
     converged: bool
 
-    def scaled(self, factor: float) -> Motion:
+    def scale(self, factor: float) -> Motion:
         """The motion with all lengths multiplied."""
         moved = rigid(self.second_from_first.rotation, factor * self.second_from_first.translation)
         return replace(self, second_from_first=moved, depths=factor * self.depths)

@@ -114,8 +114,8 @@ def normalized_correlation(template: Float[np.ndarray, "n m"], window: Raster) -
     in float32. (Tracking paper, Eq. 11.) Raises ValueError if the template is larger than the window.
     """
     _check_fit(template, window)
-    a, bright_a = kernels.centred(np.ascontiguousarray(template, dtype=np.float32))
-    b, bright_b = kernels.centred(np.ascontiguousarray(window, dtype=np.float32))
+    a, bright_a = kernels.subtract_mean(np.ascontiguousarray(template, dtype=np.float32))
+    b, bright_b = kernels.subtract_mean(np.ascontiguousarray(window, dtype=np.float32))
     return np.asarray(kernels.surface(a, b, _flat_energy(template, max(bright_a, bright_b))))
 
 
@@ -139,7 +139,7 @@ def coarse_to_fine_peak(template: Float[np.ndarray, "n m"], window: Raster, leve
     order = np.argsort(-values, kind="stable")[: candidates if levels else 1]
     places, values = maxima[order], values[order]
     for small, large in reversed(pyramid[:-1]):
-        a, bright = kernels.centred(np.ascontiguousarray(small, dtype=np.float32))
+        a, bright = kernels.subtract_mean(np.ascontiguousarray(small, dtype=np.float32))
         b = np.ascontiguousarray(large, dtype=np.float32)
         places, values = kernels.search_near(a, b, 2 * places, REACH_PX, _flat_energy(small, bright))
     best = int(np.argmax(values))

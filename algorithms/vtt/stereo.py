@@ -99,7 +99,7 @@ def point_stereo(
     )
 
 
-def triangulated(left: CameraModel, right: CameraModel, left_pixel: Vector2, right_pixel: Vector2) -> Vector3 | None:
+def triangulate(left: CameraModel, right: CameraModel, left_pixel: Vector2, right_pixel: Vector2) -> Vector3 | None:
     """The midpoint of the shortest segment between two pixels' lines of sight: see `nearest_point`."""
     return nearest_point(left.rays(left_pixel), right.rays(right_pixel))
 

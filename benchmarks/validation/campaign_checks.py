@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.validation.chaos import DEEDS, ChaosParameters, deed
+from benchmarks.validation.chaos import DEEDS, ChaosParameters, draw_fault
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.execution.workers import ExecutorConfig
@@ -56,7 +56,7 @@ def same_rows(quick: bool) -> Iterator[Measure]:
         folder = Path(name)
         settings = [f"share={share}", f"cases={cases}"]
         what = f"cases, {100 * share:g} % of which misbehave"
-        yield from _in_every_way(str(_written(folder)), folder / "chaos", settings, kills, what)
+        yield from _in_every_way(str(_write_campaign(folder)), folder / "chaos", settings, kills, what)
         rendered = ["cases=8" if quick else "cases=40", "retain.showcase=none"]
         yield from _in_every_way("dimes-smoke", folder / "rendered", rendered, kills, "rendered descents")
 
@@ -70,7 +70,7 @@ def _in_every_way(campaign: str, folder: Path, settings: Sequence[str], kills: i
     ways: dict[str, Callable[[], list[dict[str, Any]]]] = {
         "two workers": lambda: _rows_of(campaign, folder / "two", ExecutorConfig(2), settings),
         "a Dask cluster of two": lambda: _rows_of(campaign, folder / "cluster", cluster, settings),
-        f"a runner killed {kills} times": lambda: _killed(campaign, folder / "killed", settings, kills),
+        f"a runner killed {kills} times": lambda: _run_with_kills(campaign, folder / "killed", settings, kills),
         "single replays": lambda: [dict(replay(folder / "one", case).row) for case in replayed],
     }
     for way, run in ways.items():
@@ -86,7 +86,7 @@ def survival(quick: bool) -> Iterator[Measure]:
     cases, share = (60, 0.15) if quick else (400, 0.03)
     with TemporaryDirectory() as name:
         folder = Path(name)
-        file = _written(folder)
+        file = _write_campaign(folder)
         took, rows = {}, {}
         for part in (0.0, share):
             began = time.monotonic()
@@ -95,7 +95,7 @@ def survival(quick: bool) -> Iterator[Measure]:
             )
             took[part] = time.monotonic() - began
         campaign = load_campaign(str(file), [f"share={share}"])
-        deeds = [_deed(campaign, case) for case in range(cases)]
+        deeds = [_draw_fault(campaign, case) for case in range(cases)]
         wrong = sum(row["outcome"] != DEEDS.get(done, "VALID") for row, done in zip(rows[share], deeds, strict=True))
         healthy = [k for k, done in enumerate(deeds) if not done]
         changed = sum(bool(differing_columns(rows[share][k], rows[0.0][k])) for k in healthy)
@@ -111,13 +111,13 @@ def survival(quick: bool) -> Iterator[Measure]:
         )
 
 
-def _deed(campaign: Any, case: int) -> str:
+def _draw_fault(campaign: Any, case: int) -> str:
     parameters = campaign.parameters(case)
     assert isinstance(parameters, ChaosParameters)
-    return deed(parameters, campaign.streams(case))
+    return draw_fault(parameters, campaign.streams(case))
 
 
-def _written(folder: Path) -> Path:
+def _write_campaign(folder: Path) -> Path:
     path = folder / "chaos.toml"
     path.write_text(FILE)
     return path
@@ -130,7 +130,7 @@ def _rows_of(
     return read_rows(directory / "cases.parquet")
 
 
-def _killed(campaign: str, directory: Path, settings: Sequence[str], kills: int) -> list[dict[str, Any]]:
+def _run_with_kills(campaign: str, directory: Path, settings: Sequence[str], kills: int) -> list[dict[str, Any]]:
     """Rows of a campaign that is killed at random times and resumed each time."""
     rng = np.random.default_rng(7)
     program = [sys.executable, "-m", "marsyard"]

@@ -24,7 +24,7 @@ class ChaosParameters(BaseModel):
 DEEDS = {"raise": "CRASHED", "loop": "TIMED_OUT", "swell": "OUT_OF_MEMORY", "abort": "CRASHED"}
 
 
-def deed(parameters: ChaosParameters, streams: Streams) -> str:
+def draw_fault(parameters: ChaosParameters, streams: Streams) -> str:
     """Fault of a case; empty for a healthy case."""
     rng = streams.generator("chaos")
     return str(rng.choice(list(DEEDS))) if rng.random() < parameters.share else ""
@@ -46,7 +46,7 @@ class ChaosScenario:
         end = time.process_time() + parameters.work_s
         while time.process_time() < end:
             pass
-        done = deed(parameters, streams)
+        done = draw_fault(parameters, streams)
         if done == "raise":
             raise ZeroDivisionError("by chance")
         if done == "loop":

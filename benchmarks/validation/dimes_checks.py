@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmarks.dimes_threshold import STORED, WRONG_BY_M_S
-from benchmarks.estimators import ESTIMATORS, recorded, tried
+from benchmarks.estimators import ESTIMATORS, recorded, run_estimator
 from benchmarks.threshold_derivation import ThresholdInputs
 from benchmarks.validation.imu_reference import Reference
 from benchmarks.validation.records import Check, Measure
@@ -24,7 +24,7 @@ def imu_check(quick: bool) -> Iterator[Measure]:
     """Compare the threshold with a second implementation of its Monte Carlo derivation."""
     inputs, descents = ThresholdInputs(), 300 if quick else 3000
     rng = np.random.default_rng(SEED)
-    reference = Reference.drawn(inputs, descents, rng)
+    reference = Reference.draw(inputs, descents, rng)
     threshold = DimesOptions().imu_threshold_m_s
     single = reference.single()
     how = f"{descents} descents of a second implementation by first-order propagation; threshold {threshold:g} m/s"
@@ -65,7 +65,7 @@ def _stored_median_m_s() -> float:
 def estimators(quick: bool) -> Iterator[Measure]:
     descents = recorded("dimes-smoke", 4 if quick else 48)
     for name, estimator in ESTIMATORS.items():
-        found = tried(estimator, descents)
+        found = run_estimator(estimator, descents)
         valid = found.valid
         rms = float(np.sqrt(np.mean(valid**2))) if valid.size else float("nan")
         wrong = int(np.sum(valid > REQUIREMENT_M_S))

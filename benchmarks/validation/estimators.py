@@ -115,11 +115,11 @@ def peak_fits(first: np.ndarray, second: np.ndarray, centres: np.ndarray) -> tup
     """
     reach = np.arange(-HALF, HALF + 1)
     rows, columns = centres[:, 1, None] + reach, centres[:, 0, None] + reach
-    template = _normalised(first[rows[:, :, None], columns[:, None, :]])
+    template = _normalise(first[rows[:, :, None], columns[:, None, :]])
     surface = np.empty((len(centres), 5, 5))
     for i in range(5):
         for j in range(5):
-            moved = _normalised(second[(rows + i - 2)[:, :, None], (columns + j - 2)[:, None, :]])
+            moved = _normalise(second[(rows + i - 2)[:, :, None], (columns + j - 2)[:, None, :]])
             surface[:, i, j] = np.sum(template * moved, axis=(1, 2))
     best = surface[:, 1:4, 1:4].reshape(len(centres), -1).argmax(axis=1)
     top, left = best // 3, best % 3
@@ -135,7 +135,7 @@ def peak_fits(first: np.ndarray, second: np.ndarray, centres: np.ndarray) -> tup
     return whole + parabola, whole + _biquadratic(z)
 
 
-def _normalised(patches: np.ndarray) -> np.ndarray:
+def _normalise(patches: np.ndarray) -> np.ndarray:
     away = patches - patches.mean(axis=(1, 2), keepdims=True, dtype=np.float64)
     return away / np.sqrt(np.sum(away**2, axis=(1, 2), keepdims=True))
 

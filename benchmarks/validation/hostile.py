@@ -155,7 +155,7 @@ DEEDS: Mapping[str, tuple[Callable[[], object], str]] = {
 }
 
 
-def deed(parameters: HostileParameters, streams: Streams) -> str:
+def draw_fault(parameters: HostileParameters, streams: Streams) -> str:
     """Fault of a case; empty for a healthy case."""
     rng = streams.generator("deed")
     return str(rng.choice(list(DEEDS))) if rng.random() < parameters.misbehaving else ""
@@ -178,7 +178,7 @@ class HostileScenario:
             raise RuntimeError("an earlier case of this process has spoiled it")
         time.sleep(0.02)
         row = _numbers(streams)
-        wrong = DEEDS[done][0]() if (done := deed(parameters, streams)) else None
+        wrong = DEEDS[done][0]() if (done := draw_fault(parameters, streams)) else None
         return CaseResult("VALID", True, {**row, **(wrong if isinstance(wrong, dict) else {})})
 
 

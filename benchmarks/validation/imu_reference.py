@@ -49,7 +49,7 @@ class Reference:
     imu: Float[np.ndarray, "n 2"]
 
     @classmethod
-    def drawn(cls, inputs: ThresholdInputs, descents: int, rng: np.random.Generator) -> Reference:
+    def draw(cls, inputs: ThresholdInputs, descents: int, rng: np.random.Generator) -> Reference:
         """Draw descents with feasible overlap for two templates in each pair."""
         tracks = np.empty((descents, 2, 2, 2))
         for number in range(descents):
@@ -106,7 +106,7 @@ def _descent_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> Float[
         (h1, h2), (a1, a2), (e1, e2) = (one[pair : pair + 2] for one in (heights, of_height, turned))
         later = (h1 * slopes - moved) / h2
         relief = inputs.feature_height_sd_m * rng.standard_normal((2, 1))
-        displaced = h1 * (a1 * slopes + _turned(e1, slopes)) - h2 * (a2 * later + _turned(e2, later))
+        displaced = h1 * (a1 * slopes + _rotate_slopes(e1, slopes)) - h2 * (a2 * later + _rotate_slopes(e2, later))
         errors[pair] = (displaced + relief * (slopes - later)) / interval
     return np.asarray(errors + inputs.match_sd_m_s * rng.standard_normal((2, 2, 2)))
 
@@ -133,7 +133,7 @@ def _attitude_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> Float
     return np.asarray(common + own + tags)
 
 
-def _turned(error: Float[np.ndarray, "3"], slopes: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+def _rotate_slopes(error: Float[np.ndarray, "3"], slopes: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """First-order change of slopes whose rays are rotated by a small vector."""
     rays = np.column_stack([slopes, -np.ones(len(slopes))])
     change = np.cross(error, rays)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
-from benchmarks.validation.bars import bar_of
+from benchmarks.validation.bars import find_bar
 from benchmarks.validation.motion import View, render
 from benchmarks.validation.raycast import Ground, meet_triangles
 from benchmarks.validation.records import Check, Measure
@@ -50,7 +50,7 @@ def run_opposition(quick: bool) -> Iterator[Measure]:
             pixel = rng.uniform(0.2, 0.8, 2) * camera.size
             turn = Rotation.align_vectors(np.array([[0.2, 0.1, -1.0]]), camera.boresight()[None])[0]
             pose = rigid(turn, np.array([0.0, 0.0, 800.0]))
-            _, ray = camera.moved(pose).rays(pixel)
+            _, ray = camera.transform(pose).rays(pixel)
             if ray[2] > -0.3:
                 continue
             view = View(Scene(surface, (0.0, 0.0), Sun(-ray), law), camera, pose)
@@ -58,7 +58,7 @@ def run_opposition(quick: bool) -> Iterator[Measure]:
             errors.append(float(np.linalg.norm(_peak(radiance) - pixel)))
         how = f"{len(errors)} suns; centre of the light above 90 % of the peak's height"
         claim = f"opposition peak from the antisolar point: {name}"
-        yield Measure(claim, max(errors), "px", bar_of(claim), how)
+        yield Measure(claim, max(errors), "px", find_bar(claim), how)
 
 
 def _peak(radiance: np.ndarray) -> np.ndarray:
@@ -186,7 +186,7 @@ def run_reflectance(quick: bool) -> Iterator[Measure]:
             ("rendered brightness against the formula", max(off), how),
             ("spherical albedo from the stated one", albedo, "the law integrated over sun and eye by Sobol points"),
         ):
-            yield Measure(f"{claim}: {name}", measured, "", bar_of(f"{claim}: {name}"), by)
+            yield Measure(f"{claim}: {name}", measured, "", find_bar(f"{claim}: {name}"), by)
 
 
 def _spherical_albedo(law: Photometry, log2_points: int) -> float:
@@ -257,9 +257,9 @@ def run_sun(quick: bool) -> Iterator[Measure]:
         angle = np.square(rays.pixel_angles.astype(np.float64)).reshape(radiance.shape)
         flux.append(abs(float((light * angle).sum()) / np.pi - 1.0))
     claim = "the sun's disc from the sun's direction"
-    yield Measure(claim, max(off), "px", bar_of(claim), f"{len(off)} suns in the navcam's sky")
+    yield Measure(claim, max(off), "px", find_bar(claim), f"{len(off)} suns in the navcam's sky")
     claim = "light of the sun's disc from the direct sun"
-    yield Measure(claim, max(flux), "", bar_of(claim), "the same pictures")
+    yield Measure(claim, max(flux), "", find_bar(claim), "the same pictures")
 
 
 CHECKS = (

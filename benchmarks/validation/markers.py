@@ -65,11 +65,11 @@ def _rolling(extent_m: float, rng: np.random.Generator) -> np.ndarray:
     return heights
 
 
-def marked_view(camera: CameraModel, height_m: float, rng: np.random.Generator) -> Marked:
+def mark_view(camera: CameraModel, height_m: float, rng: np.random.Generator) -> Marked:
     """Create ground with as many markers as fit into the image."""
     pose = rigid(_looking_down(camera, rng), np.array([0.0, 0.0, height_m]))
-    world_camera = camera.moved(pose)
-    pixels = _scattered(camera.size, rng)
+    world_camera = camera.transform(pose)
+    pixels = _scatter_points(camera.size, rng)
     origins, rays = world_camera.rays(pixels)
     steep = rays[:, 2] < -np.cos(MAX_OBLIQUITY_RAD)
     pixels, origins, rays = pixels[steep], np.array(origins[steep]), rays[steep]
@@ -102,7 +102,7 @@ def marked_view(camera: CameraModel, height_m: float, rng: np.random.Generator) 
     return Marked(scene, camera, pose, expected)
 
 
-def _scattered(size: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+def _scatter_points(size: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
     """Random pixels with a minimum distance: a jittered grid."""
     cell = APART + 12
     across, down = (side // cell for side in size)
@@ -144,7 +144,7 @@ def _centre_of_light(camera: CameraModel, ground: Ground, marker: np.ndarray, si
     return (weight[near, None] * pixels[near]).sum(axis=0) / weight[near].sum()
 
 
-def _found(radiance: np.ndarray, near: np.ndarray) -> np.ndarray:
+def _locate_marker(radiance: np.ndarray, near: np.ndarray) -> np.ndarray:
     u0, v0 = np.rint(near).astype(int)
     v, u = np.mgrid[v0 - WINDOW : v0 + WINDOW + 1, u0 - WINDOW : u0 + WINDOW + 1]
     light = radiance[v, u].astype(np.float64)
@@ -158,9 +158,9 @@ def marker_errors(renderer: Renderer, camera: CameraModel, seed: int, count: int
     errors: list[np.ndarray] = []
     while len(errors) < count:
         # from the height of a mast to that of a parachute descent
-        marked = marked_view(camera, float(10.0 ** rng.uniform(0.2, 3.3)), rng)
+        marked = mark_view(camera, float(10.0 ** rng.uniform(0.2, 3.3)), rng)
         radiance = renderer.render(marked.scene, rays, marked.pose).radiance
-        errors += [_found(radiance, near) - near for near in marked.expected]
+        errors += [_locate_marker(radiance, near) - near for near in marked.expected]
     return np.stack(errors[:count])
 
 

@@ -37,7 +37,7 @@ class View:
     world_from_body: RigidTransform
     footprint: float = 1.0
 
-    def moved(self, offset_world_m: np.ndarray) -> View:
+    def transform(self, offset_world_m: np.ndarray) -> View:
         """The same view from a shifted position."""
         pose = rigid(self.world_from_body.rotation, self.world_from_body.translation + offset_world_m)
         return replace(self, world_from_body=pose)
@@ -76,7 +76,7 @@ def render(renderer: Renderer, view: View, samples: int = 1) -> Frame:
     if samples == 1:
         return frame
     return Frame(
-        supersampled(renderer, view, samples), frame.range_m, frame.body, frame.normal, frame.world_from_body, rays
+        supersample(renderer, view, samples), frame.range_m, frame.body, frame.normal, frame.world_from_body, rays
     )
 
 
@@ -84,16 +84,16 @@ def render(renderer: Renderer, view: View, samples: int = 1) -> Frame:
 PIECE = 1024
 
 
-def supersampled(renderer: Renderer, view: View, samples: int) -> np.ndarray:
+def supersample(renderer: Renderer, view: View, samples: int) -> np.ndarray:
     """Mean over samples x samples rays in each pixel; the footprint of each ray is its part of the pixel."""
-    fine = view.camera.scaled(samples)
+    fine = view.camera.scale(samples)
     columns, rows = view.camera.size
     step = PIECE // samples
     picture = np.empty((rows, columns))
     for row in range(0, rows, step):
         for column in range(0, columns, step):
             size = (min(step, columns - column), min(step, rows - row))
-            part = fine.cropped(column * samples, row * samples, (size[0] * samples, size[1] * samples))
+            part = fine.crop(column * samples, row * samples, (size[0] * samples, size[1] * samples))
             radiance = renderer.render(view.scene, view.rays(part), view.world_from_body).radiance
             blocks = radiance.reshape(size[1], samples, size[0], samples)
             picture[row : row + size[1], column : column + size[0]] = blocks.mean(axis=(1, 3), dtype=np.float64)
@@ -112,10 +112,10 @@ def sideways(view: View, frame: Frame) -> np.ndarray:
 def true_motion(frame: Frame, view: View, other: View) -> np.ndarray:
     """Motion (u, v) of every pixel's point between two views; NaN in the sky and for invisible points."""
     points = frame.points_world()
-    camera = view.camera.moved(other.world_from_body)
+    camera = view.camera.transform(other.world_from_body)
     pixels, _ = camera.project(points)
     # the difference of two projections is more accurate than the pixel position of a ray in single precision (1e-4 px)
-    here, _ = view.camera.moved(view.world_from_body).project(points)
+    here, _ = view.camera.transform(view.world_from_body).project(points)
     return pixels - here
 
 
@@ -146,10 +146,10 @@ def measure(
     first = render(renderer, view, samples)
     unit = sideways(view, first)
     first_smooth = SmoothPicture(first.radiance)
-    one_pixel = true_motion(first, view, view.moved(unit))
+    one_pixel = true_motion(first, view, view.transform(unit))
     centres = _whole_patches(one_pixel, patch_grid(view.camera.size, stride))
     for step in steps:
-        other = view.moved(step * unit)
+        other = view.transform(step * unit)
         second = render(renderer, other, samples)
         shifts = symmetric_shifts(first_smooth, SmoothPicture(second.radiance), centres)
         # motion relative to the midpoint of both images, as in the estimator
@@ -163,11 +163,11 @@ def measure(
             (shifts.found - shifts.expected(motion))[seen_from_both],
             (parabola - mean_ahead)[seen_from_both],
             (biquadratic - mean_ahead)[seen_from_both],
-            _shown(_windows(first.body, centres))[seen_from_both],
+            _shown_requirement(_windows(first.body, centres))[seen_from_both],
         )
 
 
-def _shown(bodies: np.ndarray) -> np.ndarray:
+def _shown_requirement(bodies: np.ndarray) -> np.ndarray:
     """Body of each patch, or `MIXED`."""
     lowest, highest = bodies.min(axis=(1, 2)), bodies.max(axis=(1, 2))
     return np.where(lowest == highest, lowest, MIXED)

@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.validation.bars import bar_of
+from benchmarks.validation.bars import find_bar
 from benchmarks.validation.estimators import PATCH
-from benchmarks.validation.motion import STEPS_PX, Motion, View, measure, render, supersampled
+from benchmarks.validation.motion import STEPS_PX, Motion, View, measure, render, supersample
 from benchmarks.validation.records import Check, Measure
 from benchmarks.validation.scenes import descent_view, renderer, rock_view, tile_view
 from marsyard.sim.render.renderer import edge_pixels
@@ -52,7 +52,7 @@ def _row(claim: str, errors: Sequence[np.ndarray], steps: np.ndarray, bar: float
         f"{patches} patches, {len(steps)} steps from {steps[0]:.2g} to {steps[-1]:.2g} px; "
         f"one patch scatters by {scatter:.2g} px, the mean by {uncertainty(errors):.1g} px"
     )
-    return Measure(claim, bias(errors), "px", bar_of(claim) if bar is None else bar, how)
+    return Measure(claim, bias(errors), "px", find_bar(claim) if bar is None else bar, how)
 
 
 def _fits(motions: Sequence[Motion]) -> tuple[float, float]:
@@ -113,14 +113,14 @@ def _commonest_rock(motion: Motion) -> int:
     return int(np.bincount(rocks).argmax())
 
 
-def _controlled() -> Iterator[tuple[str, View]]:
+def _control_views() -> Iterator[tuple[str, View]]:
     yield "gusev from 2 km", descent_view("gusev", DESCENT_HEIGHT_M, CONTROL_SIZE)
     yield "rock at 5 m", rock_view(ROCK_SITE, 5.0, CONTROL_SIZE)
 
 
 def run_control(quick: bool) -> Iterator[Measure]:
     samples = 4 if quick else CONTROL_SAMPLES
-    for name, view in _controlled():
+    for name, view in _control_views():
         motions = list(measure(renderer(), view, CONTROL_STEPS_PX, samples))
         claim = f"the estimator's own bias, {name}, {samples**2} samples a pixel"
         bar = QUICK_CONTROL_BAR_PX if quick else None
@@ -135,7 +135,7 @@ def _edge_error(view: View) -> tuple[float, float, int]:
     single = replace(view, scene=replace(view.scene, edge_rays=1))
     one, several = render(renderer(), single), render(renderer(), view)
     edges = edge_pixels(one.radiance, one.range_m, one.body)
-    true = supersampled(renderer(), replace(single, footprint=float(CONTROL_SAMPLES)), CONTROL_SAMPLES)
+    true = supersample(renderer(), replace(single, footprint=float(CONTROL_SAMPLES)), CONTROL_SAMPLES)
     before, after = (
         float(np.sqrt(np.mean((frame.radiance - true).ravel()[edges] ** 2)) / true.mean()) for frame in (one, several)
     )
@@ -147,7 +147,7 @@ def run_edges(quick: bool) -> Iterator[Measure]:
     for distance in OUTLINE_DISTANCES_M:
         whole = rock_view(ROCK_SITE, distance)
         # the upper left part of the image contains an outline in front of distant ground
-        view = replace(whole, camera=whole.camera.cropped(0, 0, size))
+        view = replace(whole, camera=whole.camera.crop(0, 0, size))
         before, after, count = _edge_error(view)
         yield Measure(
             f"radiance at outlines, rms, {distance:g} m from a rock",

@@ -29,7 +29,7 @@ class Yard:
 
     def __init__(self, seed: int) -> None:
         self._rng = np.random.default_rng(seed)
-        self._bank = self._drawn_terrains(12)
+        self._bank = self._list_drawn_terrains(12)
         self._number = 0
 
     def night(self, kind: str, worse: float = 1.0) -> list[NightFigure]:
@@ -53,10 +53,10 @@ class Yard:
         if kind == KINDS[0]:
             return self._rng.integers(0, 12, CASES), self._bank
         if kind == KINDS[1]:
-            return self._rng.integers(0, 20, CASES), self._drawn_terrains(20)
-        return np.arange(CASES), self._drawn_terrains(CASES)
+            return self._rng.integers(0, 20, CASES), self._list_drawn_terrains(20)
+        return np.arange(CASES), self._list_drawn_terrains(CASES)
 
-    def _drawn_terrains(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def _list_drawn_terrains(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Draw error scales in metres and answer probabilities."""
         return self._rng.uniform(0.4, 1.6, count), self._rng.beta(19.0, 1.0, count)
 

@@ -31,7 +31,7 @@ class _Hash:
         return mixed ^ (mixed >> np.uint32(_SHIFT))
 
 
-def _mixed(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _mix(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     result = np.asarray(np.uint32(_LEFT) * x - np.uint32(_RIGHT) * y, dtype=np.uint32)
     return result ^ (result >> np.uint32(_SHIFT))
 
@@ -55,10 +55,10 @@ def seeds(words: np.ndarray) -> np.ndarray:
     for source in range(_POOL):
         for target in range(_POOL):
             if source != target:
-                pool[target] = _mixed(pool[target], hashed(pool[source]))
+                pool[target] = _mix(pool[target], hashed(pool[source]))
     for source in range(_POOL, words.shape[1]):
         for target in range(_POOL):
-            pool[target] = _mixed(pool[target], hashed(words[:, source]))
+            pool[target] = _mix(pool[target], hashed(words[:, source]))
     return np.ascontiguousarray(np.stack(pool, axis=1)).view(np.uint64)
 
 

@@ -39,10 +39,10 @@ def renderer() -> Renderer:
 
 def forward(camera: CameraModel) -> CameraModel:
     """Move the camera to the origin of the body frame."""
-    return camera.moved(rigid(Rotation.identity(), -np.asarray(camera.c)))
+    return camera.transform(rigid(Rotation.identity(), -np.asarray(camera.c)))
 
 
-def made_hazcam() -> Cahvore:
+def make_hazcam() -> Cahvore:
     """A 124 deg camera similar to the MER hazcams, with a moving entrance pupil, if no image label is available."""
     pinhole = Cahv.from_focal_length(
         focal_m=5.58e-3,
@@ -63,7 +63,7 @@ def label_hazcam() -> CameraModel | None:
         return None
     # rover axes: x forward, y right, z down
     turned = rigid(Rotation.from_matrix(np.diag([1.0, -1.0, -1.0])), np.zeros(3))
-    return forward(read_camera(HAZCAM_LABEL).moved(turned))
+    return forward(read_camera(HAZCAM_LABEL).transform(turned))
 
 
 def cameras() -> dict[str, CameraModel]:
@@ -71,7 +71,7 @@ def cameras() -> dict[str, CameraModel]:
     made: dict[str, CameraModel | None] = {
         "MER descent camera, CAHVOR, 45 deg": preset("mer-descent-flown").cameras()[0],
         "MER navcam, CAHVOR, 45 deg": forward(preset("mer-navcam").cameras()[0]),
-        "hazcam, CAHVORE, 124 deg": made_hazcam(),
+        "hazcam, CAHVORE, 124 deg": make_hazcam(),
         "Opportunity's hazcam from its label, CAHVORE, 124 deg": label_hazcam(),
         "research pancam, 16 mm": forward(preset("research-pancam").cameras()[0]),
         "Sony XC-55": preset("xc-55").cameras()[0],
@@ -134,7 +134,7 @@ def tile_view(height_m: float, size: tuple[int, int]) -> View | None:
     surface = synthesise(terrain, np.random.default_rng(SEED))
     middle = (0.5 * 2048 * 0.25, 0.5 * 2048 * 0.25)
     whole = preset("mer-descent-flown").cameras()[0]
-    camera = whole.cropped((whole.size[0] - size[0]) // 2, (whole.size[1] - size[1]) // 2, size)
+    camera = whole.crop((whole.size[0] - size[0]) // 2, (whole.size[1] - size[1]) // 2, size)
     scene = Scene(
         surface,
         middle,
@@ -151,7 +151,7 @@ def descent_view(name: str, height_m: float, size: tuple[int, int]) -> View:
     """Centre of the descent camera's image of a site from a height, slightly tilted."""
     where, surface = site(name), descent_surface(name)
     whole = preset("mer-descent-flown").cameras()[0]
-    camera = whole.cropped((whole.size[0] - size[0]) // 2, (whole.size[1] - size[1]) // 2, size)
+    camera = whole.crop((whole.size[0] - size[0]) // 2, (whole.size[1] - size[1]) // 2, size)
     scene = Scene(
         surface,
         DESCENT_PLACE,
@@ -188,7 +188,7 @@ def rock_view(name: str, distance_m: float, size: tuple[int, int] | None = None)
     whole = forward(preset("research-pancam").cameras()[0])
     if size is None:
         size = whole.size
-    camera = whole.cropped((whole.size[0] - size[0]) // 2, (whole.size[1] - size[1]) // 2, size)
+    camera = whole.crop((whole.size[0] - size[0]) // 2, (whole.size[1] - size[1]) // 2, size)
     scene = Scene(
         surface,
         (eye[0], eye[1]),

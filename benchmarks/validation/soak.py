@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.validation.hostile import DEEDS, HostileParameters, deed
+from benchmarks.validation.hostile import DEEDS, HostileParameters, draw_fault
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.replay import differing_columns
@@ -99,7 +99,7 @@ def soak(folder: Path, cases: int, kills: int, misbehaving: float, killed_after_
     (folder / "soak.toml").write_text(f"cases = {cases}\n{FILE}")
     healthy = _run(folder, "healthy", 0.0, environment, cases)
     began = time.monotonic()
-    killed = _killed(folder, misbehaving, kills, killed_after_s, environment)
+    killed = _run_with_kills(folder, misbehaving, kills, killed_after_s, environment)
     ended = _run(folder, "soaked", None, environment, cases) == 0 or (folder / "soaked" / "cases.parquet").exists()
     seconds = time.monotonic() - began
     deadline = time.monotonic() + _GOING_S
@@ -108,7 +108,7 @@ def soak(folder: Path, cases: int, kills: int, misbehaving: float, killed_after_
     assert healthy == 0, "the undisturbed campaign failed"
     rows = {name: read_rows(folder / name / "cases.parquet") for name in ("healthy", "soaked")}
     campaign = load_campaign(str(folder / "soak.toml"), [f"misbehaving={misbehaving}"])
-    deeds = tuple(_deed(campaign, case) for case in range(cases))
+    deeds = tuple(_draw_fault(campaign, case) for case in range(cases))
     pairs = list(zip(deeds, rows["soaked"], rows["healthy"], strict=True))
     return Soak(
         kills=killed,
@@ -147,7 +147,7 @@ def _run(folder: Path, name: str, misbehaving: float | None, environment: Mappin
     ).returncode
 
 
-def _killed(
+def _run_with_kills(
     folder: Path, misbehaving: float, kills: int, after_s: tuple[float, float], environment: Mapping[str, str]
 ) -> int:
     """Run and resume the campaign, killing each run; return the number of runs killed before their end."""
@@ -176,10 +176,10 @@ def _processes(folder: Path) -> list[int]:
     return found
 
 
-def _deed(campaign: Any, case: int) -> str:
+def _draw_fault(campaign: Any, case: int) -> str:
     parameters = campaign.parameters(case)
     assert isinstance(parameters, HostileParameters)
-    return deed(parameters, campaign.streams(case))
+    return draw_fault(parameters, campaign.streams(case))
 
 
 def isolation(quick: bool) -> Iterator[Measure]:

@@ -108,7 +108,7 @@ def run_shared(quick: bool) -> Iterator[Measure]:
     truths = {"mean": 0.0, "standard deviation": 1.0, "95 % quantile": float(stats.norm.ppf(0.95))}
     for correlation in (0.05, 0.3, 0.9):
         for terrains in (12, 60, 250):
-            found = [_covered(*_errors(rng, correlation, terrains), truths) for _ in range(trials)]
+            found = [_check_coverage(*_errors(rng, correlation, terrains), truths) for _ in range(trials)]
             for what, nominal in (("mean", 0.95), ("standard deviation", 0.95), ("95 % quantile", CONFIDENCE)):
                 covered = float(np.min(np.mean([one[what] for one in found], axis=0)))
                 interval = "bounds" if what.endswith("quantile") else "interval"
@@ -125,7 +125,7 @@ def _errors(rng: np.random.Generator, correlation: float, terrains: int) -> tupl
     return math.sqrt(correlation) * shared + math.sqrt(1.0 - correlation) * own, terrain
 
 
-def _covered(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, float]) -> dict[str, tuple[bool, ...]]:
+def _check_coverage(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, float]) -> dict[str, tuple[bool, ...]]:
     """Whether each interval contains the true value; the bounds of the quantile are separate."""
     lower, upper = quantile_bounds(errors, 0.95, CONFIDENCE, terrain)
     covered: dict[str, tuple[bool, ...]] = {
@@ -143,7 +143,7 @@ def run_sequential(quick: bool) -> Iterator[Measure]:
     rng = np.random.default_rng(3)
     for asked, max_cases in ((0.9, 512), (0.99, 1000)):
         for correlation in (None, 0.2):
-            wrong = np.mean([_decided(rng, asked, max_cases, correlation) for _ in range(trials)], axis=0)
+            wrong = np.mean([_simulate_decision(rng, asked, max_cases, correlation) for _ in range(trials)], axis=0)
             kind = "independent cases" if correlation is None else f"cases on terrains, correlation {correlation}"
             how = f"{trials} campaigns of up to {max_cases} cases at a true rate of {asked}; Monte Carlo error allowed"
             bar = 1.0 - _min_coverage(CONFIDENCE, trials)
@@ -151,7 +151,9 @@ def run_sequential(quick: bool) -> Iterator[Measure]:
                 yield Measure(f"false {word} of {asked} at 90 %, {kind}", share, "", bar, how)
 
 
-def _decided(rng: np.random.Generator, asked: float, max_cases: int, correlation: float | None) -> tuple[bool, bool]:
+def _simulate_decision(
+    rng: np.random.Generator, asked: float, max_cases: int, correlation: float | None
+) -> tuple[bool, bool]:
     """Simulate a campaign; return whether its first deciding look gives PASS, and whether FAIL."""
     if correlation is None:
         success, terrain = rng.random(max_cases) < asked, np.arange(max_cases)

@@ -76,7 +76,7 @@ def _drifts(rows: list[dict[str, Scalar]], name: str, *, judged: bool) -> Iterat
         f"{np.count_nonzero(np.isnan(px))} not tracked to the end"
     )
     if judged:
-        yield _lost(f"targets lost before 2 m: {name}", int(np.isnan(px).sum()), len(px), how)
+        yield _measure_losses(f"targets lost before 2 m: {name}", int(np.isnan(px).sum()), len(px), how)
     tracked = px[~np.isnan(px)]
     rms, worst = float(np.sqrt(np.mean(tracked**2))), float(tracked.max())
     yield Measure(f"drift of the tracked point, rms: {name}", rms, "px", DRIFT_RMS_BAR_PX if judged else None, how)
@@ -85,7 +85,7 @@ def _drifts(rows: list[dict[str, Scalar]], name: str, *, judged: bool) -> Iterat
     )
 
 
-def _lost(claim: str, lost: int, cases: int, how: str) -> Measure:
+def _measure_losses(claim: str, lost: int, cases: int, how: str) -> Measure:
     """Row of the fraction of lost cases, which other figures exclude; one lost case is always allowed."""
     return Measure(claim, lost / cases, "", max(LOST_BAR, 1.0 / cases), how)
 
@@ -97,7 +97,7 @@ def _sun_moved_deg(rows: list[dict[str, Scalar]]) -> float:
 def stereo(quick: bool) -> Iterator[Measure]:
     """Ratio of the range error of the first pair at 10 m to Eq. 1 with the true disparity errors."""
     for camera in CAMERAS:
-        rows = [_designated(number, camera) for number in range(10 if quick else 60)]
+        rows = [_designation_errors(number, camera) for number in range(10 if quick else 60)]
         pairs = [row for row in rows if row is not None]
         found = [row for row in pairs if np.isfinite(row[0])]
         errors, expected = np.array(found).reshape(-1, 2).T
@@ -105,12 +105,12 @@ def stereo(quick: bool) -> Iterator[Measure]:
         how = f"first pairs of {len(errors)} runs of vtt-accuracy at rocks of 1.5 m, disparity wrong by 1/3 px rms"
         yield Measure(f"stereo range error at 10 m over Eq. 1, less 1: {camera}", abs(ratio - 1.0), "", RANGE_BAR, how)
         how = f"of {len(pairs)} selectable targets; the row above leaves them out"
-        yield _lost(
+        yield _measure_losses(
             f"first stereo pairs in which the target is not found: {camera}", len(pairs) - len(found), len(pairs), how
         )
 
 
-def _designated(number: int, camera: str) -> tuple[float, float] | None:
+def _designation_errors(number: int, camera: str) -> tuple[float, float] | None:
     """Range error of a first pair (NaN if the target is not found) and its value from Eq. 1, metres.
 
     None if the target is not selectable.

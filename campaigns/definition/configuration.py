@@ -224,11 +224,11 @@ def read_table(path: Path, model: type[Model]) -> Model:
     try:
         return model.model_validate(read_tables(path))
     except ValidationError as error:
-        problems = [Problem(str(path), key_text(key), message) for key, message in problems_of(error, model)]
+        problems = [Problem(str(path), key_text(key), message) for key, message in validation_problems(error, model)]
         raise ConfigurationError(problems) from error
 
 
-def problems_of(error: ValidationError, model: type[BaseModel]) -> list[tuple[Key, str]]:
+def validation_problems(error: ValidationError, model: type[BaseModel]) -> list[tuple[Key, str]]:
     """Problems of a validation: keys as written in the file, and messages with the allowed values."""
     problems: list[tuple[Key, str]] = []
     for detail in error.errors(include_url=False):

@@ -24,7 +24,7 @@ from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves
 from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
-from marsyard.scenarios.estimators import algorithm_sources, installed
+from marsyard.scenarios.estimators import algorithm_sources, list_installed
 from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
 from marsyard.scenarios.offline import answers_file, is_offline
 from marsyard.scenarios.systems import UnknownScenarioError, scenario, scenario_source
@@ -70,7 +70,7 @@ class Identity:
         return [f"{name} ({old}, now {new})" for name, (old, new) in pairs.items() if old != new]
 
 
-def identity_of(configuration: CampaignConfiguration) -> Identity:
+def create_identity(configuration: CampaignConfiguration) -> Identity:
     """Identity of a campaign if it were run now.
 
     Raises CampaignError where a file that the parameters name cannot be used any more.
@@ -252,7 +252,7 @@ def _describe_custom(spec: str) -> tuple[str, str | None, dict[str, Any]]:
     command = parse_command(spec)
     if command is not None or is_offline(spec):
         return (spec.partition(":")[2] if command is None else command.words[0]), None, {}
-    point = installed().get(spec)
+    point = list_installed().get(spec)
     path, target = (spec, import_object(spec)) if point is None else (point.value, point.load())
     top = path.partition(":")[0].partition(".")[0]
     versions = map(_distribution_version, metadata.packages_distributions().get(top, []))

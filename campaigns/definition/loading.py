@@ -24,13 +24,13 @@ from marsyard.campaigns.definition.configuration import (
     Requirement,
     current_path,
     key_text,
-    problems_of,
     read_tables,
     use_current_names,
+    validation_problems,
 )
 from marsyard.campaigns.definition.identity import find_scenario, list_algorithms
 from marsyard.campaigns.definition.requirements import fill_requirements
-from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
+from marsyard.campaigns.errors import ConfigurationError, Problem, unknown_name_message
 from marsyard.campaigns.sampling.design import MATRICES
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
 from marsyard.scenarios.estimators import labels
@@ -72,7 +72,7 @@ def find_campaign(name_or_path: str) -> Path:
         return path
     files = catalogue()
     if name_or_path not in files:
-        message = f"{not_allowed('campaign', name_or_path, files)}, or the path of a TOML file"
+        message = f"{unknown_name_message('campaign', name_or_path, files)}, or the path of a TOML file"
         raise ConfigurationError([Problem("", "", message)])
     return files[name_or_path]
 
@@ -218,18 +218,18 @@ def _validate(where: str, tables: Mapping[str, Any], overridden: Mapping[tuple[s
                     break
             problems.append(Problem(location, key_text(key), message))
 
-    def validated(model: type[Model], tables: Mapping[str, Any], prefix: Key = ()) -> Model | None:
+    def validate(model: type[Model], tables: Mapping[str, Any], prefix: Key = ()) -> Model | None:
         try:
             return model.model_validate(tables)
         except ValidationError as error:
-            note(problems_of(error, model), prefix)
+            note(validation_problems(error, model), prefix)
             return None
 
     tables, unresolved = fill_requirements(tables)
     note(unresolved)
     if problems:
         raise ConfigurationError(problems)
-    configuration, selected, parameters = validated(CampaignConfiguration, tables), None, None
+    configuration, selected, parameters = validate(CampaignConfiguration, tables), None, None
     try:
         if isinstance(name := tables.get("scenario"), str) and name:
             selected = scenario(name)
@@ -237,7 +237,7 @@ def _validate(where: str, tables: Mapping[str, Any], overridden: Mapping[tuple[s
         note([(("scenario",), str(error))])
     stated = tables.get("parameters", {})
     if selected is not None and isinstance(stated, Mapping):
-        parameters = validated(selected.parameters_type, stated, ("parameters",))
+        parameters = validate(selected.parameters_type, stated, ("parameters",))
     if configuration is None or selected is None or parameters is None:
         raise ConfigurationError(problems)
     complete = parameters.model_dump(mode="json", round_trip=True)
@@ -302,7 +302,7 @@ def _describe_unknown(path: str, parameters: Iterable[str]) -> str:
         if inside:
             allowed = list(dict.fromkeys(f"{prefix}{head}{'.*' if rest else ''}" for head, rest, _ in inside))
             break
-    return not_allowed("parameter", path, names, allowed)
+    return unknown_name_message("parameter", path, names, allowed)
 
 
 def _check_ranges(campaign: Campaign) -> list[tuple[Key, str]]:
@@ -355,7 +355,7 @@ def _find_refusal(campaign: Campaign, values: Mapping[str, Any]) -> str:
     try:
         campaign.with_values(values)
     except ValidationError as error:
-        problems = problems_of(error, campaign.scenario.parameters_type)
+        problems = validation_problems(error, campaign.scenario.parameters_type)
         return "; ".join(f"{key_text(key)}: {message}" if key else message for key, message in problems)
     return ""
 
@@ -401,7 +401,7 @@ def find_unknown_columns(
         named += [("population", name, FLAGS, (*POPULATIONS, *flags)) for name in requirement.population_columns]
         for key, name, wanted, listed in named:
             if not is_known(name, wanted):
-                problems.append((("requirements", index, key), not_allowed(wanted, name, listed)))
+                problems.append((("requirements", index, key), unknown_name_message(wanted, name, listed)))
     return problems
 
 

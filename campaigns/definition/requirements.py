@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from marsyard.campaigns.definition.configuration import Key, Requirement, read_table
-from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
+from marsyard.campaigns.errors import ConfigurationError, Problem, unknown_name_message
 from marsyard.scenarios.systems import systems
 from marsyard.sim.parameters import Parameters
 
@@ -88,7 +88,7 @@ def fill_requirements(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[t
         named = shipped.get(str(entry["id"]))
         wrong = [key for key in entry if key not in ("id", *_CHANGEABLE)]
         if named is None:
-            message = "; ".join((not_allowed("requirement", str(entry["id"]), shipped), *unusable))
+            message = "; ".join((unknown_name_message("requirement", str(entry["id"]), shipped), *unusable))
             problems.append((("requirements", index, "id"), f"{message}; or state a metric"))
         problems += [(("requirements", index, key), "is stated in requirements.toml already") for key in wrong]
         if named is not None and not wrong:

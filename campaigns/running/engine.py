@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, key_text
-from marsyard.campaigns.definition.identity import Identity, describe_algorithms, identity_of
+from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
 from marsyard.campaigns.definition.loading import NUMBERS, find_unknown_columns
 from marsyard.campaigns.errors import RETRYABLE, UNFINISHED, CampaignError, ConfigurationError, Problem, StoreError
 from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
@@ -62,7 +62,7 @@ def run_campaign(campaign: Campaign, directory: Path, executor: ExecutorConfig, 
     record.claim(directory)
     with folder_lock(directory):
         record.claim(directory)
-        identity = identity_of(campaign.configuration)
+        identity = create_identity(campaign.configuration)
         algorithms = describe_algorithms(campaign)
         create_store(directory / ROWS_FILE, {"identity": identity.configuration})
         words, stated = campaign.command, campaign.configuration
@@ -133,7 +133,7 @@ def _continue_campaign(run: _Run, command: str, allow_changed: bool, retry: Sequ
     if "identity" not in stored:
         what = "was run by an earlier version, which stored no rows to continue from"
         raise StoreError(f"{directory} {what}; run it again")
-    before, identity = Identity.read(stored["identity"]), identity_of(configuration)
+    before, identity = Identity.read(stored["identity"]), create_identity(configuration)
     changes = before.differences(identity)
     if changes and not allow_changed:
         listed = "\n  ".join(changes)
@@ -175,7 +175,7 @@ def _execute(run: _Run, store: RowStore, again: Sequence[int]) -> None:
     configuration, table = run.campaign.configuration, run.directory / TABLE_FILE
 
     def record_end(state: str) -> None:
-        progress = {"cases_finished": store.count(), "cases_crashed": store.unfinished()}
+        progress = {"cases_finished": store.count(), "cases_crashed": store.count_unfinished()}
         record.update(run.directory, {"state": state, "finished_utc": record.utc_now(), **progress})
 
     try:

@@ -14,7 +14,7 @@ from typing import Any
 from marsyard.campaigns.definition.campaign import Campaign, replace_value
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
 from marsyard.campaigns.definition.identity import configuration_hash
-from marsyard.campaigns.errors import CampaignError, StoreError, writing
+from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import Watch, resume_campaign, run_campaign
 from marsyard.campaigns.store import record
@@ -73,7 +73,7 @@ outcome and no numbers; outcomes: {", ".join(form.outcomes.__members__) if form 
 """
     if form and form.note:
         text += f"{form.note}\n"
-    with writing(directory):
+    with report_write_errors(directory):
         (directory / MANIFEST_FILE).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
         (directory / README_FILE).write_text(text, encoding="utf-8")
 

@@ -19,7 +19,7 @@ from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
 from marsyard.campaigns.store.products import KEEP_ALL
 from marsyard.scenarios.interface import SelectsInputs
 from marsyard.scenarios.systems import scenario_paths
-from marsyard.sim.cache import cache_directory, kept_bytes, limit_bytes
+from marsyard.sim.cache import cache_directory, cached_bytes, limit_bytes
 from marsyard.sim.kernel_cache import count_compiled_functions, kernels_are_ready
 
 #: Seconds between two reports on compilation.
@@ -77,7 +77,7 @@ def plan_inputs(campaign: Campaign, cases: Iterable[int]) -> InputPlan:
     selects = isinstance(scenario, SelectsInputs)
     try:
         folder = cache_directory("terrain")
-        limit = limit_bytes(folder, kept_bytes(folder))
+        limit = limit_bytes(folder, cached_bytes(folder))
         sizes = {n: scenario.missing_bytes(base, n) if isinstance(scenario, SelectsInputs) else 0 for n in numbers}
     except OSError as error:
         raise CampaignError(f"the cache cannot be used: {error}") from error

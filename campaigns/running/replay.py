@@ -10,8 +10,8 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, key_text, problems_of
-from marsyard.campaigns.definition.identity import Identity, identity_of
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, key_text, validation_problems
+from marsyard.campaigns.definition.identity import Identity, create_identity
 from marsyard.campaigns.errors import UNFINISHED, CampaignError, CaseEndedError, ConfigurationError, Problem
 from marsyard.campaigns.execution.cases import run_cases
 from marsyard.campaigns.execution.worker_process import (
@@ -69,7 +69,7 @@ def replay(directory: Path, case: int) -> Replay:
     load_stored_campaign(directory, configuration)
     stored = stored_row(directory, case)
     identity = read(directory).get("identity")
-    changed = Identity.read(identity).differences(identity_of(configuration)) if identity else []
+    changed = Identity.read(identity).differences(create_identity(configuration)) if identity else []
     with LocalExecutor(1) as workers:
         return replay_with(workers, configuration, case, stored, tuple(changed))
 
@@ -113,7 +113,7 @@ def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) 
     except (UnknownScenarioError, ValidationError) as error:
         problems = [("scenario", str(error))]
         if isinstance(error, ValidationError):
-            found = problems_of(error, campaign.scenario.parameters_type)
+            found = validation_problems(error, campaign.scenario.parameters_type)
             problems = [(key_text(("parameters", *key)), message) for key, message in found]
         hint = "modules of your own are searched for in the current folder"
         problems.append(("", f"nothing was run or changed; {hint}: start the command where the campaign was run"))
@@ -125,7 +125,7 @@ def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) 
 _OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
 
 
-def subject_of(spec: str, task: str | None, limit_s: float) -> suite.Subject:
+def create_subject(spec: str, task: str | None, limit_s: float) -> suite.Subject:
     """Algorithm or part of a name, for a stated task, or the task that it states itself.
 
     Raises CampaignError where the name or the task is unknown.

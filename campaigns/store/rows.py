@@ -158,7 +158,7 @@ class RowStore(AbstractContextManager["RowStore"]):
         (number,) = self._ask("SELECT count(*) FROM cases").fetchone()
         return int(number)
 
-    def unfinished(self) -> int:
+    def count_unfinished(self) -> int:
         """Number of unfinished cases."""
         return len(self.with_outcomes(UNFINISHED))
 

@@ -97,7 +97,7 @@ def show(
     """Show a campaign: parameters, dispersions with their sources, requirements; or the draws of its cases."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.errors import CampaignError
-    from marsyard.cli.showing import described, show_campaign, show_draws, write_draws_figure
+    from marsyard.cli.showing import describe_campaign, show_campaign, show_draws, write_draws_figure
 
     if figure is not None and draw is None:
         raise CampaignError("--figure shows draws: give the number of cases with --draw N")
@@ -105,7 +105,7 @@ def show(
     if figure is not None and draw is not None:
         write_draws_figure(loaded, draw, figure)
     if as_json:
-        typer.echo(json.dumps(described(loaded, draw), indent=2))
+        typer.echo(json.dumps(describe_campaign(loaded, draw), indent=2))
     elif draw is None:
         show_campaign(loaded, console())
     else:

@@ -85,14 +85,14 @@ def resume(
     allow_changed: options.ChangedOption = False,
 ) -> None:
     """Run the remaining cases of an interrupted or killed campaign, and judge it."""
-    from marsyard.campaigns.errors import RETRYABLE, CampaignError, not_allowed
+    from marsyard.campaigns.errors import RETRYABLE, CampaignError, unknown_name_message
     from marsyard.campaigns.running.engine import resume_campaign
     from marsyard.cli.outcome import continue_until_decided
 
     executor, allowed = make_executor(jobs, cluster), [*RETRYABLE, "all"]
     for word in retry or []:
         if word not in allowed:
-            raise CampaignError(f"--retry: {not_allowed('outcome', word, allowed)}")
+            raise CampaignError(f"--retry: {unknown_name_message('outcome', word, allowed)}")
     outcomes = list(RETRYABLE) if "all" in (retry or []) else retry or []
 
     def continue_campaign(watch: Watch) -> None:
@@ -137,7 +137,7 @@ def replay(
     from marsyard.campaigns.store.products import (
         case_directory,
         pack_products,
-        replaced_files,
+        replace_files,
         unpack_products,
         write_packed,
     )
@@ -151,7 +151,7 @@ def replay(
     else:  # the products, stages and figures, all or none
         packed = replayed.products or pack_products({})
         products = unpack_products(packed)
-        with replaced_files(target) as folder:
+        with replace_files(target) as folder:
             write_packed(folder, packed, replayed.row)
             stages = write_stages(folder / "stages", products) if save_stages else 0
             figures = [target / path.relative_to(folder) for path in write_case_figures(folder, products)]
@@ -205,7 +205,7 @@ def shown_progress(directory: Path, next_command: str) -> Iterator[Watch]:
     from marsyard.cli.progress import campaign_progress
 
     try:
-        with stopped_by_signals(), campaign_progress(options.console(stderr=True)) as progress:
+        with stop_on_signals(), campaign_progress(options.console(stderr=True)) as progress:
             yield progress
     except KeyboardInterrupt:
         try:
@@ -218,7 +218,7 @@ def shown_progress(directory: Path, next_command: str) -> Iterator[Watch]:
 
 
 @contextmanager
-def stopped_by_signals() -> Iterator[None]:
+def stop_on_signals() -> Iterator[None]:
     """The first Ctrl-C or SIGTERM stops the work in good order, the second ends the program at once."""
 
     def stop(number: int, _frame: object) -> None:

@@ -93,11 +93,11 @@ def plate(number: int, shot: Shot) -> SvgFigure:
     if picture.exposed is None or picture.counts is None:
         raise ValueError("only what a detector delivered can be displayed")
     signal = np.clip(picture.counts - picture.exposed.detector.parameters.offset_dn, 0.0, None)
-    grey = displayed(signal, np.isfinite(picture.frame.range_m))
+    grey = map_to_grey(signal, np.isfinite(picture.frame.range_m))
     return SvgFigure(shot, grey, f"{number:02d}-{shot.site}-{shot.camera}.jpg")
 
 
-def displayed(signal: Float64[np.ndarray, "rows columns"], ground: Bool[np.ndarray, "rows columns"]) -> Grey:
+def map_to_grey(signal: Float64[np.ndarray, "rows columns"], ground: Bool[np.ndarray, "rows columns"]) -> Grey:
     """Map counts above the offset to greys for the eye; `ground` marks the pixels that see the ground.
 
     White is the brightest ground; a brighter sky is compressed into the upper greys (Reinhard et al. 2002, eq. 4).

@@ -35,12 +35,12 @@ def clean(
     from rich import box
     from rich.table import Table
 
-    from marsyard.campaigns.errors import CampaignError, not_allowed
+    from marsyard.campaigns.errors import CampaignError, unknown_name_message
     from marsyard.sim.cache import UNFINISHED
 
     for kind in kinds or []:
         if kind not in KINDS:
-            raise CampaignError(not_allowed("kind", kind, KINDS))
+            raise CampaignError(unknown_name_message("kind", kind, KINDS))
     found = [cache_usage(kind) for kind in kinds or KINDS]
     freed = 0
     paths = [path for one in found for path in sorted(one["folder"].rglob("*"), reverse=True)] if yes else []

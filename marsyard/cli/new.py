@@ -46,7 +46,7 @@ class NewOptions:
 @with_options(NewOptions)
 def new(given: NewOptions) -> None:
     """Write a commented campaign of your own; at a terminal asks for what is not given."""
-    from marsyard.campaigns.errors import CampaignError, not_allowed
+    from marsyard.campaigns.errors import CampaignError, unknown_name_message
     from marsyard.cli.outcome import evidence_limits
     from marsyard.reports.wording import count
     from marsyard.scenarios.systems import template_paths
@@ -63,7 +63,7 @@ def new(given: NewOptions) -> None:
     asked, known = given.system is None and _is_terminal(), template_paths()
     chosen = given.system or _answer("System", next(iter(known)), asked, partial(_find_word_problem, list(known)))
     if chosen not in known:
-        raise CampaignError(f"--system: {not_allowed('system', chosen, known)}")
+        raise CampaignError(f"--system: {unknown_name_message('system', chosen, known)}")
     template: CampaignTemplate = import_object(known[chosen])
     asks_camera, asks_flight = (asked and option not in template.refused for option in ("camera", "flight"))
     with_terrain = [name for name, one in sites().items() if getattr(one, template.scale) is not None]
@@ -89,11 +89,11 @@ def _is_terminal() -> bool:
 def _write_and_load(path: Path, template: CampaignTemplate, choices: Choices) -> Campaign:
     """Write the campaign and load it; where it cannot be loaded, restore what the path held before."""
     from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.campaigns.errors import CampaignError, writing
+    from marsyard.campaigns.errors import CampaignError, report_write_errors
 
     before = path.read_text(encoding="utf-8") if path.exists() else None
     try:
-        with writing(f"{path}:"):
+        with report_write_errors(f"{path}:"):
             path.write_text(template.text(choices), encoding="utf-8")
     except ValueError as error:
         raise CampaignError(str(error)) from error
@@ -118,9 +118,9 @@ def _answer(question: str, default: str, asked: bool, find_problem: Callable[[st
 
 
 def _find_word_problem(allowed: Sequence[str], answer: str) -> str:
-    from marsyard.campaigns.errors import not_allowed
+    from marsyard.campaigns.errors import unknown_name_message
 
-    return "" if answer in allowed else not_allowed("answer", answer, allowed)
+    return "" if answer in allowed else unknown_name_message("answer", answer, allowed)
 
 
 def _find_file_problem(answer: str) -> str:
@@ -158,7 +158,7 @@ def ingest(
 ) -> None:
     """Make a campaign of real cases from pictures with measured attitude and altitude."""
     from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.campaigns.errors import CampaignError, StoreError, not_allowed, writing
+    from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors, unknown_name_message
     from marsyard.reports.wording import count
     from marsyard.scenarios.systems import systems
     from marsyard.scenarios.user_files import import_object
@@ -166,12 +166,12 @@ def ingest(
     known = {one.name: one.ingest for one in systems() if one.ingest}
     chosen = system or next(iter(known))
     if chosen not in known:
-        raise CampaignError(f"--system: {not_allowed('system', chosen, known)}")
+        raise CampaignError(f"--system: {unknown_name_message('system', chosen, known)}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise StoreError(f"{out} is there already, and is not empty; name a new folder with --out")
     unfinished = out.with_name(f"{out.name}.part{os.getpid()}")
     try:
-        with writing(f"{out}:"):
+        with report_write_errors(f"{out}:"):
             unfinished.mkdir(parents=True)
             made: Ingested = import_object(known[chosen])(folder, unfinished, out.resolve())
             (unfinished / CAMPAIGN_FILE).write_text(made.campaign, encoding="utf-8")

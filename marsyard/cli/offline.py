@@ -124,10 +124,10 @@ def conformance(
     as_json: JsonOption = False,
 ) -> None:
     """Check an algorithm, or a custom motion, instrument or score, against its protocol: types, inputs, time, ..."""
-    from marsyard.campaigns.running.replay import examine, subject_of
+    from marsyard.campaigns.running.replay import create_subject, examine
     from marsyard.scenarios.parts.named import KINDS
 
-    subject = subject_of(algorithm, task, time_limit)
+    subject = create_subject(algorithm, task, time_limit)
     findings = []
     if not as_json:
         kind = "a part of the kind" if subject.task in KINDS else "an algorithm for"

@@ -80,13 +80,13 @@ def with_options(kind: type[Options]) -> Callable[[Callable[[Options], None]], C
     fields = [one.replace(annotation=hints[name]) for name, one in inspect.signature(kind).parameters.items()]
 
     def decorate(command: Callable[[Options], None]) -> Callable[..., None]:
-        def wrapped(**given: Any) -> None:
+        def call(**given: Any) -> None:
             command(kind(**given))
 
-        wrapped.__name__, wrapped.__doc__ = command.__name__, command.__doc__
-        wrapped.__annotations__ = hints
-        wrapped.__signature__ = inspect.Signature(fields)  # type: ignore[attr-defined]
-        return wrapped
+        call.__name__, call.__doc__ = command.__name__, command.__doc__
+        call.__annotations__ = hints
+        call.__signature__ = inspect.Signature(fields)  # type: ignore[attr-defined]
+        return call
 
     return decorate
 
@@ -95,7 +95,7 @@ def handle_user_errors(command: Callable[Parameters, None]) -> Callable[Paramete
     """Wrap a command: a user error, a full disk or a read-only one ends it with one message and status 2."""
 
     @functools.wraps(command)
-    def wrapped(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
         # imported here, so that `doctor` can report a foreign package in place of ours
         from marsyard.campaigns.errors import CampaignError
 
@@ -106,7 +106,7 @@ def handle_user_errors(command: Callable[Parameters, None]) -> Callable[Paramete
                 raise
             fail(error)
 
-    return wrapped
+    return call
 
 
 def fail(error: object) -> NoReturn:

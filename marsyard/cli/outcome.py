@@ -24,7 +24,7 @@ from rich.table import Table
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import stored_columns_now
-from marsyard.campaigns.errors import CampaignError, StoreError, writing
+from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
 from marsyard.campaigns.running.engine import Watch, append_cases, run_campaign
 from marsyard.campaigns.running.preparation import estimate
@@ -37,14 +37,14 @@ from marsyard.cli.options import Exit, size_text
 from marsyard.cli.showing import grid_table
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.comparison import comparison, comparison_grids
-from marsyard.reports.evaluation import Judged, judged, next_look
+from marsyard.reports.evaluation import Judged, evaluate_run, next_look
 from marsyard.reports.presentation import notable_cases
-from marsyard.reports.sampling_design import sampled
+from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.statistics.proportions import minimum_sample_size, planned_looks
 from marsyard.reports.stored import read_run
 from marsyard.reports.tables import verdict_table
 from marsyard.reports.verdicts import ESTIMATE, Verdict, judge_campaign
-from marsyard.reports.wording import count, primary_metric, stated
+from marsyard.reports.wording import count, format_fraction, primary_metric
 
 #: Browsers that can print pages, in order of preference.
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -65,7 +65,7 @@ def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[s
         refresh_table(directory)
     found, page = settle(directory, requirements)
     console.print(verdict_table(found.verdicts))
-    for table in _comparison_tables(found.how.drawn(found.run.frame), found.run.requirements, found.verdicts):
+    for table in _comparison_tables(found.how.draw(found.run.frame), found.run.requirements, found.verdicts):
         console.print(table)
     lines = [f"verdict: {found.whole.word}", found.whole.sentence, f"report: {page}"]
     if not finished:
@@ -86,10 +86,10 @@ def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
 
     Raises StoreError where the folder holds no campaign with rows, or the report cannot be written.
     """
-    found = judged(directory, requirements)
+    found = evaluate_run(directory, requirements)
     if requirements is None and found.run.recorded("state") == "finished":
         record.update(directory, {"exit_code": found.exit_code})
-    with writing("the report"):
+    with report_write_errors("the report"):
         return found, write_evaluation(found)
 
 
@@ -123,7 +123,7 @@ def write_csv(directory: Path) -> Path:
     """Write all rows as CSV in batches, atomically."""
     path = directory / "cases.csv"
     partial = path.with_name(f"{path.name}.partial")
-    with writing(path):
+    with report_write_errors(path):
         table = pq.ParquetFile(directory / TABLE_FILE)
         with pa_csv.CSVWriter(partial, table.schema_arrow) as writer:
             for batch in table.iter_batches():
@@ -181,7 +181,7 @@ def evidence_limits(campaign: Campaign) -> list[str]:
     """
     configuration = campaign.configuration
     asked = [one for one in configuration.requirements if one.decide_by != ESTIMATE]
-    how = sampled(configuration.model_dump(mode="json"))
+    how = read_sampling_design(configuration.model_dump(mode="json"))
     if not asked:
         return []
     if not how.independent:
@@ -189,7 +189,7 @@ def evidence_limits(campaign: Campaign) -> list[str]:
     hardest = max(asked, key=lambda one: minimum_sample_size(one.probability, one.confidence))
     fewest = minimum_sample_size(hardest.probability, hardest.confidence)
     cases = configuration.total_cases
-    what = f"{hardest.id}: {stated(hardest.probability)} at {stated(hardest.confidence)} confidence"
+    what = f"{hardest.id}: {format_fraction(hardest.probability)} at {format_fraction(hardest.confidence)} confidence"
     limits = []
     if cases < fewest:
         limits.append(f"{what} takes at least {count(fewest, 'case')} without a failure, and {cases} are asked for.")
@@ -242,7 +242,7 @@ def run_until_decided(campaign: Campaign, directory: Path, executor: ExecutorCon
     Raises CampaignError for dependent draws, or without a requirement to decide; and as `run_campaign`.
     """
     configuration = campaign.configuration
-    how = sampled(configuration.model_dump(mode="json"))
+    how = read_sampling_design(configuration.model_dump(mode="json"))
     if not how.independent:
         raise CampaignError(f"--until-decided: {how.no_probability}")
     if all(asked.decide_by == ESTIMATE for asked in configuration.requirements):
@@ -265,7 +265,7 @@ def continue_until_decided(directory: Path, executor: ExecutorConfig, watch: Wat
         if configuration.max_cases is None:
             return
         plain = configuration.model_dump(mode="json")
-        how, cases = sampled(plain), configuration.total_cases
+        how, cases = read_sampling_design(plain), configuration.total_cases
         look = next_look(judge_campaign(read_frame(directory), plain["requirements"], how), how, cases)
         if look is None:
             watch.note(f"stopped after {cases} of at most {count(configuration.max_cases, 'case')}")

@@ -141,14 +141,14 @@ def take(shot: Shot, *, detector: bool = True, both: bool = True) -> list[Pictur
     pictures = []
     for number, camera in enumerate(taken):
         frame = process_renderer(default_backend()).render(scene, rays[number], pose)
-        exposed, counts = _exposed(shot, ground, camera, number, frame) if detector else (None, None)
+        exposed, counts = _expose(shot, ground, camera, number, frame) if detector else (None, None)
         suffix = "" if len(cameras) == 1 else ("-left", "-right")[number]
-        filled = _filled(ground, frame)
-        pictures.append(Picture(suffix, camera.moved(pose), camera, frame, scene, exposed, counts, filled))
+        filled = _mark_filled(ground, frame)
+        pictures.append(Picture(suffix, camera.transform(pose), camera, frame, scene, exposed, counts, filled))
     return pictures
 
 
-def _filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows columns"] | None:
+def _mark_filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows columns"] | None:
     """Mark the pixels that see ground in holes of a terrain model; None for the ground of a preset."""
     terrain = ground.terrain
     if terrain.source is None:
@@ -160,7 +160,7 @@ def _filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows columns"
     return np.asarray(seen & holes[row, column])
 
 
-def _exposed(
+def _expose(
     shot: Shot, ground: SiteGround, camera: CameraModel, number: int, frame: Frame
 ) -> tuple[sensor.AutoExposure, UInt16[np.ndarray, "rows columns"]]:
     """Expose the camera's detector at the site automatically; its rows are not summed."""
@@ -170,9 +170,7 @@ def _exposed(
     sun_au = 1.0 / math.sqrt(air.solar_irradiance)
     lit = {"responsivity_e_s": of_camera.light.responsivity_e_s(sun_au), "sun_au": sun_au}
     parameters = of_camera.detector.model_copy(update={**lit, "rows_summed": 1})
-    detector = sensor.Detector.drawn(
-        sensor.natural_fall_off(camera), parameters, streams.generator("detector response")
-    )
+    detector = sensor.Detector.draw(sensor.natural_fall_off(camera), parameters, streams.generator("detector response"))
     # the frame's radiance factor is over the sunlight at the ground; the detector's is over that above the air
     radiance = frame.radiance * np.float32(air.direct_share(math.radians(shot.sun_elevation_deg)))
     exposed = sensor.auto_expose(

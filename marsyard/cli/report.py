@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from marsyard.cli.campaign import make_executor, stopped_by_signals
+from marsyard.cli.campaign import make_executor, stop_on_signals
 from marsyard.cli.options import DirectoryArgument, Exit, JobsOption, JsonOption, console, handle_user_errors
 
 LOOPBACK = "127.0.0.1"
@@ -94,14 +94,14 @@ def dashboard(
 ) -> None:
     """Write a dashboard over stored campaigns: requirements, latest verdicts, trends, pages of campaigns and cases."""
     from marsyard.campaigns.definition.requirements import read_requirements
-    from marsyard.campaigns.errors import CampaignError, writing
+    from marsyard.campaigns.errors import CampaignError, report_write_errors
     from marsyard.reports.dashboard.site import write_site
 
     missing = [str(one) for one in directories if not one.is_dir()]
     if missing:
         raise CampaignError(f"no such folder: {', '.join(missing)}")
     stated = None if requirements is None else {one.id: one for one in read_requirements(requirements)}
-    with writing(out):
+    with report_write_errors(out):
         site = write_site(out, directories, stated)
     for problem in site.problems:
         typer.echo(f"not shown: {problem}", err=True)
@@ -133,7 +133,7 @@ def nightly(
 
     Exit status: as of the campaigns, the worst; 1 also for a regression, or a campaign that could not be run.
     """
-    from marsyard.campaigns.errors import writing
+    from marsyard.campaigns.errors import report_write_errors
     from marsyard.campaigns.store.record import folder_lock, git_commit
     from marsyard.cli import nightly_plan as plans
     from marsyard.cli.progress import campaign_progress
@@ -141,14 +141,14 @@ def nightly(
 
     path = plan or plans.PLAN_FILE
     stated, executor = plans.read_plan(path), make_executor(jobs, None)
-    with writing(out):
+    with report_write_errors(out):
         (out / plans.RUNS).mkdir(parents=True, exist_ok=True)
     with folder_lock(out), History(out / plans.HISTORY_FILE) as history:
         night = history.begin(git_commit())
         # the page of a night that is killed
         plans.write_page(history, night, out, ())
         try:
-            with stopped_by_signals(), campaign_progress(console(stderr=True)) as watch:
+            with stop_on_signals(), campaign_progress(console(stderr=True)) as watch:
                 for one in stated.campaigns:
                     plans.run_planned(plans.Night(history, night, out, executor, stated), one, path.parent, watch)
         except KeyboardInterrupt:

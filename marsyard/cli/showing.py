@@ -14,9 +14,9 @@ from rich.text import Text
 
 from marsyard.campaigns.definition.campaign import Campaign, leaves, value_at
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, description_at
-from marsyard.campaigns.errors import CampaignError, writing
+from marsyard.campaigns.errors import CampaignError, report_write_errors
 from marsyard.campaigns.sampling.design import describe_design
-from marsyard.reports.wording import asked_text, count, split_unit
+from marsyard.reports.wording import count, requirement_text, split_unit
 
 if TYPE_CHECKING:
     from marsyard.reports.section import Grid
@@ -65,7 +65,7 @@ def show_campaign(campaign: Campaign, console: Console) -> None:
         console.print(table)
     table = _table("Requirements", "id", "statement", "asked")
     for asked in configuration.requirements:
-        table.add_row(Text(asked.id), Text(asked.statement), Text(asked_text(asked, asked.metric)))
+        table.add_row(Text(asked.id), Text(asked.statement), Text(requirement_text(asked, asked.metric)))
     console.print(table)
 
 
@@ -74,7 +74,7 @@ def show_draws(campaign: Campaign, cases: int, console: Console) -> None:
 
     A row begins with minimum, mean and maximum over all cases; of values other than numbers, the number of kinds.
     """
-    drawn, nominal = drawn_values(campaign, cases), int(campaign.configuration.design.nominal)
+    drawn, nominal = list_drawn_values(campaign, cases), int(campaign.configuration.design.nominal)
     _print_head(campaign.configuration, console)
     cases = cases if drawn else 0
     units = {path: campaign.marginals[path].unit for path in drawn}
@@ -98,14 +98,14 @@ def show_draws(campaign: Campaign, cases: int, console: Console) -> None:
     console.print(table)
 
 
-def described(campaign: Campaign, cases: int | None) -> dict[str, Any]:
+def describe_campaign(campaign: Campaign, cases: int | None) -> dict[str, Any]:
     """A campaign as plain data, optionally with the draws of its first cases; infinite bounds are None."""
     configuration = campaign.configuration
     data: dict[str, Any] = configuration.model_dump(mode="json")
     data["design"]["text"] = _sampling_text(configuration)
     data["dispersions"] = [_dispersion_data(campaign, path) for path in configuration.dispersions]
     if cases is not None:
-        drawn = drawn_values(campaign, cases)
+        drawn = list_drawn_values(campaign, cases)
         data["draws"] = [
             {"case": case, "values": {path: values[case] for path, values in drawn.items()}} for case in range(cases)
         ]
@@ -122,7 +122,7 @@ def write_draws_figure(campaign: Campaign, cases: int, path: Path) -> None:
     if path.suffix not in _FIGURES:
         raise CampaignError(f"--figure {path}: unknown kind of picture; allowed: {', '.join(_FIGURES)}")
     nominal = int(campaign.configuration.design.nominal)
-    drawn = {name: values[nominal:] for name, values in drawn_values(campaign, cases).items()}
+    drawn = {name: values[nominal:] for name, values in list_drawn_values(campaign, cases).items()}
     if not any(drawn.values()):
         raise CampaignError(f"--figure {path}: nothing is drawn in {count(cases, 'case')}")
     of_each = []
@@ -131,11 +131,11 @@ def write_draws_figure(campaign: Campaign, cases: int, path: Path) -> None:
         if not dispersion.formulas:
             quantiles = [dispersion.quantile((index + 0.5) / _QUANTILES) for index in range(_QUANTILES)]
         of_each.append(Drawn(name, values, quantiles))
-    with writing(f"--figure {path}:"):
+    with report_write_errors(f"--figure {path}:"):
         save_figure(draws_figure(campaign.configuration.name, of_each), path)
 
 
-def drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
+def list_drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
     """The draws of each dispersion in the first cases, by parameter.
 
     Raises CampaignError where the campaign has fewer cases, or a case cannot be drawn.
@@ -219,7 +219,7 @@ def write_stages(directory: Path, products: Mapping[str, Any]) -> int:
     A picture (8 or 16 bits, two dimensions, or three with three bands) is a PNG with unchanged counts; any other array
     is `.npy`; all else is JSON. A table or list of products is a folder. Raises StoreError.
     """
-    with writing(directory):
+    with report_write_errors(directory):
         return _write(directory, products)
 
 

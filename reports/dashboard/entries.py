@@ -16,10 +16,10 @@ from marsyard.campaigns.definition.requirements import StatedRequirement
 from marsyard.campaigns.errors import CampaignError
 from marsyard.reports.campaign import SCHEMA, TWIN_FILE, write_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
-from marsyard.reports.traceability import Algorithm, algorithms_of, format_judged_algorithms
+from marsyard.reports.traceability import Algorithm, format_judged_algorithms, judged_algorithms
 from marsyard.reports.verdicts import ESTIMATE
 from marsyard.reports.wording import NOTHING, percent
-from marsyard.scenarios.systems import system_of
+from marsyard.scenarios.systems import find_system
 
 #: Maximum depth of campaigns below a folder.
 _DEPTH = 3
@@ -122,16 +122,16 @@ def _read_entry(path: Path) -> Entry:
         twin = table(json.loads(file.read_text(encoding="utf-8")))
     record = table(json.loads((path / RECORD_FILE).read_text(encoding="utf-8")))
     parameters = table(table(record.get("configuration")).get("parameters"))
-    system = system_of(str(table(record.get("configuration")).get("scenario")))
+    system = find_system(str(table(record.get("configuration")).get("scenario")))
     name = str(twin.get("campaign") or path.name)
     return Entry(
-        slug=slug_of(path, name),
+        slug=make_slug(path, name),
         directory=path,
         name=name,
         system="other" if system is None else system.name,
         sites=_named(twin, "sites", parameters, "site"),
         algorithms=_named(twin, "algorithms", parameters, "algorithm"),
-        tested=tuple(algorithms_of(record)),
+        tested=tuple(judged_algorithms(record)),
         commit=str(twin.get("git_commit") or "")[:10],
         started=str(twin.get("started_utc") or ""),
         state=str(twin.get("state") or ""),
@@ -139,14 +139,14 @@ def _read_entry(path: Path) -> Entry:
         crashed=int(twin.get("crashed") or 0),
         verdict=str(twin.get("verdict") or ""),
         sentence=str(twin.get("sentence") or ""),
-        shown=tuple(_shown(table(one)) for one in twin.get("verdicts") or ()),
+        shown=tuple(_shown_requirement(table(one)) for one in twin.get("verdicts") or ()),
         kept=tuple(int(case) for case in twin.get("showcases") or ()),
         worst=tuple(str(case) for case in twin.get("worst_cases") or ()),
         outcomes={str(key): int(value) for key, value in table(twin.get("outcomes")).items()},
     )
 
 
-def _shown(verdict: Mapping[str, Any]) -> ShownRequirement:
+def _shown_requirement(verdict: Mapping[str, Any]) -> ShownRequirement:
     values: dict[str, Any] = {
         name: str(verdict.get(name) or "") for name in ("statement", "status", "decide_by", "note")
     }
@@ -157,7 +157,7 @@ def _shown(verdict: Mapping[str, Any]) -> ShownRequirement:
     return ShownRequirement(requirement=str(verdict.get("requirement_id") or "?"), **values)
 
 
-def slug_of(path: Path, name: str) -> str:
+def make_slug(path: Path, name: str) -> str:
     """Folder name that is unique and cannot lead out of the site."""
     plain = re.sub(r"[^A-Za-z0-9-]+", "-", name)[:60].strip("-") or "campaign"
     return f"{plain}-{hashlib.sha256(str(path.resolve()).encode('utf-8', 'replace')).hexdigest()[:10]}"

@@ -19,7 +19,7 @@ from marsyard.reports.campaign import PAGE_FILE, TWIN_FILE, VERIFICATION_FILE, p
 from marsyard.reports.dashboard import entries as stored
 from marsyard.reports.dashboard.entries import Entry, RequirementRow, basis_text, evidence_text, margin_text
 from marsyard.reports.presentation import shown_case
-from marsyard.reports.sections import embedded, replay_command, script_hash
+from marsyard.reports.sections import embed_json, replay_command, script_hash
 from marsyard.reports.stored import read_run
 from marsyard.reports.traceability import algorithm_cells, verification_csv
 from marsyard.reports.wording import percent
@@ -66,7 +66,7 @@ def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, St
         filters=[(name.lower(), name, sorted(found - {""})) for name, found in values.items()],
         most=stored.MAX_FURTHER_VERDICTS,
         coverage=stored.coverage(rows),
-        data=embedded(_data(rows)),
+        data=embed_json(_data(rows)),
         script=script,
         hash=script_hash(script),
         **_FORMATS,

@@ -28,7 +28,7 @@ from marsyard.reports.section import (
     Section,
     Subject,
     SvgFigure,
-    grid_of,
+    build_grid,
     in_page_style,
     new_axes,
     plate,
@@ -38,6 +38,7 @@ from marsyard.reports.wording import (
     NOTHING,
     axis_columns,
     count,
+    format_fraction,
     label,
     magnitude_label,
     note_text,
@@ -45,7 +46,6 @@ from marsyard.reports.wording import (
     numbers,
     percent,
     split_unit,
-    stated,
 )
 
 #: Rows of the paper's Fig. 11 by (category, run).
@@ -64,14 +64,16 @@ def field_test_section(subject: Subject) -> Section | None:
     if not {"run", "category"}.issubset(frame.columns) or not rates.is_flag(frame, "answered"):
         return None
     found = field_cells(subject)
-    grid = grid_of(
+    grid = build_grid(
         found,
         {
             "Category and run": lambda one: f"{one['category']}: {one['run']}",
             "Triples": lambda one: f"{one['valid'].n:,}",
             "Valid": lambda one: f"{one['valid'].hits:,}",
             "% valid": lambda one: percent(one["valid"].share),
-            f"{stated(CONFIDENCE)} interval": lambda one: rates.range_text(one["valid"].lower, one["valid"].upper),
+            f"{format_fraction(CONFIDENCE)} interval": lambda one: rates.range_text(
+                one["valid"].lower, one["valid"].upper
+            ),
             "Paper": lambda one: NOTHING if one["paper_percent"] is None else f"{one['paper_percent']} %",
             "Difference": lambda one: _difference_text(one["difference_points"]),
             "Beyond the bound" if bound is None else f"Beyond {bound:g}": lambda one: (
@@ -101,7 +103,7 @@ def field_cells(subject: Subject) -> list[dict[str, Any]]:
         answered = rates.members(chosen, "valid")
         errors = np.abs(numbers(chosen[answered], subject.metric)) if subject.metric else np.array([])
         errors = errors[np.isfinite(errors)]
-        share, paper = rates.share_of(answered, chosen), FIG_11.get((category, run), {}).get("percent")
+        share, paper = rates.fraction_of(answered, chosen), FIG_11.get((category, run), {}).get("percent")
         found.append(
             {
                 "category": category,
@@ -207,7 +209,7 @@ NOTABLE_M_S = 1.0
 SPEEDS_M_S = (5.0, 10.0, 15.0, 20.0, 25.0)
 
 
-def _landed(subject: Subject) -> pd.DataFrame | None:
+def _landing_rows(subject: Subject) -> pd.DataFrame | None:
     speeds = np.column_stack([numbers(subject.frame, name) for name in (WITH, WITHOUT)])
     landed = subject.frame[np.isfinite(speeds).all(axis=1)]
     return landed if len(landed) else None
@@ -217,12 +219,12 @@ def landing_shares(landed: kinds.Rows) -> dict[str, rates.Share]:
     """Landings that the answer helped and harmed, and answers in time for the thrusters' firing."""
     change = numbers(landed, WITH) - numbers(landed, WITHOUT)
     shares = {
-        f"slower by more than {NOTABLE_M_S:g} m/s": rates.share_of(change < -NOTABLE_M_S, landed),
-        f"faster by more than {NOTABLE_M_S:g} m/s": rates.share_of(change > NOTABLE_M_S, landed),
+        f"slower by more than {NOTABLE_M_S:g} m/s": rates.fraction_of(change < -NOTABLE_M_S, landed),
+        f"faster by more than {NOTABLE_M_S:g} m/s": rates.fraction_of(change > NOTABLE_M_S, landed),
     }
     if rates.is_flag(landed, "answer_punctual"):
         name = "computed before the thrusters fired, of all landings"
-        shares[name] = rates.share_of(rates.flag(landed, "answer_punctual"), landed)
+        shares[name] = rates.fraction_of(rates.flag(landed, "answer_punctual"), landed)
     return shares
 
 
@@ -236,7 +238,7 @@ def _speeds(landed: kinds.Rows, subject: Subject, key: str) -> kinds.Drawn:
             bound = quantile_bounds(values, probability, CONFIDENCE, groups)[1]
             bounded = f" (≤ {number(bound)})" if np.isfinite(bound) else ""
             texts.append(f"{number(float(np.quantile(values, probability)))}{bounded}")
-        rows.append([f"{stated(probability)} quantile (its bound)", *texts])
+        rows.append([f"{format_fraction(probability)} quantile (its bound)", *texts])
     rows += [
         [f"faster than {speed:g} m/s", *(percent(float(np.mean(values > speed))) for values in columns)]
         for speed in SPEEDS_M_S
@@ -252,7 +254,7 @@ def _speeds(landed: kinds.Rows, subject: Subject, key: str) -> kinds.Drawn:
         "largest_loss_m_s": float(change.max()),
     }
     gain, loss = number(data["largest_gain_m_s"]), number(data["largest_loss_m_s"])
-    note = note_text("dimes.landing", confidence=stated(CONFIDENCE), gain=gain, loss=loss)
+    note = note_text("dimes.landing", confidence=format_fraction(CONFIDENCE), gain=gain, loss=loss)
     return [Block(heading="Horizontal speed at touchdown", grid=Grid(["", "With", "Without"], rows), note=note)], data
 
 
@@ -261,7 +263,7 @@ LANDING = kinds.SectionDeclaration(
     "landing",
     "Landing",
     "Horizontal speed at the ground",
-    rows=_landed,
+    rows=_landing_rows,
     parts=(
         kinds.Distribution(
             (kinds.Quantity(WITH, "with"), kinds.Quantity(WITHOUT, "without")),
@@ -312,7 +314,7 @@ def sensitivity_section(subject: Subject) -> Section | None:
     unit = split_unit(metric)[1]
     caption = f"Change of the mean {magnitude_label(metric)} from the 5 % to the 95 % quantile of each condition."
     drawn = plate(effect_figure(drivers, unit), "sensitivity", caption)
-    note = note_text("dimes.sensitivity", metric=magnitude_label(metric), confidence=stated(CONFIDENCE))
+    note = note_text("dimes.sensitivity", metric=magnitude_label(metric), confidence=format_fraction(CONFIDENCE))
     rows = [
         [label(one.column), f"{number(one.low)} to {number(one.high)}"]
         + ["{} ({} to {})".format(*map(number, value)) for value in (one.rank_correlation, one.coefficient, one.effect)]

@@ -16,8 +16,8 @@ from marsyard.reports.figures import RateLine, draw_rates
 from marsyard.reports.hda.sections import PAPER, landing_rows
 from marsyard.reports.kinds import Drawn, Rows
 from marsyard.reports.rates import CONFIDENCE, PooledRate, flag, pooled_rate, rate_text
-from marsyard.reports.section import MUTED, REQUIREMENT, Block, Grid, Section, Subject, grid_of, in_page_style, plate
-from marsyard.reports.wording import NOTHING, note_text, numbers, percent, stated
+from marsyard.reports.section import MUTED, REQUIREMENT, Block, Grid, Section, Subject, build_grid, in_page_style, plate
+from marsyard.reports.wording import NOTHING, format_fraction, note_text, numbers, percent
 from marsyard.scenarios.landing.pictures import CLASS_NAMES, CLASSES
 
 
@@ -77,7 +77,7 @@ def draw_classes(frame: Rows, subject: Subject, key: str) -> Drawn:
         return [], {}
     rates = {name: pooled_rate(frame, *columns) for name, columns in RATES.items()}
     figure = plate(class_figure(classes), key, "Hazards by size: called safe, and not flagged.")
-    by_class = grid_of(
+    by_class = build_grid(
         [one for one in classes if one.called_safe.of],
         {
             "By": lambda one: one.kind,
@@ -89,10 +89,10 @@ def draw_classes(frame: Rows, subject: Subject, key: str) -> Drawn:
         },
     )
     rows = [[name, f"{one.hits:,} of {one.of:,}", rate_text(one)] for name, one in rates.items()]
-    counted = Grid(["Footprints", "Counted", f"Share ({stated(CONFIDENCE)} interval)"], rows)
+    counted = Grid(["Footprints", "Counted", f"Share ({format_fraction(CONFIDENCE)} interval)"], rows)
     blocks = [
         Block(heading="Hazards missed, by height and slope", plates=[figure], grid=by_class),
-        Block(grid=counted, note=note_text("hda.classes", confidence=stated(CONFIDENCE))),
+        Block(grid=counted, note=note_text("hda.classes", confidence=format_fraction(CONFIDENCE))),
     ]
     data = {"rates": {name: asdict(one) for name, one in rates.items()}, "classes": [asdict(one) for one in classes]}
     return blocks, data
@@ -167,7 +167,7 @@ def limits_section(subject: Subject) -> Section | None:
     found = [] if frame is None else curves(frame)
     if not found:
         return None
-    knees = grid_of(
+    knees = build_grid(
         found,
         {
             "Change": lambda one: one.change["name"],
@@ -177,7 +177,7 @@ def limits_section(subject: Subject) -> Section | None:
             "Minimum share within the paper's limit": lambda one: percent(one.min_fraction_within_limit),
         },
     )
-    by_size = grid_of(
+    by_size = build_grid(
         [(one.change, at) for one in found for at in one.points],
         {
             "Change": lambda pair: pair[0]["name"],

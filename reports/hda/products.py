@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from marsyard.reports.presentation import numeric_product, plane, read_arrays, shaped
+from marsyard.reports.presentation import check_shape, numeric_product, plane, read_arrays
 
 Plane = Float[np.ndarray, "rows columns"]
 Pixels = Float[np.ndarray, "n 2"]
@@ -124,7 +124,7 @@ def solved_motion(products: Mapping[str, Any]) -> SolvedMotion | None:
     rotation, translation, rays = (3, 3), (3,), (4, 3)
     shapes = {"rotation": rotation, "translation": translation, "frustum_0": rays, "frustum_1": rays}
     found = read_arrays(products, shapes | {"true_rotation": rotation, "true_translation": translation}, finite=True)
-    points = shaped(products.get("sparse_points"), None, 3)
+    points = check_shape(products.get("sparse_points"), None, 3)
     if found is None or points is None or not len(points):
         return None
     return SolvedMotion(found[0], found[1], (found[2], found[3]), found[4], found[5], points)
@@ -146,7 +146,7 @@ def landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
         return None
     shapes = {"corner": (2,), "apriori": (2,), "surface_from_camera": (3, 3), "world_from_surface": (3, 3)}
     frames = read_arrays(products, shapes | {"limits": (3,)}, finite=True)
-    pixels, cell_m = shaped(products.get("map_pixels"), *planes[0].shape, 2), _positive(products, "cell")
+    pixels, cell_m = check_shape(products.get("map_pixels"), *planes[0].shape, 2), _positive(products, "cell")
     if frames is None or pixels is None or cell_m is None or not np.all(frames[-1] > 0.0):
         return None
     known = np.isfinite(pixels).all(axis=-1)
@@ -163,7 +163,7 @@ def landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
 
 def true_ground(products: Mapping[str, Any]) -> TrueGround | None:
     """The truth; None if missing."""
-    places, heights = shaped(products.get("true_places"), None, None, 2), plane(products.get("true_heights"))
+    places, heights = check_shape(products.get("true_places"), None, None, 2), plane(products.get("true_heights"))
     frames = read_arrays(products, {"camera_true": (4, 4), "true_corner": (2,)}, finite=True)
     spacing_m = _positive(products, "true_spacing")
     if places is None or min(places.shape[:2]) < 2 or heights is None or frames is None or spacing_m is None:

@@ -22,7 +22,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle, Rectangle
 from scipy import ndimage
 
-from marsyard.reports.presentation import numeric_product, plane, save_figures, shaped
+from marsyard.reports.presentation import check_shape, numeric_product, plane, save_figures
 from marsyard.reports.section import GRID, INK, MUTED, SERIES, in_page_style, show_subframe
 
 Picture = Float[np.ndarray, "_ _"]
@@ -110,7 +110,7 @@ def template_px(products: Mapping[str, Any]) -> float | None:
     return float(side) if side is not None and side.ndim == 0 and np.isfinite(side) else None
 
 
-def stops_of(products: Mapping[str, Any]) -> list[StopPictures]:
+def list_stops(products: Mapping[str, Any]) -> list[StopPictures]:
     """The stops in order, up to the first without a left subframe."""
     found: list[StopPictures] = []
     states, table = products.get("states"), products.get("figures")
@@ -137,34 +137,34 @@ def stops_of(products: Mapping[str, Any]) -> list[StopPictures]:
     return found
 
 
-def path_of(products: Mapping[str, Any]) -> RoverPath | None:
+def rover_path(products: Mapping[str, Any]) -> RoverPath | None:
     """The run seen from above; None if missing."""
     target = numeric_product(products.get("target_m"))
     stops, believed = _positions(products.get("rover_true_m")), _positions(products.get("rover_believed_m"))
     estimates = _positions(products.get("target_believed_m"))
     if target is None or target.shape != (3,) or not stops.size or not stops.shape == estimates.shape == believed.shape:
         return None
-    path, rocks = _positions(products.get("path_true_m")), shaped(products.get("rocks_m"), None, 3)
+    path, rocks = _positions(products.get("path_true_m")), check_shape(products.get("rocks_m"), None, 3)
     rocks = np.empty((0, 3)) if rocks is None else rocks
     heading = np.radians(_shaped_or_nan(products.get("heading_deg"), len(stops)))
     return RoverPath(path if path.size else stops, stops, believed, heading, target[:2], estimates, rocks)
 
 
 def _shaped_or_nan(value: object, *shape: int) -> Float[np.ndarray, "..."]:
-    values = shaped(value, *shape)
+    values = check_shape(value, *shape)
     return np.full(shape, np.nan) if values is None else values
 
 
 def _positions(value: object) -> Float[np.ndarray, "n 2"]:
     """East and north of world positions, shape (0, 2) if the product is something else."""
-    values = next((one for width in (2, 3) if (one := shaped(value, None, width)) is not None), np.empty((0, 2)))
+    values = next((one for width in (2, 3) if (one := check_shape(value, None, width)) is not None), np.empty((0, 2)))
     return np.asarray(values[:, :2])
 
 
 @in_page_style
 def draw_stops(products: Mapping[str, Any], max_stops: int | None = None) -> Figure:
     """Subframes of all stops, or of `max_stops` of them, spread evenly from the first to the last."""
-    stops = stops_of(products)
+    stops = list_stops(products)
     if max_stops is not None and len(stops) > max_stops:
         stops = [stops[k] for k in np.unique(np.rint(np.linspace(0, len(stops) - 1, max_stops)).astype(np.int64))]
     side = template_px(products)
@@ -183,7 +183,7 @@ def draw_stops(products: Mapping[str, Any], max_stops: int | None = None) -> Fig
 @in_page_style
 def draw_path(products: Mapping[str, Any]) -> Figure:
     """The path from above, and the target's estimates around the designated point; ValueError if missing."""
-    way = path_of(products)
+    way = rover_path(products)
     if way is None:
         raise ValueError("the products hold no way of a rover")
     figure = Figure(figsize=(10.5, 5.0), layout="constrained")
@@ -197,7 +197,7 @@ def draw_path(products: Mapping[str, Any]) -> Figure:
 def write_vtt_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
     """Write `stops.png` and, if the products hold the path, `way.png` into a folder; returns their paths."""
     figures = {"stops": draw_stops(products)}
-    if path_of(products) is not None:
+    if rover_path(products) is not None:
         figures["way"] = draw_path(products)
     return save_figures(directory, figures)
 

@@ -8,7 +8,14 @@ from typing import Any
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
 from marsyard.reports.section import plate
 from marsyard.reports.vtt import sections
-from marsyard.reports.vtt.case_figures import draw_path, draw_stops, is_vtt_case, path_of, stops_of, write_vtt_figures
+from marsyard.reports.vtt.case_figures import (
+    draw_path,
+    draw_stops,
+    is_vtt_case,
+    list_stops,
+    rover_path,
+    write_vtt_figures,
+)
 from marsyard.reports.vtt.goal import GOAL
 from marsyard.reports.wording import NOTHING, label, note_text, number
 
@@ -23,10 +30,10 @@ _QUANTITIES = (
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
     """A tracking case."""
-    stops = stops_of(products)
+    stops = list_stops(products)
     caption = f"{_MAX_STOPS} stops of {len(stops)}." if len(stops) > _MAX_STOPS else "All stops."
     plates = [plate(draw_stops(products, _MAX_STOPS), f"{key}stops", caption, wide=True)]
-    if path_of(products) is not None:
+    if rover_path(products) is not None:
         text = "The path from above, and the target as estimated."
         plates.append(plate(draw_path(products), f"{key}way", text, wide=True))
     names = [name for name in _QUANTITIES if any(name in stop.figures for stop in stops)]

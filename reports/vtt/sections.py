@@ -19,10 +19,10 @@ from marsyard.reports.figures import RateLine, rate_figure
 from marsyard.reports.kinds import Drawn, MadeBy, Rows
 from marsyard.reports.papers import PaperFacts, read_paper
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
+from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, plate
 from marsyard.reports.stored import table
 from marsyard.reports.vtt.goal import is_closed_loop, is_tracking, losses_grid, selectable
-from marsyard.reports.wording import NOTHING, note_text, number, numbers, percent, stated
+from marsyard.reports.wording import NOTHING, format_fraction, note_text, number, numbers, percent
 
 _PAPER_FILE = Path(__file__).with_name("paper.toml")
 PAPER = read_paper(_PAPER_FILE)
@@ -41,7 +41,7 @@ def table_1_section(subject: Subject) -> Section | None:
         return None
     computed = {row.name: row for row in table_1()}
     both = [(kind, row[name]) for name in PRINTED for kind, row in (("printed", PRINTED), ("computed", computed))]
-    grid = grid_of(
+    grid = build_grid(
         both,
         {
             "Camera": lambda pair: pair[1].name,
@@ -190,7 +190,7 @@ def updates_section(subject: Subject) -> Section | None:
 
 #: Columns that distinguish the lines of a figure of steps, if they vary.
 _SERIES = ("algorithm", "search_px")
-_STEPS_NOTE = note_text("vtt.steps", confidence=stated(CONFIDENCE))
+_STEPS_NOTE = note_text("vtt.steps", confidence=format_fraction(CONFIDENCE))
 #: Edges of classes of the most oblique sight, deg.
 _CLASSES_DEG = (0.0, 45.0, 60.0, 65.0, 70.0, 90.0)
 
@@ -213,16 +213,16 @@ def steps_section(subject: Subject) -> Section | None:
     unit = "% of the distance" if motion["per_cent"] else "deg"
     xlabel = "step (% of the target's distance)" if motion["per_cent"] else "step (deg)"
     caption = "Selectable targets tracked to the end, with intervals; open: the paper's text."
-    grid = grid_of(
+    grid = build_grid(
         found,
         {
             "Tracker": lambda one: one["line"] or "vtt",
             f"Step ({unit})": lambda one: number(one["step"]).rstrip("0").rstrip("."),
-            "Tracked, of selectable": lambda one: rates.share_text(one["good"]),
-            f"{stated(CONFIDENCE)} interval": lambda one: rates.interval_text(one["good"]),
+            "Tracked, of selectable": lambda one: rates.fraction_text(one["good"]),
+            f"{format_fraction(CONFIDENCE)} interval": lambda one: rates.interval_text(one["good"]),
             "Paper": lambda one: NOTHING if one["paper_percent"] is None else f"{one['paper_percent']:.0f} %",
-            "Tracked, of all targets": lambda one: rates.share_text(one["all_targets"]),
-            "False track, of selectable": lambda one: rates.share_text(one["false_tracks"]),
+            "Tracked, of all targets": lambda one: rates.fraction_text(one["all_targets"]),
+            "False track, of selectable": lambda one: rates.fraction_text(one["false_tracks"]),
         },
     )
     figure = rate_figure(lines, (xlabel, "targets tracked"))
@@ -257,9 +257,9 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
                 {
                     "line": line,
                     "step": step,
-                    "good": rates.flag_share(good, "tracked"),
-                    "all_targets": rates.flag_share(chosen, "tracked"),
-                    "false_tracks": rates.flag_share(good, "true_track", wanted=False),
+                    "good": rates.flag_fraction(good, "tracked"),
+                    "all_targets": rates.flag_fraction(chosen, "tracked"),
+                    "false_tracks": rates.flag_fraction(good, "true_track", wanted=False),
                     "paper_percent": next((p for size, p in paper.items() if abs(step - float(size)) < 0.5), None),
                 }
             )
@@ -288,7 +288,7 @@ def _obliquity_grid(frame: Rows) -> Grid | None:
     for low, high in pairwise(_CLASSES_DEG):
         chosen = seen[seen["obliquity_max_deg"].between(low, high, inclusive="left")]
         if len(chosen):
-            shares = [rates.flag_share(chosen[chosen["step"].eq(step)], "tracked") for step in steps]
+            shares = [rates.flag_fraction(chosen[chosen["step"].eq(step)], "tracked") for step in steps]
             rows.append([f"{low:g} to {high:g}", *(f"{one.hits:,} of {one.n:,}" for one in shares)])
     return Grid(["Maximum obliquity (deg)", *(f"{step:g} deg" for step in steps)], rows) if rows else None
 
@@ -312,16 +312,16 @@ def terrains_section(subject: Subject) -> Section | None:
         good, slips = selectable(runs), rates.known(runs, "slip_max")
         lost = good[~rates.flag(good, "tracked")]
         counted = dict(Counter(failure_cause(row) for _, row in lost.iterrows()).most_common())
-        failed, failed_all = (rates.flag_share(one, "tracked", wanted=False) for one in (good, runs))
+        failed, failed_all = (rates.flag_fraction(one, "tracked", wanted=False) for one in (good, runs))
         slip = float(slips.max()) if slips.size else float("nan")
         row = printed.get(name)
         paper = [NOTHING] * 2 if row is None else [f"{row['failures']} of {row['trials']}", row["reason"]]
         causes = "; ".join(f"{cause}: {n}" for cause, n in counted.items()) or "none"
-        ours = [rates.share_text(failed), rates.interval_text(failed), causes, rates.share_text(failed_all)]
+        ours = [rates.fraction_text(failed), rates.interval_text(failed), causes, rates.fraction_text(failed_all)]
         rows.append([name, *paper, *ours, percent(slip)])
         shares = {"failed": asdict(failed), "failed_all": asdict(failed_all)}
         data.append({"name": name, **shares, "causes": counted, "slip_max": slip})
-    head = ["Terrain", "Failures, paper", "Reason, paper", "Failures, ours", f"{stated(CONFIDENCE)} interval"]
+    head = ["Terrain", "Failures, paper", "Reason, paper", "Failures, ours", f"{format_fraction(CONFIDENCE)} interval"]
     head += ["Cause, ours", "Failures, all targets", "Maximum slip"]
     note = note_text("vtt.table_2", limit=f"{EXCESSIVE_DEG:g}")
     title = "Table II: tracking with visual odometry on four kinds of ground"
@@ -352,14 +352,14 @@ def regression_section(subject: Subject) -> Section | None:
         driving=np.where(frame["autonav"].astype(bool), by_map, driving),
         rock=np.where(numbers(frame, "rock_height_m") <= SMALL_M, "small", "large"),
     )
-    grid = grid_of(
+    grid = build_grid(
         list(described.groupby(["driving", "rock", "incline"], sort=True)),
         {
             "Driving": lambda one: str(one[0][0]),
             "Rock": lambda one: str(one[0][1]),
             "Ground": lambda one: str(one[0][2]),
             "Runs": lambda one: f"{len(one[1]):,}",
-            "Tracked to the goal": lambda one: rates.share_text(rates.flag_share(one[1], "tracked")),
+            "Tracked to the goal": lambda one: rates.fraction_text(rates.flag_fraction(one[1], "tracked")),
             "Outcomes": lambda one: ", ".join(sorted(str(outcome) for outcome in one[1]["outcome"].unique())),
             "Position error (cm)": lambda one: rates.spread_text(rates.known(one[1], "position_error_m", 100.0), 2),
             "Drift (px)": lambda one: rates.spread_text(rates.known(one[1], "drift_px"), 1),
@@ -370,7 +370,7 @@ def regression_section(subject: Subject) -> Section | None:
     blocks, lost = [Block(grid=grid, note=note)], losses_grid(frame)
     if lost.rows:
         blocks.append(Block(heading="Runs that lost the target", grid=lost))
-    data = {"tracked": asdict(rates.flag_share(frame, "tracked"))}
+    data = {"tracked": asdict(rates.flag_fraction(frame, "tracked"))}
     return Section("regression", "Regression", "Regression runs on the engineering model", blocks, data)
 
 

@@ -109,7 +109,7 @@ class EstimatorSuite(Suite):
         return str(self._answer(measurements).outcome.name)
 
     def _fails_on(self, name: str, blank: inputs.Blank) -> str:
-        answer = self._answer(inputs.blanked(self.protocol.measurements(), blank))
+        answer = self._answer(inputs.blank_pictures(self.protocol.measurements(), blank))
         if self.protocol.is_valid(answer):
             raise BreachError(f"it answers {answer.outcome.name} to pictures that are {name}: there is nothing to see")
         return str(answer.outcome.name)

@@ -26,7 +26,7 @@ from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
 from marsyard.scenarios.parts import scores
 from marsyard.scenarios.parts.instruments import InstrumentTruth, check_readings
 from marsyard.scenarios.parts.motions import DescentPlace, Poses, check_poses
-from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, KINDS, SCORE, Kind, check_columns, installed
+from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, KINDS, SCORE, Kind, check_columns, list_installed
 from marsyard.sim.dynamics.recorded import RecordedMotion
 from marsyard.sim.frames import rigid
 
@@ -36,9 +36,9 @@ _SLOPE = 0.05
 _NORMAL = np.array([-_SLOPE, 0.0, 1.0]) / np.hypot(_SLOPE, 1.0)
 
 
-def kind_of(spec: str) -> str | None:
+def part_kind(spec: str) -> str | None:
     """Kind of a named part by its entry point, members or annotations; None if they do not determine it."""
-    named = next((kind.name for kind in KINDS.values() if spec in installed(kind.group)), None)
+    named = next((kind.name for kind in KINDS.values() if spec in list_installed(kind.group)), None)
     if named is not None or ":" not in spec:
         return named
     try:

@@ -47,7 +47,7 @@ def designation() -> PixelTarget:
     angles = mast_angles(TARGET_M, mast())
     if angles is None:
         raise ValueError("the mast cannot point at the suite's target")
-    left = mast().left.moved(mast().geometry.rover_from_head(*angles))
+    left = mast().left.transform(mast().geometry.rover_from_head(*angles))
     return PixelTarget(np.asarray(left.project(TARGET_M)[0]), *angles)
 
 
@@ -55,8 +55,8 @@ def take_pictures(aim: MastAim, world_from_rover: RigidTransform, blank: int | N
     """Measurements of a stop at the aim: pictures of the wall, or blank pictures of one count."""
     angles = aim.azimuth_rad, aim.elevation_rad
     head = world_from_rover * mast().geometry.rover_from_head(*angles)
-    left = _take_picture(mast().left.moved(head), aim.left, blank)
-    right = _take_picture(mast().right.moved(head), aim.right, blank)
+    left = _take_picture(mast().left.transform(head), aim.left, blank)
+    right = _take_picture(mast().right.transform(head), aim.right, blank)
     return RoverMeasurements(left, right, mast(), *angles, world_from_rover)
 
 
@@ -64,7 +64,7 @@ def _take_picture(camera: CameraModel, box: PixelBox, blank: int | None) -> Mast
     if blank is not None:
         return MastImage(np.full(box.size[::-1], blank, np.uint16), box.corner)
     wall = TexturedPlane(np.array([_WALL_M, 0.0, 0.0]), np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]), 0.006)
-    radiance = wall.radiance(camera.cropped(*box.corner, box.size))
+    radiance = wall.radiance(camera.crop(*box.corner, box.size))
     return MastImage(np.clip(np.rint(_LEVEL_DN / MEAN * radiance), 0, FULL_SCALE_DN).astype(np.uint16), box.corner)
 
 

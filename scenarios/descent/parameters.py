@@ -22,7 +22,7 @@ from marsyard.scenarios.parts.scores import CustomScores, ScoredDescent
 from marsyard.scenarios.terrain_files import CheckedTerrain, check_site
 from marsyard.sim.dynamics import SwingParameters
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
-from marsyard.sim.parameters import NonNegative, Parameters, bounded, merge_settings
+from marsyard.sim.parameters import NonNegative, Parameters, bounded_field, merge_settings
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.render.photometry import CloudLayer, CloudParameters
 from marsyard.sim.sensor import (
@@ -57,8 +57,8 @@ class Faults(SizedFaults):
     dunes_m: Annotated[NonNegative, Field(le=30.0, description="height of regular dunes on all of the ground")] = 0.0
     cable_bursts: Annotated[NonNegative, Field(le=1e4, description="mean number of noise bursts in a picture")] = 0.0
     late_s: Annotated[NonNegative, Field(le=3.0, description="delay of the second picture after its time tag")] = 0.0
-    repeated_picture: Annotated[int, bounded(0, 3, "picture delivered as the previous one, 2 or 3; 0: none")] = 0
-    black_picture: Annotated[int, bounded(0, 3, "picture that is delivered black, 1 to 3; 0: none")] = 0
+    repeated_picture: Annotated[int, bounded_field(0, 3, "picture delivered as the previous one, 2 or 3; 0: none")] = 0
+    black_picture: Annotated[int, bounded_field(0, 3, "picture that is delivered black, 1 to 3; 0: none")] = 0
     altitude_error: Annotated[NonNegative, Field(le=0.9, description="relative error of all altitudes, too high")] = 0.0
     altitude_error_once: Annotated[NonNegative, Field(le=0.9, description="the same of the second altitude")] = 0.0
     attitude_error_deg: Annotated[NonNegative, Field(le=90.0, description="tilt error of all attitudes")] = 0.0
@@ -121,7 +121,7 @@ PICTURES = 3
 class Location(Parameters):
     """Terrain and position of the descent."""
 
-    bank: Annotated[int, bounded(1, 100000, "terrains in the bank")] = 4
+    bank: Annotated[int, bounded_field(1, 100000, "terrains in the bank")] = 4
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
     terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
     east_m: Annotated[float, Field(description="position of the first picture on the periodic terrain")] = 0.0
@@ -137,7 +137,7 @@ class Location(Parameters):
 class SunParameters(Parameters):
     """Direction to the sun."""
 
-    azimuth_deg: Annotated[float, bounded(-360.0, 720.0, "clockwise from north")] = 270.0
+    azimuth_deg: Annotated[float, bounded_field(-360.0, 720.0, "clockwise from north")] = 270.0
     elevation_deg: Annotated[float, Field(gt=0.0, le=90.0, description="above the horizon")] = 40.0
 
 
@@ -150,18 +150,18 @@ class LanderParameters(Parameters):
     by 1 deg of the view, is not modelled: the zero-phase spot that DIMES masks is 4 deg in radius.
     """
 
-    caster_diameter_m: Annotated[float, bounded(0.0, 100.0, "disc that casts the lander's shadow")] = 10.9
+    caster_diameter_m: Annotated[float, bounded_field(0.0, 100.0, "disc that casts the lander's shadow")] = 10.9
 
 
 class LandingParameters(Parameters):
     """Landing with the estimate (`marsyard.scenarios.descent.score.touchdown`); values but the burn's are assumed."""
 
-    computation_s: Annotated[float, bounded(0.0, 1000.0, "time to the answer on the flight computer")] = 14.0
+    computation_s: Annotated[float, bounded_field(0.0, 1000.0, "time to the answer on the flight computer")] = 14.0
     processor_factor: Annotated[float, Field(gt=0.0, le=1e6, description="flight computer over host (assumed)")] = 600.0
-    min_steered_m_s: Annotated[float, bounded(0.0, 100.0, "speed up to which the thrusters do not steer")] = 5.0
-    max_steered_m_s: Annotated[float, bounded(0.0, 100.0, "steering limit: 80 m/s burn tilted by 15 deg")] = 20.0
-    steering_error: Annotated[float, bounded(0.0, 1.0, "RMS relative error of the steering per axis")] = 0.1
-    burn_error_m_s: Annotated[float, bounded(0.0, 50.0, "RMS of the burn's velocity error per axis")] = 1.0
+    min_steered_m_s: Annotated[float, bounded_field(0.0, 100.0, "speed up to which the thrusters do not steer")] = 5.0
+    max_steered_m_s: Annotated[float, bounded_field(0.0, 100.0, "steering limit: 80 m/s burn tilted by 15 deg")] = 20.0
+    steering_error: Annotated[float, bounded_field(0.0, 1.0, "RMS relative error of the steering per axis")] = 0.1
+    burn_error_m_s: Annotated[float, bounded_field(0.0, 50.0, "RMS of the burn's velocity error per axis")] = 1.0
 
 
 class CameraParameters(Parameters):
@@ -175,13 +175,15 @@ class CameraParameters(Parameters):
     pixel_pitch_um: Annotated[float, Field(gt=0.5, le=100.0)] = 12.0
     columns: Annotated[int, Field(ge=64, le=4096)] = 1024
     rows: Annotated[int, Field(ge=64, le=4096)] = 1024
-    radial_0: Annotated[float, bounded(-0.1, 0.1, "first term of CAHVOR's R")] = 0.00096
-    radial_1: Annotated[float, bounded(-0.5, 0.5, "second term of CAHVOR's R")] = -0.002183
-    radial_2: Annotated[float, bounded(-0.5, 0.5, "third term of CAHVOR's R")] = 0.018547
-    alignment_error_deg: Annotated[float, bounded(0.0, 10.0, "RMS error of the mounting per axis")] = 0.02
-    focal_error: Annotated[float, bounded(0.0, 0.05, "RMS relative error of the calibrated focal length")] = 0.0002
-    centre_error_px: Annotated[float, bounded(0.0, 50.0, "RMS error of the calibrated centre, full-frame")] = 0.5
-    distortion_error_px: Annotated[float, bounded(0.0, 50.0, "RMS error of the distortion in the corners")] = 0.3
+    radial_0: Annotated[float, bounded_field(-0.1, 0.1, "first term of CAHVOR's R")] = 0.00096
+    radial_1: Annotated[float, bounded_field(-0.5, 0.5, "second term of CAHVOR's R")] = -0.002183
+    radial_2: Annotated[float, bounded_field(-0.5, 0.5, "third term of CAHVOR's R")] = 0.018547
+    alignment_error_deg: Annotated[float, bounded_field(0.0, 10.0, "RMS error of the mounting per axis")] = 0.02
+    focal_error: Annotated[float, bounded_field(0.0, 0.05, "RMS relative error of the calibrated focal length")] = (
+        0.0002
+    )
+    centre_error_px: Annotated[float, bounded_field(0.0, 50.0, "RMS error of the calibrated centre, full-frame")] = 0.5
+    distortion_error_px: Annotated[float, bounded_field(0.0, 50.0, "RMS error of the distortion in the corners")] = 0.3
 
 
 class RenderParameters(Parameters):
@@ -221,7 +223,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="own bodies on the ground")] = ()
     sun: SunParameters = SunParameters()
     descent: SwingParameters = SwingParameters()
-    pictures: Annotated[int, bounded(2, 100, "pictures, descent.interval_s apart; a stream gets all")] = PICTURES
+    pictures: Annotated[int, bounded_field(2, 100, "pictures, descent.interval_s apart; a stream gets all")] = PICTURES
     #: By default the last picture and two others, as far apart as possible at equal intervals.
     triple: Annotated[tuple[int, int, int] | None, Field(description="numbers of the three used, from 1")] = None
     flight: Annotated[Flight | None, Field(description="recorded flight or own motion instead of the dynamics")] = None

@@ -30,7 +30,7 @@ from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import Optics, Sample, pixel_sample
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, Kind
-from marsyard.scenarios.parts.scores import ScoredDescent, scored
+from marsyard.scenarios.parts.scores import ScoredDescent, compute_scores
 from marsyard.scenarios.velocity import (
     Horizontal,
     Span,
@@ -80,7 +80,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         world = World.of(p)
         states = picture_states(p, create_flight(p, world.surface, streams))
         optics = camera_optics(p.camera)
-        camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
+        camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
         exposed = take_exposures(p, world, states, optics, draw_detector(p, optics, streams), streams)
         for state, (counts, frame) in zip(states, exposed, strict=True):
             pose = frame.world_from_body
@@ -112,7 +112,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
 def draw_detector(p: DescentScenarioParameters, optics: Optics, streams: Streams) -> Detector:
     """Draw the pixel response of a case's detector, its faults included."""
     settings = faulty_detector(p.faults, p.detector)
-    return Detector.drawn(optics.fall_off, settings, streams.generator("detector response"))
+    return Detector.draw(optics.fall_off, settings, streams.generator("detector response"))
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class Descent:
         overlap: Mapping[str, Scalar] = {}
         if p.triple_indices is not None:
             three = [states[index] for index in p.triple_indices]
-            camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
+            camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
             overlap = feasible_overlap_row(three, world, camera, detector.calibration, p.dimes)
         return cls(p, streams, world, flight, instruments, states, pictures, measurements, overlap)
 
@@ -194,7 +194,7 @@ def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scal
             at_firing=firing,
             touchdown_m_s=landed.with_answer,
         )
-        row |= scored(p.scores, case, {*row, *shared})
+        row |= compute_scores(p.scores, case, {*row, *shared})
     # figures show the three pictures of DIMES' input, or all of other algorithms
     is_dimes = estimate is not None and isinstance(estimate.details, DimesDetails)
     shown = p.triple_indices if is_dimes and p.triple_indices is not None else range(len(descent.pictures))

@@ -38,7 +38,7 @@ class Targets:
     surveyed_m: Float64[np.ndarray, "targets 3"]
 
     @classmethod
-    def drawn(
+    def draw(
         cls, p: TargetParameters, surface: Surface, middle_m: Float64[np.ndarray, "2"], rng: np.random.Generator
     ) -> Targets:
         """Draw targets on the ground around a position; the first ones of those placed are used."""

@@ -242,8 +242,8 @@ def simulate_run(key: RunKey) -> Run:
     times_of_pass = [np.arange(one.start_s + 0.5 * step, one.end_s, step) for one in flight.passes]
     times = np.concatenate(times_of_pass)
     passes = np.repeat(np.arange(len(times_of_pass)), [part.size for part in times_of_pass])
-    clock = Clock.drawn(p.pictures.clock, stream("camera clock"))
-    gps = Gps.drawn(p.gps, flight.span_s, stream("gps"))
+    clock = Clock.draw(p.pictures.clock, stream("camera clock"))
+    gps = Gps.draw(p.gps, flight.span_s, stream("gps"))
     position = gps.measure(flight, times, stream("gps noise")).values
     solution = _estimate_attitudes(p, surface, flight, clock, gps, stream)
     attitudes = solution.attitude(clock.tags(times, stream("picture tags")))
@@ -279,14 +279,14 @@ def _estimate_attitudes(
 ) -> InertialSolution:
     """Simulate both passes over the targets and the gyros, and estimate the attitude over the flight."""
     camera, noise, sightings = field_camera(), stream("sightings"), []
-    targets = Targets.drawn(p.targets, surface, flight.origin_m[:2], stream("targets"))
+    targets = Targets.draw(p.targets, surface, flight.origin_m[:2], stream("targets"))
     for start, end in flight.fly_overs_s:
         times = np.linspace(start, end, p.targets.pictures + 2)[1:-1]
         tags = clock.tags(times, noise)
         fixes = gps.measure(flight, times, noise).values
         motion = flight.motion(times)
         sightings.append(sight_targets(targets, camera, motion, tags, fixes, p.targets.centroid_px, noise))
-    unit = Imu.drawn(p.imu, flight.span_s, stream("imu errors"))
+    unit = Imu.draw(p.imu, flight.span_s, stream("imu errors"))
     increments = unit.increments(flight, *flight.span_s, stream("imu noise"))
     middle = np.array(camera.size) / 2.0
     _, directions = camera.rays(np.stack([middle, middle + np.array([1.0, 0.0])]))

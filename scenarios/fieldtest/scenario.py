@@ -20,7 +20,7 @@ from marsyard.scenarios.exposure import camera_optics, draw_calibrated, render_s
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
 from marsyard.scenarios.fieldtest.run import Category, Run, RunKey, Triple, field_camera, simulate_run
 from marsyard.scenarios.interface import CaseResult, Scalar
-from marsyard.scenarios.parts.scores import ScoredFlight, scored
+from marsyard.scenarios.parts.scores import ScoredFlight, compute_scores
 from marsyard.scenarios.velocity import check_last_interval, consistency_row, velocity_products, velocity_row
 from marsyard.scenarios.views import Eye, SiteGround, site_scene
 from marsyard.sim.camera import CameraModel
@@ -86,7 +86,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         case = Case(run, triple, (first, second, third))
         # one camera took all pictures
         response = Streams(streams.seed, streams.campaign, 0).generator("detector response")
-        detector = Detector.drawn(camera_optics(field_camera()).fall_off, p.detector, response)
+        detector = Detector.draw(camera_optics(field_camera()).fall_off, p.detector, response)
         noise, scene = streams.generator("detector noise"), self._start_scene(key)
         taken = [take_picture(run, scene, ground, state, detector, noise) for state in case.states]
         pictures = [counts for counts, _ in taken]
@@ -114,7 +114,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
             if estimate is not None:
                 known: dict[str, Any] = {"true_velocity_m_s": truth, "states": case.states, "motion": run.flight}
                 flight = ScoredFlight(measurements=measurements, answer=estimate, **known)
-                row |= scored(p.scores, flight, {*row, *conditions})
+                row |= compute_scores(p.scores, flight, {*row, *conditions})
             return algorithm_result(attempt, velocity is not None, row, velocity_products(pictures, estimate, truth))
 
         return case_result(p.algorithms, judge, conditions)
@@ -123,7 +123,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
 def calibrated_camera(p: FieldTestParameters, streams: Streams) -> CameraModel:
     """Return the calibrated camera of the delivered pictures, the same in all cases."""
     rng = Streams(streams.seed, streams.campaign, 0).generator("camera calibration")
-    return draw_calibrated(field_camera(), p.calibration, rng).binned(columns=1, rows=p.detector.rows_summed)
+    return draw_calibrated(field_camera(), p.calibration, rng).bin(columns=1, rows=p.detector.rows_summed)
 
 
 def _find_triple(p: FieldTestParameters, case: int) -> tuple[int, int]:

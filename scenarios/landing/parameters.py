@@ -21,7 +21,7 @@ from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredLanding
 from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.parameters import NonNegative, Parameters, bounded
+from marsyard.sim.parameters import NonNegative, Parameters, bounded_field
 from marsyard.sim.sensor import (
     PRESETS,
     AutoExposureParameters,
@@ -38,15 +38,19 @@ from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 class Faults(SizedFaults):
     """Faults of a flight; lost pictures and receiver outages need a helicopter flight."""
 
-    black_picture: Annotated[int, bounded(0, 2, "number of the black picture, 1 or 2; 0: none")] = 0
-    repeated_picture: Annotated[int, bounded(0, 1, "1: the second picture is the first again")] = 0
-    lost_rows: Annotated[float, bounded(0.0, 1.0, "part of the second picture's rows lost, from below")] = 0.0
-    lost_pictures: Annotated[float, bounded(0.0, 1.0, "part of the pictures; two always arrive")] = 0.0
-    laser_silent: Annotated[int, bounded(0, 1, "1: the altimeter gives no range, to the ground")] = 0
-    laser_stuck: Annotated[float, bounded(0.0, 5.0, "excess of the stuck range over the height, as a fraction")] = 0.0
-    gps_outage_s: Annotated[float, bounded(0.0, 300.0, "silence before the first picture; it lasts to the end")] = 0.0
-    listed_bad_pixels: Annotated[float, bounded(0.0, 0.5, "`bad_pixels` that the camera lists and fills")] = 0.0
-    vehicle_shadow_m: Annotated[float, bounded(0.0, 100.0, "diameter of the shadow's disc; raises the sun")] = 0.0
+    black_picture: Annotated[int, bounded_field(0, 2, "number of the black picture, 1 or 2; 0: none")] = 0
+    repeated_picture: Annotated[int, bounded_field(0, 1, "1: the second picture is the first again")] = 0
+    lost_rows: Annotated[float, bounded_field(0.0, 1.0, "part of the second picture's rows lost, from below")] = 0.0
+    lost_pictures: Annotated[float, bounded_field(0.0, 1.0, "part of the pictures; two always arrive")] = 0.0
+    laser_silent: Annotated[int, bounded_field(0, 1, "1: the altimeter gives no range, to the ground")] = 0
+    laser_stuck: Annotated[
+        float, bounded_field(0.0, 5.0, "excess of the stuck range over the height, as a fraction")
+    ] = 0.0
+    gps_outage_s: Annotated[
+        float, bounded_field(0.0, 300.0, "silence before the first picture; it lasts to the end")
+    ] = 0.0
+    listed_bad_pixels: Annotated[float, bounded_field(0.0, 0.5, "`bad_pixels` that the camera lists and fills")] = 0.0
+    vehicle_shadow_m: Annotated[float, bounded_field(0.0, 100.0, "diameter of the shadow's disc; raises the sun")] = 0.0
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
         """Bad pixels are filled where the camera has a list of them."""
@@ -81,7 +85,7 @@ def faulty_helicopter(faults: Faults, helicopter: HelicopterParameters) -> Helic
     )
 
 
-def arrived_numbers(faults: Faults, count: int, rng: np.random.Generator) -> Int64[np.ndarray, "n"]:
+def draw_arrivals(faults: Faults, count: int, rng: np.random.Generator) -> Int64[np.ndarray, "n"]:
     """Sorted numbers of a flight's pictures that arrive, at least two."""
     kept = max(2, count - round(faults.lost_pictures * count))
     return np.sort(rng.permutation(count)[:kept]).astype(np.int64)
@@ -225,7 +229,7 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
         known = sites().get(name) if isinstance(name, str) else None
         if "terrain_of" in stated or getattr(known, str(scale), None) is None or not isinstance(changes, Mapping):
             return stated
-        return {**stated, "terrain_of": name, "terrain": site(name).terrain(scale).changed(changes).model_dump()}
+        return {**stated, "terrain_of": name, "terrain": site(name).terrain(scale).with_changes(changes).model_dump()}
 
     @model_validator(mode="after")
     def _check_consistency(self) -> LandingScenarioParameters:

@@ -80,7 +80,7 @@ class Pair:
 
 def take_pictures(p: LandingScenarioParameters, world: World, flight: Flight, optics: Optics, streams: Streams) -> Pair:
     """The pictures of a flight; both have the exposure that suits the first."""
-    detector = Detector.drawn(
+    detector = Detector.draw(
         optics.fall_off, faulty_detector(p.faults, p.detector), streams.generator("detector response")
     )
     caster = max(p.lander.caster_diameter_m, p.faults.vehicle_shadow_m)
@@ -96,7 +96,7 @@ def take_pictures(p: LandingScenarioParameters, world: World, flight: Flight, op
     detector = auto_expose(detector, light[0], p.exposure, streams.generator("test pictures")).detector
     counts = [detector.expose(one, noise, motion) for one, motion in zip(light, motions, strict=True)]
     delivered = deliver(counts, 2 * p.faults.repeated_picture, p.faults.black_picture, p.faults.lost_rows)
-    camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
+    camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
     first, second = (
         DetectorImage(one, state.time_s, camera, detector.calibration)
         for one, state in zip(delivered, flight.states, strict=True)
@@ -110,11 +110,11 @@ def measure(p: LandingScenarioParameters, flight: Flight, pair: Pair, streams: S
     The a-priori site is the ground on the first picture's optical axis, at the measured range; without one, at the
     commanded height.
     """
-    unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
+    unit = RangingUnit.draw(p.laser, streams.generator("laser"))
     reading = unit.readings(np.zeros(1), np.array([pair.axis_range_m]), streams.generator("laser noise"))
     slant = float(faulty_ranges(p.faults, reading.values, p.height_m)[0])
     calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
-    camera = calibrated.binned(columns=1, rows=p.detector.rows_summed)
+    camera = calibrated.bin(columns=1, rows=p.detector.rows_summed)
     first, second = (replace(image, camera=camera) for image in pair.images)
     ahead = (slant if np.isfinite(slant) else p.height_m) * camera.a
     return LandingMeasurements(
@@ -165,11 +165,11 @@ class GroundTruth:
         corners = places.reshape(-1, 2)
         west_south, east_north = corners.min(axis=0) - margin, corners.max(axis=0) + margin
         relief = Relief.of(world.ground, west_south, east_north, SPACING_DIAMETERS * limits.diameter_m, world.meshes)
-        heights = relief.averaged(places, relief.spacing_m)
+        heights = relief.average(places, relief.spacing_m)
         # points of the ground in both pictures
         points, visible = np.concatenate([corners, heights.reshape(-1, 1)], axis=1), np.ones(len(corners), dtype=bool)
         for image, state in zip(pair.images, flight.states, strict=True):
-            pixels, ahead = image.camera.moved(state.world_from_body).project(points)
+            pixels, ahead = image.camera.transform(state.world_from_body).project(points)
             with np.errstate(invalid="ignore"):
                 visible &= ahead & np.all((pixels >= 0.0) & (pixels <= np.array(image.camera.size) - 1.0), axis=1)
         around = distance_transform_edt(np.pad(visible.reshape(heights.shape), 1))[1:-1, 1:-1] * step
@@ -318,7 +318,7 @@ def map_errors(ground: Ground, flight: Flight, at: SampledMap, truth: GroundTrut
     local = ground.elevation.places(np.stack([rows, columns], axis=-1).astype(np.float64))
     start = flight.states[0].position_m
     places = start[:2] + local @ ground.world_from_surface.as_matrix()[:2, :2].T
-    exact = truth.relief.averaged(places, ground.elevation.cell_m) - start[2]
+    exact = truth.relief.average(places, ground.elevation.cell_m) - start[2]
     error = ground.elevation.elevation_m - exact
     known = np.isfinite(error)
     values = error[known]

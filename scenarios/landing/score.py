@@ -115,7 +115,7 @@ def landing_row(
     site, relief, landed = estimate.site_world, truth.relief, None
     if flight.transit is not None and site is not None:
         ground = GroundPatch(np.array([relief.west_m, relief.south_m]), relief.spacing_m, relief.heights_m)
-        unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
+        unit = RangingUnit.draw(p.laser, streams.generator("laser"))
         landed = land(flight.transit, site, ground, unit, streams, stuck_range_m(p.faults, p.height_m))
     if landed is None or site is None:
         columns = (*(f"touchdown_{column}" for column in PLACE_COLUMNS), *TOUCHDOWN_COLUMNS)
@@ -159,7 +159,7 @@ def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]
         tracks = details.tracks
         column, line = np.rint(tracks.first).astype(np.int64).T
         points = pair.frames[0].points_world()[line * pair.images[0].calibration.rows_summed, column]
-        camera = pair.images[1].camera.moved(flight.states[1].world_from_body)
+        camera = pair.images[1].camera.transform(flight.states[1].world_from_body)
         pixels, ahead = camera.project(points)
         with np.errstate(invalid="ignore"):
             inside = np.all((pixels >= BORDER_PX) & (pixels <= np.array(camera.size) - 1.0 - BORDER_PX), axis=1) & ahead

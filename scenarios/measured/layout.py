@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.scenarios.user_files import RecordedAxes, check_together, finite_number, format_problems, parse_table
 from marsyard.sim.files import check_regular, npy_header, open_regular
 from marsyard.sim.frames import direction
-from marsyard.sim.parameters import Parameters, bounded
+from marsyard.sim.parameters import Parameters, bounded_field
 
 #: The two files of every folder.
 INGEST_FILE, TABLE_FILE = "ingest.toml", "pictures.csv"
@@ -67,7 +67,9 @@ class DetectorTable(Parameters):
     transfer_row_s: Annotated[
         float, Field(ge=0.0, le=1.0, description="frame transfer: time under each row while shifted out; 0: none")
     ] = 0.0
-    clear_row_s: Annotated[float, bounded(0.0, 1.0, "frame transfer: time under each row while cleared; 0: none")] = 0.0
+    clear_row_s: Annotated[
+        float, bounded_field(0.0, 1.0, "frame transfer: time under each row while cleared; 0: none")
+    ] = 0.0
     rows_summed: Annotated[
         int | None,
         Field(ge=1, le=64, description="physical rows in a delivered one; by default the camera's ratio of scales"),

@@ -28,7 +28,7 @@ from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
 from marsyard.scenarios.measured.layout import TaskName
 from marsyard.scenarios.parts.named import SCORE, Kind
-from marsyard.scenarios.parts.scores import CustomScores, ScoredSite, ScoredVelocity, scored
+from marsyard.scenarios.parts.scores import CustomScores, ScoredSite, ScoredVelocity, compute_scores
 from marsyard.scenarios.velocity import check_last_interval, consistency_row, velocity_products, velocity_row
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DescentMeasurements, DetectorImage, LandingMeasurements
@@ -152,7 +152,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
         measurements = store.descent_measurements(p.case, images)
         matches = match_images(images)
         axes = [
-            image.camera.moved(RigidTransform.from_rotation(attitude.world_from_body)).boresight()
+            image.camera.transform(RigidTransform.from_rotation(attitude.world_from_body)).boresight()
             for image, attitude in zip(images, measurements.attitudes, strict=True)
         ]
         conditions: dict[str, Scalar] = {
@@ -195,7 +195,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
                     answer=attempt.answer,
                     true_velocity_m_s=None if true_velocity is None else truth,
                 )
-                row |= scored(p.scores, case, {*row, *conditions})
+                row |= compute_scores(p.scores, case, {*row, *conditions})
             products = velocity_products([image.counts for image in images], attempt.answer, truth)
             return algorithm_result(
                 attempt, velocity is not None, row, {**products, **agreement_products(images, pairs)}
@@ -241,7 +241,7 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
             row |= attempt.row
             if attempt.answer is not None:
                 case = ScoredSite(measurements=measurements, answer=attempt.answer, true_poses=true_poses)
-                row |= scored(p.scores, case, {*row, *conditions})
+                row |= compute_scores(p.scores, case, {*row, *conditions})
             products = hda_products(details) if isinstance(details, HdaDetails) else {}
             converged = attempt.answer is not None and attempt.answer.outcome.converged
             return algorithm_result(attempt, converged, row, {**products, **agreement_products(images, pairs)})

@@ -155,7 +155,7 @@ class CustomScores(Parameters):
         return specs
 
 
-def scored(specs: Sequence[str], case: ScoredCase, taken: Collection[str]) -> dict[str, Scalar]:
+def compute_scores(specs: Sequence[str], case: ScoredCase, taken: Collection[str]) -> dict[str, Scalar]:
     """Columns of all scores of a case. Raises ValueError for an invalid column, or one that the row has already."""
     row: dict[str, Scalar] = {}
     for spec, label in zip(specs, labels(specs), strict=True):

@@ -18,7 +18,7 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import SlipParameters
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import MastCalibration
-from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded
+from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.render import CloudParameters, Sun
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import (
@@ -60,8 +60,8 @@ class WorldParameters(Parameters):
     terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
     samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, 2.5 cm apart")] = 2048
     incline: InclineParameters = InclineParameters()
-    rms_slope_deg: Annotated[float | None, bounded(0.0, 30.0, "of rough ground; default: the site's")] = None
-    rock_abundance: Annotated[float | None, bounded(0.0, 0.4, "ground under rocks; default: the site's")] = None
+    rms_slope_deg: Annotated[float | None, bounded_field(0.0, 30.0, "of rough ground; default: the site's")] = None
+    rock_abundance: Annotated[float | None, bounded_field(0.0, 0.4, "ground under rocks; default: the site's")] = None
     largest_near_m: Annotated[NonNegative, Field(description="largest rock left on the route")] = 0.08
     east_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
     north_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
@@ -128,7 +128,7 @@ class LegParameters(Parameters):
     """
 
     motion: Literal["stay", "approach", "back-off", "straight", "turn", "circle"] = "approach"
-    steps: Annotated[int, bounded(1, 200, "number of steps; the maximum of an approach or back-off")] = 60
+    steps: Annotated[int, bounded_field(1, 200, "number of steps; the maximum of an approach or back-off")] = 60
     step_fraction: float = Field(default=0.1, gt=0.0, le=0.9, description="step length over the camera's distance")
     step_m: Annotated[float | None, Field(description="length of a step instead; needed for straight")] = None
     step_deg: Annotated[Turn, Field(description="of a turn or circle")] = 5.0
@@ -158,7 +158,7 @@ class SunParameters(Parameters):
 
     azimuth_deg: Annotated[Azimuth, Field(description="clockwise from north")] = 225.0
     elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="above the horizon")] = 45.0
-    hour_angle_deg_min: Annotated[float, bounded(-1.0, 1.0, "about the pole: 16 deg in 66 min (Table IV)")] = (
+    hour_angle_deg_min: Annotated[float, bounded_field(-1.0, 1.0, "about the pole: 16 deg in 66 min (Table IV)")] = (
         16.0 / 66.0
     )
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0, description="elevation of the pole")] = -2.0

@@ -359,4 +359,4 @@ def map_terrain(p: RoverScenarioParameters, run: Run, leg: LegParameters, target
             middle = float(towards + (number - 0.5 * (leg.wedges - 1)) * MAST_SPACING_RAD)
             wedges.append(Wedge(position.copy(), middle, MAST_HALF_RAD, MAST_MIN_M, MAST_MAX_M))
     for wedge in wedges:
-        run.terrain = run.terrain.sensed(wedge, tuple(obstacles))
+        run.terrain = run.terrain.add_wedge(wedge, tuple(obstacles))

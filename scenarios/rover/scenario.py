@@ -29,7 +29,7 @@ from marsyard.scenarios.conditions import picture_columns
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import SCORE, Kind
-from marsyard.scenarios.parts.scores import scored
+from marsyard.scenarios.parts.scores import compute_scores
 from marsyard.scenarios.rover import score
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.run import Run, Setup, TrackerGuide, TruthGuide, drive_legs, prepare_run, track_target
@@ -324,7 +324,7 @@ def _judge(
         digest = hashlib.sha256(b"".join(stop.pictures.digest for stop in run.stops)).hexdigest()
         row |= {**score.stored_updates(run, p.score.stored_updates), **score.run_conditions(p, run)}
         row |= picture_columns(p.backend, digest)
-    row |= scored(p.scores, score.scored_run(run), {*row, *known})
+    row |= compute_scores(p.scores, score.scored_run(run), {*row, *known})
     return CaseResult(
         run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, score.products(p, run) if judged else {}
     )

@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.interface import PixelBox, TargetUpdate
 from marsyard.algorithms.vtt import VttDetails, VttOptions
 from marsyard.algorithms.vtt.pointing import mast_angles
-from marsyard.algorithms.vtt.stereo import triangulated
+from marsyard.algorithms.vtt.stereo import triangulate
 from marsyard.scenarios.rover import points
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import Triangles, Vector
@@ -70,7 +70,7 @@ class StereoCamera:
     def draw(cls, p: RoverScenarioParameters, streams: Streams) -> StereoCamera:
         """Draw the detectors of the designed pair."""
         design, settings, rng = p.camera.mast(), p.camera.settings(), streams.generator("detector response")
-        left, right = (Detector.drawn(_cached_fall_off(one), settings, rng) for one in (design.left, design.right))
+        left, right = (Detector.draw(_cached_fall_off(one), settings, rng) for one in (design.left, design.right))
         return cls(p, (left, right), streams.generator("detector noise"))
 
     def take(
@@ -91,14 +91,14 @@ class StereoCamera:
         p, scale = self.parameters, np.float32(brightness / self.detectors[0].parameters.sunlight)
 
         def add_rover(shown: Scene) -> Scene:
-            return shown if rover is None else shown.with_objects(Objects.joined([shown.objects, rover]))
+            return shown if rover is None else shown.with_objects(Objects.join([shown.objects, rover]))
 
         def render(shown: Scene, rays: PixelRays) -> Float32[np.ndarray, "rows columns"]:
             frame = process_renderer(p.backend).render(shown, rays, world_from_head, time_s)
             return np.asarray(frame.radiance * scale)
 
         pairs = zip(cameras, boxes, strict=True)
-        pixel_rays = [PixelRays.of(camera.cropped(*box.corner, box.size)) for camera, box in pairs]
+        pixel_rays = [PixelRays.of(camera.crop(*box.corner, box.size)) for camera, box in pairs]
         near = add_rover(scene.within([rays.cone(world_from_head) for rays in pixel_rays]))
         lights, exposure_s = [render(near, rays) for rays in pixel_rays], 0.0
         if p.camera.detector_noise:
@@ -107,7 +107,7 @@ class StereoCamera:
             exposure_s = metered.parameters.exposure_s
             if p.exposure.of == "full-frame":
                 # each block of pixels by its mean light, through a detector of as many pixels
-                light = render(replace(add_rover(scene), edge_rays=1), PixelRays.of(cameras[0].scaled(1.0 / _BINNED)))
+                light = render(replace(add_rover(scene), edge_rays=1), PixelRays.of(cameras[0].scale(1.0 / _BINNED)))
                 response = np.resize(metered.response[: len(light), : light.shape[1]], light.shape)
                 metered = replace(metered, response=response, hot_e_s=None)
             if p.exposure.of != "fixed":
@@ -186,7 +186,7 @@ class Stop(View):
             return np.full(2, np.nan)
         if self.details is not None and self.details.match is not None:
             return np.asarray(self.details.match.pixel, dtype=np.float64)
-        camera = mast.left.moved(mast.geometry.rover_from_head(*self.angles_rad))
+        camera = mast.left.transform(mast.geometry.rover_from_head(*self.angles_rad))
         return np.asarray(camera.project(self.reported_rover)[0], dtype=np.float64)
 
     def error_m(self) -> Float64[np.ndarray, "3"]:
@@ -244,7 +244,7 @@ def choose_target(p: RoverScenarioParameters, world: RunWorld, rig: Rig, stance:
         return target
     in_head = np.asarray(head.inv().apply(target.point_world.copy()))
     left, right = (np.asarray(camera.project(in_head)[0]) for camera in (rig.left, rig.right))
-    position = triangulated(calibrated.left, calibrated.right, left, right)
+    position = triangulate(calibrated.left, calibrated.right, left, right)
     if position is None:
         raise ValueError("the target cannot be triangulated from the start")
     in_rover = np.asarray(calibrated.geometry.rover_from_head(*readings).apply(position))

@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.dynamics.kernels.swing import WindField, wind_profile
 from marsyard.sim.frames import rigid
-from marsyard.sim.parameters import Parameters, Positive, bounded
+from marsyard.sim.parameters import Parameters, Positive, bounded_field
 
 Times = Float64[np.ndarray, "n"]
 Vectors = Float64[np.ndarray, "n 3"]
@@ -145,12 +145,14 @@ WAVES = 24
 class WindParameters(Parameters):
     """Mean wind above the boundary layer, profile of the layer, and gusts."""
 
-    wind_east_m_s: Annotated[float, bounded(-60.0, 60.0, "mean wind to the east")] = 0.0
-    wind_north_m_s: Annotated[float, bounded(-60.0, 60.0, "mean wind to the north")] = 0.0
+    wind_east_m_s: Annotated[float, bounded_field(-60.0, 60.0, "mean wind to the east")] = 0.0
+    wind_north_m_s: Annotated[float, bounded_field(-60.0, 60.0, "mean wind to the north")] = 0.0
     wind_layer_m: Annotated[Positive, Field(le=5000.0, description="depth of the boundary layer (assumed)")] = 500.0
     wind_roughness_m: Annotated[Positive, Field(le=1.0, description="roughness (Mars Pathfinder: 0.03)")] = 0.03
-    gust_intensity_m_s: Annotated[float, bounded(0.0, 20.0, "RMS of each component of the gusts (assumed)")] = 1.5
-    gust_length_m: Annotated[float, bounded(50.0, 5000.0, "length scale (MIL-F-8785C above 610 m: 533 m)")] = 533.0
+    gust_intensity_m_s: Annotated[float, bounded_field(0.0, 20.0, "RMS of each component of the gusts (assumed)")] = 1.5
+    gust_length_m: Annotated[float, bounded_field(50.0, 5000.0, "length scale (MIL-F-8785C above 610 m: 533 m)")] = (
+        533.0
+    )
 
 
 @dataclass(frozen=True)

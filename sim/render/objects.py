@@ -61,7 +61,7 @@ class Objects:
         )
 
     @classmethod
-    def joined(cls, parts: Sequence[Objects]) -> Objects:
+    def join(cls, parts: Sequence[Objects]) -> Objects:
         """Join the bodies of several sets."""
         names = ("triangles", "normals", "albedo", "names", "spheres")
         arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}

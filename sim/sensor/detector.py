@@ -137,7 +137,7 @@ class Detector:
     listed: Bool[np.ndarray, "delivered_rows columns"] | None = None
 
     @classmethod
-    def drawn(cls, fall_off: Picture, parameters: DetectorParameters, rng: np.random.Generator) -> Detector:
+    def draw(cls, fall_off: Picture, parameters: DetectorParameters, rng: np.random.Generator) -> Detector:
         """Draw pixel responses, defects and dust of a detector behind a lens with this fall-off."""
         p, rows = parameters, len(fall_off)
         if rows % p.rows_summed:

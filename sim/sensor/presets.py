@@ -2,7 +2,7 @@
 
 A descent camera is given in the body frame: at its origin, looking along -z, columns along +x. All others are given in
 a frame with x forward, y left and z up, with its origin between the two cameras of a pair: the mast's or the rover's.
-``camera.moved(body_from_mast)`` mounts them on a vehicle.
+``camera.transform(body_from_mast)`` mounts them on a vehicle.
 
 Sources: the field-test paper III.B; the target tracking paper section 3 (research rover); the landing paper section 5;
 Maki et al. 2003, "Mars Exploration Rover Engineering Cameras" (MER). Assumed values are marked.
@@ -399,11 +399,11 @@ def _read(stated: object) -> object:
     return CustomCamera.of(cameras[number], file=path, number=number, subframe_folded_in=bool(folded))
 
 
-def _named_or_read(stated: object) -> object:
+def _read_camera_path(stated: object) -> object:
     """Return a preset's name unchanged; read a path, which has a suffix or a folder."""
     return stated if isinstance(stated, str) and not Path(stated).suffix and "/" not in stated else _read(stated)
 
 
 #: A user camera in a campaign; and a user camera or a preset's name.
 CustomCameraChoice = Annotated[CustomCamera, BeforeValidator(_read)]
-NamedOrCustomCamera = Annotated[str | CustomCamera, BeforeValidator(_named_or_read)]
+NamedOrCustomCamera = Annotated[str | CustomCamera, BeforeValidator(_read_camera_path)]

@@ -124,7 +124,7 @@ class Site(Parameters):
         terrain = (self.descent or self.ground) if scale is None else getattr(self, scale)
         if not isinstance(terrain, TerrainParameters):
             raise ValueError(f"site {self.name} has no terrain at the scale '{scale}'")
-        return terrain.changed(changes) if changes else terrain
+        return terrain.with_changes(changes) if changes else terrain
 
 
 @dataclass(frozen=True)

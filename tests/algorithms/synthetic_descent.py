@@ -177,7 +177,7 @@ def _unit(rng: np.random.Generator) -> np.ndarray:
 
 def measurements_of(path: Flight, counts: list[np.ndarray], detector: DetectorCalibration) -> DescentMeasurements:
     """Exact measurements of a flight with these images; the inertial velocities have a common error of (40, -25)."""
-    camera = CAMERA.binned(1, detector.rows_summed)
+    camera = CAMERA.bin(1, detector.rows_summed)
     times = [100.0 + INTERVAL_S * i for i in range(3)]
     return DescentMeasurements(
         images=tuple(DetectorImage(c, t, camera, detector) for c, t in zip(counts, times, strict=True)),

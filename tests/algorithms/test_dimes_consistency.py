@@ -19,7 +19,7 @@ from marsyard.algorithms.dimes.validity import (
     ValidityCheck,
     combinations,
     failed_checks,
-    propagated,
+    propagate_velocity,
     track_metrics,
 )
 from marsyard.algorithms.image.correlation import Peak
@@ -38,7 +38,7 @@ def track(pair: int, index: int, velocity: np.ndarray, failed: tuple[ValidityChe
 
 @cache
 def nadir_view() -> View:
-    picture = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, CAMERA.binned(1, ROWS_SUMMED), calibration())
+    picture = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, CAMERA.bin(1, ROWS_SUMMED), calibration())
     return build_view(picture, Rotation.identity(), 2000.0, (256, 256))
 
 
@@ -142,7 +142,7 @@ def test_one_wrong_track_rarely_gives_wrong_velocity(tracks_per_pair: int, wrong
 def test_propagation_removes_the_inertial_bias() -> None:
     bias = np.array([6.0, -3.0])
     at_pair, at_firing = np.array([10.0, 2.0]), np.array([14.0, -1.0])
-    np.testing.assert_allclose(propagated(at_pair, at_pair + bias, at_firing + bias), at_firing)
+    np.testing.assert_allclose(propagate_velocity(at_pair, at_pair + bias, at_firing + bias), at_firing)
 
 
 @pytest.mark.parametrize(

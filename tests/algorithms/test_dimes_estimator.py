@@ -94,7 +94,7 @@ def test_template_and_match_show_the_same_ground() -> None:
     for track in tracks:
         ground = []
         for k, pixel in ((track.pair, track.template_pixel), (track.pair + 1, track.match_pixel)):
-            _, rays = measured.images[k].camera.binned(4, 1).rays(pixel[None, :])
+            _, rays = measured.images[k].camera.bin(4, 1).rays(pixel[None, :])
             ray = truth.attitudes[k].apply(rays[0])
             ground.append(truth.positions[k] - ray * truth.positions[k, 2] / ray[2])
         np.testing.assert_allclose(ground[0], ground[1], atol=0.5)  # less than a tenth of a binned pixel
@@ -357,7 +357,7 @@ def test_altitude_error_causes_predicted_velocity_error() -> None:
     assert len(tracks) == 2
     for track in tracks:
         earlier, later = (truth.positions[k, 2] for k in (1, 2))
-        _, rays = measured.images[2].camera.binned(4, 1).rays(track.match_pixel[None, :])
+        _, rays = measured.images[2].camera.bin(4, 1).rays(track.match_pixel[None, :])
         ray = truth.attitudes[2].apply(rays[0])
         position = ray[:2] / -ray[2] * later
         expected = -error / later * position / INTERVAL_S

@@ -55,7 +55,7 @@ def make_blank_view(
 ) -> View:
     picture = np.full((256, 1024), 1000, dtype=np.uint16) if counts is None else counts
     return build_view(
-        DetectorImage(picture, time_s, CAMERA.binned(1, ROWS_SUMMED), calibration()), attitude, altitude_m, (256, 256)
+        DetectorImage(picture, time_s, CAMERA.bin(1, ROWS_SUMMED), calibration()), attitude, altitude_m, (256, 256)
     )
 
 
@@ -95,7 +95,7 @@ def test_distant_rays_end_at_limit_in_same_azimuth() -> None:
 def test_camera_is_above_origin_for_any_mounting_position() -> None:
     attitude = tilt_body(30.0, 45.0, 10.0)
     lever = np.array([0.5, -1.0, -2.0])
-    camera = CAMERA.binned(1, ROWS_SUMMED).moved(RigidTransform.from_translation(lever))
+    camera = CAMERA.bin(1, ROWS_SUMMED).transform(RigidTransform.from_translation(lever))
     image = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, camera, calibration())
     view = build_view(image, attitude, 1400.0, (256, 256))
     np.testing.assert_allclose(view.camera.c, view.centre, atol=1e-9)

@@ -70,7 +70,7 @@ def render_view(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, 
     attitude = Rotation.from_euler("zy", [30.0, 12.0], degrees=True)
     radiance = trace_scene(draw_terrain(), attitude, np.array([500.0, 300.0, 1700.0]))
     detector = calibration(transfer_row_s, clear_row_s)
-    image = DetectorImage(expose_scene(radiance, detector, level=LEVEL), 0.0, CAMERA.binned(1, ROWS_SUMMED), detector)
+    image = DetectorImage(expose_scene(radiance, detector, level=LEVEL), 0.0, CAMERA.bin(1, ROWS_SUMMED), detector)
     return radiance, build_view(image, attitude, 1700.0, (256, 256))
 
 

@@ -125,7 +125,7 @@ def _is_mapped(apex_east: float, azimuths_deg: tuple[float, ...], rocks: tuple[O
     terrain = TerrainMap()
     for azimuth in azimuths_deg:
         wedge = Wedge(np.array([apex_east, 0.0]), float(np.radians(azimuth)), 0.5 * NAVCAM, 1.8, 20.0)
-        terrain = terrain.sensed(wedge, rocks)
+        terrain = terrain.add_wedge(wedge, rocks)
     return terrain
 
 
@@ -137,7 +137,7 @@ def test_passing_an_obstacle_needs_two_wedges() -> None:
     assert navigate(one, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
     positions = _drive_to_goal(two, _make_pose(0.0, 0.0), goal, 0.5)
     assert positions[-1] == pytest.approx(goal, abs=0.02)
-    assert two.mapped(positions).all()
+    assert two.contains(positions).all()
     # Without the obstacle one wedge is wide enough.
     free = _is_mapped(-2.6, (90.0,), ())
     assert navigate(free, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome is NavigationOutcome.PATH
@@ -164,12 +164,12 @@ def test_rocks_in_a_wedge_are_mapped_once() -> None:
     terrain = _is_mapped(0.0, (90.0,), (ahead, adjacent))
     assert [rock.name for rock in terrain.obstacles] == ["ahead"]
     moved = _make_rock(5.2, 0.1, name="ahead")
-    repeated = terrain.sensed(terrain.wedges[0], (moved,))
+    repeated = terrain.add_wedge(terrain.wedges[0], (moved,))
     assert len(repeated.wedges) == 2
     assert repeated.obstacles == (moved,)
     # A rock is visible if only its rim is inside the wedge.
     rim = _make_rock(5.0, 5.0 * np.tan(0.5 * NAVCAM) + 0.2, name="rim")
-    assert len(terrain.sensed(terrain.wedges[0], (rim,)).obstacles) == 2
+    assert len(terrain.add_wedge(terrain.wedges[0], (rim,)).obstacles) == 2
 
 
 def test_wedges_across_south_are_handled() -> None:

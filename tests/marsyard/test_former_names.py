@@ -11,7 +11,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from marsyard.campaigns.definition.identity import identity_of
+from marsyard.campaigns.definition.identity import create_identity
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.store import record
 from marsyard.cli.app import main
@@ -85,7 +85,7 @@ def test_draws_are_those_of_the_former_names(files: tuple[Path, Path]) -> None:
 
 def test_a_stored_campaign_is_read_by_the_current_names(files: tuple[Path, Path], tmp_path: Path) -> None:
     expected = load_campaign(str(files[1])).configuration
-    record.begin(tmp_path, expected, identity_of(expected), "test")
+    record.begin(tmp_path, expected, create_identity(expected), "test")
     text = (tmp_path / "campaign.json").read_text()
     for former, now in (*NAMES, ("most_cases", "max_cases")):
         text = text.replace(f'"{now}', f'"{former}').replace(f".{now}", f".{former}").replace(f" {now}", f" {former}")

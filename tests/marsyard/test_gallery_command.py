@@ -13,7 +13,7 @@ import pytest
 
 from marsyard.cli import app as cli
 from marsyard.cli import gallery as gallery_command
-from marsyard.cli.gallery import PAGE, PLATES, SHEET, SHEET_BYTES, SvgFigure, contact_sheet, displayed, write_gallery
+from marsyard.cli.gallery import PAGE, PLATES, SHEET, SHEET_BYTES, SvgFigure, contact_sheet, map_to_grey, write_gallery
 from marsyard.cli.pictures import Shot
 from marsyard.sim.sensor import PRESETS
 from marsyard.sim.terrain import sites
@@ -92,18 +92,18 @@ def test_display_keeps_the_order_of_grey_values() -> None:
     ground = np.ones((120, 160), dtype=bool)
     ground[:20] = False
     signal = np.where(ground, rng.normal(800.0, 100.0, ground.shape), 3000.0)
-    grey = displayed(signal, ground)
+    grey = map_to_grey(signal, ground)
     assert (grey[~ground] > 250).all()
     assert np.ptp(np.percentile(grey[ground], [1.0, 99.0])) > 60
     order = np.argsort(signal, axis=None)
     assert (np.diff(grey.ravel()[order].astype(int)) >= 0).all()
     # without sky, the brightest terrain is white
-    assert np.percentile(displayed(signal[20:], ground[20:]), 99.8) > 250
+    assert np.percentile(map_to_grey(signal[20:], ground[20:]), 99.8) > 250
 
 
 @pytest.mark.parametrize("image", [np.zeros((8, 8)), np.full((8, 8), 7.0)])
 def test_uniform_images_can_be_displayed(image: np.ndarray) -> None:
-    assert len(np.unique(displayed(image, np.zeros((8, 8), dtype=bool)))) == 1
+    assert len(np.unique(map_to_grey(image, np.zeros((8, 8), dtype=bool)))) == 1
 
 
 @pytest.mark.parametrize("name", [PAGE, SHEET])

@@ -14,7 +14,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli import app as cli
 from marsyard.cli import nightly_plan
-from marsyard.cli.nightly_plan import PLAN_FILE, definition_of, night_seed, read_plan
+from marsyard.cli.nightly_plan import PLAN_FILE, campaign_definition, night_seed, read_plan
 from tests.campaigns.fake_campaign import DISPERSIONS, REQUIREMENT, write_campaign
 
 pytestmark = [
@@ -103,8 +103,8 @@ def test_seeds_differ_between_nights(tmp_path: Path) -> None:
     assert len({night_seed(seed, night) for seed in range(20) for night in range(50)}) == 1000
     path = write_campaign(tmp_path)
     campaign, other = (load_campaign(str(path), seed=seed) for seed in (1, 2))
-    assert definition_of(campaign) == definition_of(other)
-    assert definition_of(campaign) != definition_of(load_campaign(str(path), ["altitude_m=1500"]))
+    assert campaign_definition(campaign) == campaign_definition(other)
+    assert campaign_definition(campaign) != campaign_definition(load_campaign(str(path), ["altitude_m=1500"]))
 
 
 def test_campaigns_of_the_shipped_plan_load() -> None:

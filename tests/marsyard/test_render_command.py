@@ -43,7 +43,7 @@ def _check_picture(prefix: Path, size: tuple[int, int], multiple: int) -> None:
     assert picture.std() > 0.0
     metadata = json.loads(Path(f"{prefix}.json").read_text())
     assert "# Frame: body" in Path(f"{prefix}.cahvor").read_text()
-    camera = read_cahvor(f"{prefix}.cahvor").moved(RigidTransform.from_matrix(metadata["world_from_body"]))
+    camera = read_cahvor(f"{prefix}.cahvor").transform(RigidTransform.from_matrix(metadata["world_from_body"]))
     assert camera.size == size
     with np.load(f"{prefix}.npz") as truth:
         is_surface = np.isfinite(truth["range_m"])

@@ -72,7 +72,7 @@ def test_missing_scenario_is_reported_and_changes_nothing(
 
 
 def test_missing_algorithm_is_reported_and_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from marsyard.campaigns.definition.identity import identity_of
+    from marsyard.campaigns.definition.identity import create_identity
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.store import record
     from marsyard.campaigns.store.rows import ROWS_FILE, create_store
@@ -82,7 +82,7 @@ def test_missing_algorithm_is_reported_and_changes_nothing(tmp_path: Path, monke
     configuration = load_campaign("dimes-smoke", [], 1).configuration
     parameters = {**configuration.parameters, "algorithm": "my_absent_module:Estimator"}
     create_store(folder / ROWS_FILE, {"identity": "x"})
-    identity = identity_of(configuration)
+    identity = create_identity(configuration)
     record.begin(folder, configuration.model_copy(update={"parameters": parameters}), identity, "nobody")
     before = _read_files(folder)
     status, output = run_command("replay", folder, 0)

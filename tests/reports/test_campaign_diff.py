@@ -9,7 +9,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.reports.comparison import Contrast, Figure, campaign_diff_grid, compare_campaigns, figures_of, sample_of
+from marsyard.reports.comparison import (
+    Contrast,
+    Figure,
+    build_sample,
+    campaign_diff_grid,
+    compare_campaigns,
+    list_figures,
+)
 from marsyard.reports.statistics.changes import difference_p
 from marsyard.reports.stored import StoredRun, read_run
 
@@ -62,12 +69,12 @@ def test_terrains_of_different_sites_are_not_paired(make_rows: Rows, make_run: M
 
     gusev, meridiani = read_run(write_site_run("gusev", 1)), read_run(write_site_run("meridiani", 6))
     assert min(entry.p_value for entry in compare_campaigns(gusev, meridiani)[1]) > 0.05
-    first_sample, second_sample = (sample_of(*_select_errors(entry)) for entry in (gusev, meridiani))
+    first_sample, second_sample = (build_sample(*_select_errors(entry)) for entry in (gusev, meridiani))
     assert difference_p(first_sample, second_sample) < 1e-3
 
 
 def _select_errors(run: StoredRun) -> tuple[pd.DataFrame, Figure]:
-    frame, figures = figures_of(run)
+    frame, figures = list_figures(run)
     return frame, next(figure for figure in figures if figure.name == "velocity error (m/s)")
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from marsyard.reports.presentation import gallery_cases, notable_cases
-from marsyard.reports.sections import MAX_POINTS, choose_points, embedded, explorer_data
+from marsyard.reports.sections import MAX_POINTS, choose_points, embed_json, explorer_data
 from marsyard.reports.stored import read_run
 
 Rows = Callable[..., pd.DataFrame]
@@ -43,7 +43,7 @@ def test_explorer_data_have_labels_outcomes_and_values(make_rows: Rows, make_run
 
 def test_embedded_data_are_escaped() -> None:
     hostile = {"</script><script>alert(1)//": "<!--\u2028&"}
-    text = str(embedded(hostile))
+    text = str(embed_json(hostile))
     assert not set("<>&\u2028") & set(text)
     assert json.loads(text) == hostile
 

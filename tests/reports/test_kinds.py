@@ -22,7 +22,7 @@ from marsyard.reports.kinds import (
     SectionDeclaration,
     Statistics,
     condition_bins,
-    flagged,
+    flag_rate,
 )
 from marsyard.reports.papers import PaperFacts
 from marsyard.reports.presentation import Presentation, presentations
@@ -39,8 +39,8 @@ ALTITUDE = SectionDeclaration(
     parts=(
         Statistics("altitude_error_m"),
         Distribution([ERROR], ("altitude error (m)", "share of cases"), "Share of cases up to each error.", bound=5.0),
-        RateTable([Rate("answered", "answered", flagged("answered"))]),
-        RateByCondition(Quantity("altitude_m"), [Rate("answered", "Answered", flagged("answered"))]),
+        RateTable([Rate("answered", "answered", flag_rate("answered"))]),
+        RateByCondition(Quantity("altitude_m"), [Rate("answered", "Answered", flag_rate("answered"))]),
         Scatter([Quantity("altitude_m")], [ERROR], "Every case, and medians of bins."),
     ),
     note="Made up.",

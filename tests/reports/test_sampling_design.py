@@ -16,7 +16,7 @@ from rich.console import Console
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.evaluation import exit_code, overall
-from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, sampled
+from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design
 from marsyard.reports.tables import verdict_table
 from marsyard.reports.verdicts import Status, judge_campaign
 
@@ -35,7 +35,7 @@ DESIGNS = [
     "settings", [{}, {"design": None}, {"design": 3}, {"design": {"kind": None, "nominal": "x"}}, {"dispersions": [1]}]
 )
 def test_default_design_is_independent_draws(settings: dict[str, Any]) -> None:
-    assert sampled(settings) == INDEPENDENT
+    assert read_sampling_design(settings) == INDEPENDENT
     assert INDEPENDENT.no_probability == ""
 
 
@@ -43,7 +43,7 @@ def test_default_design_is_independent_draws(settings: dict[str, Any]) -> None:
 def test_designs_report_rates_without_confidence(
     make_rows: Rows, velocity: dict[str, Any], configuration: dict[str, Any], message: str
 ) -> None:
-    frame, design = make_rows(2000), sampled(configuration)
+    frame, design = make_rows(2000), read_sampling_design(configuration)
     requirements = [{**velocity, "probability": probability} for probability in (0.5, velocity["probability"])]
     for verdict, reference in zip(
         judge_campaign(frame, requirements, design), judge_campaign(frame, requirements), strict=True
@@ -70,7 +70,7 @@ def test_rate_of_a_design_decides_by_estimate(
     make_rows: Rows, velocity: dict[str, Any], configuration: dict[str, Any], message: str
 ) -> None:
     """A rate of 0.98 in 1000 cases meets 0.98 but not 0.99; the verdict has no bounds."""
-    frame, design = make_rows(1000), sampled(configuration)
+    frame, design = make_rows(1000), read_sampling_design(configuration)
     frame["answered"], frame["velocity_error_m_s"] = True, np.where(np.arange(1000) % 50, 0.1, 99.0)
     requirements = [{**velocity, "probability": min_rate, "decide_by": "estimate"} for min_rate in (0.98, 0.99)]
     met, missed = judge_campaign(frame, requirements, design)

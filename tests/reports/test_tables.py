@@ -13,20 +13,20 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from marsyard.reports.rates import share_of
+from marsyard.reports.rates import fraction_of
 from marsyard.reports.tables import outcome_counts, statistics_grid, verdict_table
 from marsyard.reports.verdicts import judge_campaign
 from marsyard.reports.wording import (
     axis_columns,
     category_column,
     driver_columns,
+    format_fraction,
     interval,
     label,
     magnitude_label,
     number,
     percent,
     primary_metric,
-    stated,
 )
 
 Rows = Callable[..., pd.DataFrame]
@@ -129,12 +129,12 @@ def test_rates_are_never_rounded_to_certainty(fraction: float, text: str) -> Non
 
 def test_numbers_and_intervals_are_printed_with_four_digits() -> None:
     assert [number(value) for value in (0.0, -1.5, 12.345, 123.45)] == ["0.000", "−1.500", "12.35", "123.5"]  # noqa: RUF100
-    assert (number(math.nan), number(math.inf), stated(0.9973)) == ("–", "∞", "99.73 %")
+    assert (number(math.nan), number(math.inf), format_fraction(0.9973)) == ("–", "∞", "99.73 %")
     assert (interval(1.0, math.inf), interval(-math.inf, math.inf)) == ("≥ 1.000", "–")
 
 
 def test_rate_without_cases_has_the_interval_0_to_1() -> None:
-    empty = share_of(np.zeros(0, dtype=np.bool_), pd.DataFrame())
+    empty = fraction_of(np.zeros(0, dtype=np.bool_), pd.DataFrame())
     assert (empty.hits, empty.n) == (0, 0)
     assert math.isnan(empty.share)
     assert empty.sound == (0.0, 1.0)

@@ -13,7 +13,7 @@ import pandas as pd
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.evaluation import overall
-from marsyard.reports.traceability import COLUMNS, evidence_of, junit_xml, verification_csv
+from marsyard.reports.traceability import COLUMNS, junit_xml, requirement_evidence, verification_csv
 from marsyard.reports.verdicts import judge_campaign
 
 Rows = Callable[..., pd.DataFrame]
@@ -30,7 +30,7 @@ def test_matrix_has_one_row_per_requirement(make_rows: Rows, velocity: dict[str,
     verdicts = judge_campaign(
         frame, [requirement, {**velocity, "id": HOSTILE, "statement": HOSTILE, "metric": "nonesuch"}]
     )
-    first, second = csv.DictReader(io.StringIO(verification_csv(evidence_of("dimes", verdicts))))
+    first, second = csv.DictReader(io.StringIO(verification_csv(requirement_evidence("dimes", verdicts))))
     assert tuple(first) == COLUMNS
     assert (first["requirement"], first["kind"], first["source"]) == ("DIMES-VEL", "requirement", "the paper")
     assert (first["campaign"], first["verdict"], first["bound"]) == ("dimes", str(verdicts[0].status), "5")

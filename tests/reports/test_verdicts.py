@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marsyard.reports.evaluation import exit_code, overall
-from marsyard.reports.sampling_design import SamplingDesign, sampled
+from marsyard.reports.sampling_design import SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
 from marsyard.reports.verdicts import Status, Verdict, judge_campaign
 
@@ -269,7 +269,7 @@ def test_minimum_cases_of_a_rate_allow_one_failure(
 
 def test_appended_cases_share_the_risk_of_two_looks(velocity: dict[str, Any]) -> None:
     """388 cases with one failure pass at one look, but not at a second look after 230 cases."""
-    design = sampled({"cases": 230, "appended": [158]})
+    design = read_sampling_design({"cases": 230, "appended": [158]})
     frame = _make_rows(388, 1)
     (first,) = judge_campaign(frame[:230], [velocity], design)
     (later,) = judge_campaign(frame, [velocity], design)
@@ -343,7 +343,7 @@ def test_additional_cases_account_for_the_design_effect(velocity: dict[str, Any]
 
 
 def _make_terrain_design(bank: int, **dispersion: Any) -> SamplingDesign:
-    return sampled(
+    return read_sampling_design(
         {
             "parameters": {"location": {"bank": bank}},
             "dispersions": {"location.terrain": dispersion} if dispersion else {},

@@ -259,6 +259,6 @@ def test_inputs_are_physically_consistent() -> None:
     assert 200 < descent.images[0].counts.mean() < 4000
     # The laser ray ends on the ground.
     assert abs(landing.apriori_site_world[2]) < 1e-9
-    blank = inputs.blanked(descent, inputs.BLANKS["saturated"])
+    blank = inputs.blank_pictures(descent, inputs.BLANKS["saturated"])
     assert {int(one.counts.min()) for one in blank.images} == {4095}
     assert trackers.take_pictures(trackers.aim_ahead(), trackers.pose(0.0)).left.counts.std() > 100

@@ -20,13 +20,13 @@ from marsyard.scenarios.estimators import shipped_names
 from marsyard.scenarios.systems import (
     BUILT_IN,
     UnknownScenarioError,
+    find_system,
     problems,
     registry,
     row_columns,
     scenario,
     scenario_names,
     scenario_source,
-    system_of,
     systems,
     template_paths,
 )
@@ -78,7 +78,7 @@ def test_marsyard_systems_are_complete() -> None:
         assert system.summary.endswith("."), system.name
         for name in system.scenarios:
             assert scenario(name).name == name
-            assert system_of(name) is system
+            assert find_system(name) is system
             assert row_columns(name) is not None
         for name, path in system.campaigns.items():
             assert catalogue()[name] == path

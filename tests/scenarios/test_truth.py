@@ -92,8 +92,8 @@ def test_descent_inputs_differ_from_truth(case: int) -> None:
     row = DescentScenario().run(p, streams).row
     (inputs,), (true,) = spies.GIVEN, spies.TRUE
     assert isinstance(true, ScoredDescent)
-    camera = camera_optics(p.camera).camera.binned(columns=1, rows=p.detector.rows_summed)
-    response = Detector.drawn(camera_optics(p.camera).fall_off, p.detector, streams.generator("detector response"))
+    camera = camera_optics(p.camera).camera.bin(columns=1, rows=p.detector.rows_summed)
+    response = Detector.draw(camera_optics(p.camera).fall_off, p.detector, streams.generator("detector response"))
     assert_flight_inputs_differ(inputs, true, camera, [float(row[f"altitude_{k}_m"]) for k in (1, 2, 3)])
     assert_flat_field_differs(inputs.images[0].calibration.flat_field, response)
     times = np.array(p.picture_times_s)
@@ -129,7 +129,7 @@ def test_field_test_inputs_differ_from_truth(case: int) -> None:
     p = make_parameters(runs=runs, algorithm="tests.scenarios.spies:VelocitySpy", **SPIES)
     row = FieldTestScenario().run(p, Streams(5, "test", case)).row
     (inputs,), (true,) = spies.GIVEN, spies.TRUE
-    camera = field_camera().binned(columns=1, rows=p.detector.rows_summed)
+    camera = field_camera().bin(columns=1, rows=p.detector.rows_summed)
     assert_flight_inputs_differ(inputs, true, camera, [float(row[f"altitude_{k}_m"]) for k in (1, 2, 3)])
     transformed = np.diff([state.position_m for state in true.states], axis=0)
     assert_differs("interval velocities", inputs.interval_velocities_m_s, transformed / p.triples.virtual_interval_s)
@@ -154,7 +154,7 @@ def test_landing_inputs_differ_from_truth(case: int, helicopter: dict[str, Any] 
         LandingMeasurements, {"images", "poses", "slant_range_m", "up_body", "apriori_site_world"}
     )
     for image, pose, state in zip(inputs.images, inputs.poses, true.states, strict=True):
-        assert_cameras_differ("camera", image.camera, p.optics.binned(columns=1, rows=p.detector.rows_summed))
+        assert_cameras_differ("camera", image.camera, p.optics.bin(columns=1, rows=p.detector.rows_summed))
         assert_poses_differ("pose", pose.world_from_body, rigid(state.attitude, state.position_m))
     first, range_m = true.states[0], float(row["range_m"])
     assert_differs("slant range", inputs.slant_range_m, range_m)

@@ -56,7 +56,7 @@ def test_site_without_this_scale_is_rejected() -> None:
 def test_camera_points_in_the_stated_direction(ground: SiteGround, name: str, azimuth: float, elevation: float) -> None:
     design = preset(name).design
     pose = camera_pose(ground.surface, design, 3.0, 4.0, 5.0, azimuth, elevation)
-    axes = [camera.moved(pose).a for camera in preset(name).cameras()]
+    axes = [camera.transform(pose).a for camera in preset(name).cameras()]
     # The axes of a pair with toe-in point to both sides of the centre.
     middle = np.mean(axes, axis=0)
     expected = direction(np.radians(azimuth), np.radians(elevation))
@@ -66,13 +66,13 @@ def test_camera_points_in_the_stated_direction(ground: SiteGround, name: str, az
 
 
 def test_upper_edge_of_nadir_image_faces_the_azimuth(ground: SiteGround) -> None:
-    camera = preset("xc-55").cameras()[0].moved(nadir_pose(ground.surface, 0.0, 0.0, 10.0, azimuth_deg=70.0))
+    camera = preset("xc-55").cameras()[0].transform(nadir_pose(ground.surface, 0.0, 0.0, 10.0, azimuth_deg=70.0))
     np.testing.assert_allclose(-camera.down, direction(np.radians(70.0), 0.0), atol=1e-12)
 
 
 def test_mast_is_upright(ground: SiteGround) -> None:
     left, right = (
-        camera.moved(mast_pose(ground.surface, 0.0, 0.0, 1.5, 120.0, -20.0))
+        camera.transform(mast_pose(ground.surface, 0.0, 0.0, 1.5, 120.0, -20.0))
         for camera in preset("mer-navcam").cameras()
     )
     assert abs(left.right[2]) < 1e-12

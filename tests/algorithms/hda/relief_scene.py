@@ -108,7 +108,7 @@ class Pass:
 
     def camera(self, which: int) -> Cahvor:
         """The camera in the world."""
-        return camera(self.columns).moved(self.poses[which])
+        return camera(self.columns).transform(self.poses[which])
 
     def ground(self, which: int, pixels: np.ndarray) -> np.ndarray:
         """Points of the relief at pixels."""

@@ -88,7 +88,7 @@ def make_view(yaw: float, pitch: float, roll: float) -> View:
     body_from_camera = camera_pose(camera())
     counts = np.zeros((240, 320), dtype=np.uint16)
     return View(
-        counts, camera().moved(body_from_camera.inv()), pose(3.0, 4.0, 10.0, yaw, pitch, roll) * body_from_camera
+        counts, camera().transform(body_from_camera.inv()), pose(3.0, 4.0, 10.0, yaw, pitch, roll) * body_from_camera
     )
 
 

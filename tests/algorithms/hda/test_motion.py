@@ -132,11 +132,11 @@ def test_best_of_two_initial_motions_is_selected() -> None:
 def test_scaling_does_not_change_residuals() -> None:
     rng = np.random.default_rng(6)
     points_px, depths = make_tracks(rng, 0.02)
-    result = solve_motion(points_px, project_points(points_px, depths, draw_motion(rng))).scaled(3.0)
+    result = solve_motion(points_px, project_points(points_px, depths, draw_motion(rng))).scale(3.0)
     assert result.depths.mean() == pytest.approx(30.0, rel=0.3)
     np.testing.assert_allclose(
         project_points(points_px, result.depths, result.second_from_first),
-        project_points(points_px, result.depths / 3.0, result.scaled(1.0 / 3.0).second_from_first),
+        project_points(points_px, result.depths / 3.0, result.scale(1.0 / 3.0).second_from_first),
         atol=1e-12,
     )
 

@@ -29,7 +29,7 @@ def render_detector_image(transfer_row_s: float, clear_row_s: float) -> tuple[np
         calibration_error=0.0,
         optics=OpticsParameters(diffraction_px=0.0, diffusion_px=0.0, pixel_aperture=False),
     )
-    detector = Detector.drawn(natural_fall_off(optics), parameters, rng)
+    detector = Detector.draw(natural_fall_off(optics), parameters, rng)
     return scene, DetectorImage(detector.expose(scene, rng), 0.0, optics, detector.calibration)
 
 

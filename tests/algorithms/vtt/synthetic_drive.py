@@ -176,7 +176,7 @@ class Drive:
     def camera(self, world_from_rover: RigidTransform, angles: tuple[float, float], right: bool = False) -> CameraModel:
         """A camera in the world at mast angles."""
         chosen = self.mast.right if right else self.mast.left
-        return chosen.moved(world_from_rover * self.mast.geometry.rover_from_head(*angles))
+        return chosen.transform(world_from_rover * self.mast.geometry.rover_from_head(*angles))
 
     def stop(self, true: RigidTransform, estimated: RigidTransform | None = None) -> TargetUpdate | None:
         """Aim, capture images and update; return None where the tracker has no aim."""

@@ -19,7 +19,7 @@ from marsyard.algorithms.vtt.matching import (
 )
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position, mast_angles, middle
-from marsyard.algorithms.vtt.stereo import disparity_px_m, epipolar_pixels, search_ranges, triangulated
+from marsyard.algorithms.vtt.stereo import disparity_px_m, epipolar_pixels, search_ranges, triangulate
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastCalibration, MastGeometry, PixelTarget, RoverTarget, SiteTarget
@@ -198,7 +198,7 @@ def test_passing_a_target_rolls_its_image() -> None:
     # Fig. 4: a level rover. A horizontal line perpendicular to the line of sight is seen at atan(tan t sin d). The
     # direction has turned by t at a depression angle d.
     mast = replace(navcam(), geometry=MastGeometry(np.array([0.0, 0.0, 1.5]), np.zeros(3), np.zeros(3)))
-    mast = replace(mast, left=mast.left.moved(rigid(Rotation.identity(), np.array([0.0, -0.1, 0.0]))))
+    mast = replace(mast, left=mast.left.transform(rigid(Rotation.identity(), np.array([0.0, -0.1, 0.0]))))
     target, where = np.array([6.8, 0.0, 0.0]), [(0.0, 0.0), (5.6, 0.9)]
     heads = []
     for x, y in where:
@@ -252,7 +252,7 @@ def test_search_ranges_follow_disparity_steps() -> None:
 def test_triangulation_inverts_projection(mast: MastCalibration) -> None:
     rng = np.random.default_rng(4)
     for point in rng.uniform([2.0, -0.15, -0.15], [12.0, 0.15, 0.15], (20, 3)):
-        result = triangulated(mast.left, mast.right, mast.left.project(point)[0], mast.right.project(point)[0])
+        result = triangulate(mast.left, mast.right, mast.left.project(point)[0], mast.right.project(point)[0])
         assert result is not None
         np.testing.assert_allclose(result, point, atol=1e-6)
 
@@ -261,9 +261,9 @@ def test_diverging_lines_of_sight_give_no_range() -> None:
     left, right = navcam().left, navcam().right
     far = np.array([1e3, 0.0, 0.0])
     a, b = left.project(far)[0], right.project(far)[0]
-    assert triangulated(left, right, a, b) is not None
-    assert triangulated(left, right, a, b + np.array([3.0, 0.0])) is None  # they diverge
-    assert triangulated(left, left, a, a) is None
+    assert triangulate(left, right, a, b) is not None
+    assert triangulate(left, right, a, b + np.array([3.0, 0.0])) is None  # they diverge
+    assert triangulate(left, left, a, a) is None
 
 
 def test_epipolar_curve_points_are_half_a_pixel_apart() -> None:

@@ -175,7 +175,7 @@ def test_all_three_designations_give_the_same_target() -> None:
     start = pose(0.0, 0.0)
     scene = scene_of(slanted(5, target), target, 5)
     north_east_down = np.array([target[1], target[0], -target[2]])
-    camera = navcam().left.moved(start * navcam().geometry.rover_from_head(0.02, -0.12))
+    camera = navcam().left.transform(start * navcam().geometry.rover_from_head(0.02, -0.12))
     picked: list[TargetDesignation] = [
         RoverTarget(target),
         SiteTarget(north_east_down),

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.campaigns.definition.identity import identity_of
+from marsyard.campaigns.definition.identity import create_identity
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.workers import ExecutorConfig
@@ -88,7 +88,7 @@ def test_dispersed_input_files_belong_to_the_identity(campaign_file: CampaignFil
     other.write_text("4,5,6\n")
     dispersions = f'[dispersions]\ntable = {{distribution = "choice", values = ["{table}", "{other}"]}}\n'
     campaign = load_campaign(str(campaign_file(f'table = "{table}"', dispersions=dispersions)))
-    assert set(identity_of(campaign.configuration).inputs or {}) == {str(table), str(other)}
+    assert set(create_identity(campaign.configuration).inputs or {}) == {str(table), str(other)}
 
 
 def test_terrain_camera_and_datasheet_belong_to_the_identity(tmp_path: Path) -> None:
@@ -103,17 +103,17 @@ def test_terrain_camera_and_datasheet_belong_to_the_identity(tmp_path: Path) -> 
         f"detector.file={files['sensor.toml']}",
     ]
     configuration = load_campaign("dimes-gusev", overrides).configuration
-    before = identity_of(configuration)
+    before = create_identity(configuration)
     assert set(before.inputs or {}) == {str(path) for path in files.values()}
     np.savez(files["site.npz"], dem=rng.normal(size=(64, 64)), dem_gsd=4.0)
     files["cam.cahv"].write_text(CAMERA.replace("1200", "1201"))
     files["sensor.toml"].write_text(DATASHEET.replace("25.0", "26.0"))
-    changed = before.differences(identity_of(configuration))
+    changed = before.differences(create_identity(configuration))
     assert [line.split(" ")[0] for line in changed] == sorted(str(path) for path in files.values())
     # the campaign stores the content of the camera file and datasheet, so these files may be deleted
     files["cam.cahv"].unlink()
     files["sensor.toml"].unlink()
-    assert list(identity_of(configuration).inputs or {}) == [str(files["site.npz"])]
+    assert list(create_identity(configuration).inputs or {}) == [str(files["site.npz"])]
     files["site.npz"].unlink()
     with pytest.raises(CampaignError, match=r"cannot be used any more: .*site.npz: no such file"):
-        identity_of(configuration)
+        create_identity(configuration)

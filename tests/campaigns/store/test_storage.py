@@ -46,7 +46,7 @@ def test_rows_are_read_in_case_order(tmp_path: Path) -> None:
     with open_store(tmp_path, rows) as store:
         stored = [store.row(case) or {} for case in range(3)]
         assert store.about == {"identity": "abc"}
-        assert (store.count(), store.with_outcomes(["VALID"]), store.unfinished()) == (3, [0, 1, 2], 0)
+        assert (store.count(), store.with_outcomes(["VALID"]), store.count_unfinished()) == (3, [0, 1, 2], 0)
         assert store.row(1) == complete_row(rows[2])
         assert store.row(7) is None
     assert [row["case"] for row in stored] == [0, 1, 2]
@@ -60,7 +60,7 @@ def test_missing_rows_are_listed_and_rows_replaced(tmp_path: Path) -> None:
         assert store.missing(9) == [range(1), range(3, 5), range(6, 9)]
         assert store.missing(6) == [range(1), range(3, 5)]
         assert store.with_outcomes(["CRASHED", "TIMED_OUT"]) == [1]
-        assert (store.with_outcomes([]), store.unfinished()) == ([], 1)
+        assert (store.with_outcomes([]), store.count_unfinished()) == ([], 1)
         store.add([complete_row({"case": 1, "x": 3.0})])
         assert store.row(1) == complete_row({"case": 1, "x": 3.0})
         assert store.with_outcomes(["VALID"]) == [1, 2, 5]

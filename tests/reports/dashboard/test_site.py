@@ -17,10 +17,10 @@ from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.reports.dashboard.entries import (
     ShownRequirement,
     find_campaigns,
+    make_slug,
     margin_text,
     read_entries,
     requirement_rows,
-    slug_of,
     sparkline,
 )
 from marsyard.reports.dashboard.site import write_site
@@ -118,9 +118,9 @@ def test_texts_are_escaped_and_files_stay_in_the_site(
 
 def test_folder_names_have_only_letters_digits_and_hyphens(tmp_path: Path) -> None:
     for name in ("../../etc/passwd", "", "ä/\x00", "a" * 500):
-        slug = slug_of(tmp_path, name)
+        slug = make_slug(tmp_path, name)
         assert re.fullmatch(r"[A-Za-z0-9-]{1,80}", slug)
-    assert slug_of(tmp_path / "a", "x") != slug_of(tmp_path / "b", "x")
+    assert make_slug(tmp_path / "a", "x") != make_slug(tmp_path / "b", "x")
 
 
 def test_campaigns_are_found_once(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:

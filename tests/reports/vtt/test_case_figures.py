@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from marsyard.reports.presentation import write_case_figures
-from marsyard.reports.vtt.case_figures import TARGET, WINDOW, draw_path, draw_stops, is_vtt_case, path_of, stops_of
+from marsyard.reports.vtt.case_figures import TARGET, WINDOW, draw_path, draw_stops, is_vtt_case, list_stops, rover_path
 from marsyard.reports.vtt.presentation import view
 from tests.reports.vtt.tracking_rows import make_products
 
@@ -107,8 +107,8 @@ def test_other_products_are_not_a_tracking_case() -> None:
     assert is_vtt_case(make_products())
     assert not is_vtt_case({})
     assert not is_vtt_case(make_products() | {"template_px": None})
-    assert stops_of({}) == []
-    assert path_of(make_products() | {"rover_true_m": np.zeros((2, 3))}) is None
+    assert list_stops({}) == []
+    assert rover_path(make_products() | {"rover_true_m": np.zeros((2, 3))}) is None
     with pytest.raises(ValueError, match="no picture"):
         draw_stops({})
     with pytest.raises(ValueError, match="no way"):

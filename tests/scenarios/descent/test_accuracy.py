@@ -38,7 +38,7 @@ def _run_descent(case: int, **parts: Any) -> tuple[list[Track], list[State], Des
     flight = create_flight(p, world.surface, streams)
     states = picture_states(p, flight)
     optics = camera_optics(p.camera)
-    detector = Detector.drawn(optics.fall_off, p.detector, streams.generator("detector response"))
+    detector = Detector.draw(optics.fall_off, p.detector, streams.generator("detector response"))
     pictures = [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
     instruments = Instruments.draw(p, world, flight, streams)
     measurements = measure(p, world, flight.motion, pictures, detector, instruments, streams)

@@ -134,7 +134,7 @@ def _render_descent(faults: Mapping[str, Any], **parts: Any) -> list[np.ndarray]
     world, streams = World.of(p), Streams(1, "faults", 0)
     states = picture_states(p, create_flight(p, world.surface, streams))
     optics = camera_optics(p.camera)
-    detector = Detector.drawn(optics.fall_off, faulty_detector(p.faults, p.detector), streams.generator("detector"))
+    detector = Detector.draw(optics.fall_off, faulty_detector(p.faults, p.detector), streams.generator("detector"))
     return [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
 
 

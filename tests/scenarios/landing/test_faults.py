@@ -11,7 +11,7 @@ from marsyard.scenarios.landing.helicopter import HelicopterParameters, Transit
 from marsyard.scenarios.landing.parameters import (
     Faults,
     LandingScenarioParameters,
-    arrived_numbers,
+    draw_arrivals,
     faulty_helicopter,
     faulty_ranges,
     stuck_range_m,
@@ -28,7 +28,7 @@ def test_outage_covers_images_and_landing() -> None:
     for outage, errors in off.items():
         flight = faulty_helicopter(Faults(gps_outage_s=outage), HELICOPTER)
         for case in range(6):
-            transit = Transit.flown(flight, np.array([0.0, 0.0, 10.0]), 0.5, 0.5, 9.8, Streams(7, "outage", case))
+            transit = Transit.fly(flight, np.array([0.0, 0.0, 10.0]), 0.5, 0.5, 9.8, Streams(7, "outage", case))
             estimate = np.array(transit.pose(0).world_from_body.translation)
             errors.append(float(np.hypot(*(estimate - transit.state(0).position_m)[:2])))
             known = np.isfinite(transit.navigated.solutions.positions_m[:, 0])
@@ -49,11 +49,11 @@ def test_stuck_altimeter_repeats_an_earlier_range() -> None:
 
 def test_two_images_always_remain() -> None:
     rng = np.random.default_rng(0)
-    assert len(arrived_numbers(Faults(), 40, rng)) == 40
-    subset = arrived_numbers(Faults(lost_pictures=0.75), 40, rng)
+    assert len(draw_arrivals(Faults(), 40, rng)) == 40
+    subset = draw_arrivals(Faults(lost_pictures=0.75), 40, rng)
     assert len(np.unique(subset)) == 10
     assert np.all(np.diff(subset) > 0)
-    assert len(arrived_numbers(Faults(lost_pictures=1.0), 40, rng)) == 2
+    assert len(draw_arrivals(Faults(lost_pictures=1.0), 40, rng)) == 2
 
 
 @pytest.mark.parametrize("fault", [{"lost_pictures": 0.5}, {"gps_outage_s": 5.0}])

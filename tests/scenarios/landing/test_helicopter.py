@@ -22,7 +22,7 @@ FLOATING: dict[str, object] = {"rtk": {"float_fraction": 1.0}, "transit": {"hove
 def _fly_transit(case: int, **changes: object) -> tuple[Transit, Streams]:
     streams = Streams(7, "helicopter", case)
     parameters = HelicopterParameters.model_validate({"transit": {"hover_s": 8.0}} | changes)
-    return Transit.flown(parameters, np.array([0.0, 0.0, HEIGHT]), 0.5, 0.5, GRAVITY, streams), streams
+    return Transit.fly(parameters, np.array([0.0, 0.0, HEIGHT]), 0.5, 0.5, GRAVITY, streams), streams
 
 
 @cache
@@ -32,7 +32,7 @@ def _fly_landing(case: int) -> tuple[Transit, Touchdown]:
 
 
 def _land(transit: Transit, streams: Streams, stuck_m: float | None = None) -> Touchdown:
-    unit = RangingUnit.drawn(LaserParameters(), streams.generator("laser"))
+    unit = RangingUnit.draw(LaserParameters(), streams.generator("laser"))
     touchdown = land(transit, SITE, GROUND, unit, streams, stuck_m)
     assert touchdown is not None
     return touchdown
@@ -168,5 +168,5 @@ def test_stuck_altimeter_causes_a_hard_landing() -> None:
 
 def test_overlong_landing_has_no_touchdown() -> None:
     transit, streams = _fly_transit(0, guidance={"max_duration_s": 3.0})
-    unit = RangingUnit.drawn(LaserParameters(), streams.generator("laser"))
+    unit = RangingUnit.draw(LaserParameters(), streams.generator("laser"))
     assert land(transit, SITE, GROUND, unit, streams) is None

@@ -42,7 +42,7 @@ def velocity_folder(
                 row |= {"true_vx_m_s": x, "true_vy_m_s": y}
             rows.append(row)
     first = next(iter(cases.values())).images[0]
-    return _written(folder, "velocity", first, rows, ned=ned)
+    return _write_campaign(folder, "velocity", first, rows, ned=ned)
 
 
 def landing_folder(folder: Path, one: LandingMeasurements, task: str, *, true_poses: bool = False) -> Path:
@@ -56,7 +56,7 @@ def landing_folder(folder: Path, one: LandingMeasurements, task: str, *, true_po
         if true_poses:
             row |= _numbers("true_{}_m", position) | _quaternion("true_", turn)
         rows.append(row)
-    return _written(folder, task, one.images[0], rows, ned=False)
+    return _write_campaign(folder, task, one.images[0], rows, ned=False)
 
 
 def _row(
@@ -81,7 +81,9 @@ def _numbers(form: str, values: np.ndarray) -> dict[str, float]:
     return {form.format(axis): float(value) for axis, value in zip("xyz", values, strict=True)}
 
 
-def _written(folder: Path, task: str, image: DetectorImage, rows: Sequence[Mapping[str, Any]], *, ned: bool) -> Path:
+def _write_campaign(
+    folder: Path, task: str, image: DetectorImage, rows: Sequence[Mapping[str, Any]], *, ned: bool
+) -> Path:
     known = image.calibration
     write_cahvor(image.camera, folder / "camera.cahvor")
     np.save(folder / "flat.npy", known.flat_field)

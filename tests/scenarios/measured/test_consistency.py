@@ -26,7 +26,7 @@ TURN = Rotation.from_euler("xyz", [3.0, -2.0, 20.0], degrees=True)
 @pytest.mark.parametrize("moved_m", [0.0, 0.05, 40.0])
 def test_correct_poses_have_zero_offsets(moved_m: float) -> None:
     rng = np.random.default_rng(1)
-    second = CAMERA.moved(rigid(TURN, moved_m * np.array([1.0, 0.4, 0.1])))
+    second = CAMERA.transform(rigid(TURN, moved_m * np.array([1.0, 0.4, 0.1])))
     points = np.stack([rng.uniform(-30, 30, 400), rng.uniform(-25, 25, 400), -100.0 - rng.uniform(0, 50, 400)], axis=1)
     if moved_m == 0.0:
         points *= 1e4  # for any distance
@@ -37,7 +37,7 @@ def test_correct_poses_have_zero_offsets(moved_m: float) -> None:
 def test_only_error_across_epipolar_line_is_an_offset() -> None:
     """A camera that moves along its columns has horizontal epipolar lines near the image centre."""
     pinhole = Cahv(CAMERA.c, CAMERA.a, CAMERA.h, CAMERA.v, CAMERA.size)
-    second = pinhole.moved(rigid(Rotation.identity(), np.array([5.0, 0.0, 0.0])))
+    second = pinhole.transform(rigid(Rotation.identity(), np.array([5.0, 0.0, 0.0])))
     points = np.array([[0.0, 0.0, -100.0], [10.0, -6.0, -120.0], [-4.0, 7.0, -90.0]])
     actual, expected = pinhole.project(points)[0], second.project(points)[0]
     across = offsets_px(pinhole, second, actual, expected + np.array([0.0, 2.0]))
@@ -51,7 +51,7 @@ def test_only_error_across_epipolar_line_is_an_offset() -> None:
 
 
 def test_pure_rotation_maps_to_one_point() -> None:
-    second = CAMERA.moved(rigid(TURN, np.zeros(3)))
+    second = CAMERA.transform(rigid(TURN, np.zeros(3)))
     actual = np.array([[300.0, 200.0], [400.0, 260.0]])
     expected = second.project(1e3 * CAMERA.rays(actual)[1])[0]
     result = offsets_px(CAMERA, second, actual, expected + np.array([1.5, -2.0]))

@@ -13,7 +13,7 @@ from marsyard.scenarios.descent.exposure import World
 from marsyard.scenarios.descent.flight import create_flight
 from marsyard.scenarios.descent.measurement import Instruments
 from marsyard.scenarios.parts import DescentPlace, InstrumentReadings, InstrumentTruth, Poses, ScoredDescent
-from marsyard.scenarios.parts.scores import scored
+from marsyard.scenarios.parts.scores import compute_scores
 from marsyard.sim.streams import Streams
 from tests.scenarios.descent.settings import FLAT, PERFECT, parameters, run
 
@@ -180,4 +180,4 @@ def test_motion_below_the_ground_is_reported() -> None:
 def test_score_cannot_replace_a_column() -> None:
     spec = f"{HERE}velocity_error"
     with pytest.raises(ValueError, match="gives the column velocity_error_m_s, which the row has already"):
-        scored([spec], None, {"velocity_error_m_s"})  # type: ignore[arg-type]
+        compute_scores([spec], None, {"velocity_error_m_s"})  # type: ignore[arg-type]

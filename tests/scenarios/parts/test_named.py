@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, problems_of
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, validation_problems
 from marsyard.campaigns.definition.identity import custom_sources, list_parts
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.parts import named
@@ -35,7 +35,7 @@ def find_problem(**parts: Any) -> tuple[str, str]:
     """Return the invalid key of descent parameters and the message."""
     with pytest.raises(ValidationError) as caught:
         DescentScenarioParameters.model_validate(parts)
-    ((key, message),) = problems_of(caught.value, DescentScenarioParameters)
+    ((key, message),) = validation_problems(caught.value, DescentScenarioParameters)
     return ".".join(map(str, key)), message
 
 

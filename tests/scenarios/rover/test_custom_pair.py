@@ -39,7 +39,7 @@ def test_pair_from_preset_files_equals_the_preset(
     """The pair is equal for any position of the cameras in the files."""
     anywhere = rigid(Rotation.from_euler("xyz", [20.0, -50.0, 130.0], degrees=True), np.array([3.0, -8.0, 1.5]))
     for side, camera in zip(("left", "right"), preset(name).cameras(), strict=True):
-        write_cahvor(camera.moved(anywhere), tmp_path / f"{side}.cahvor")
+        write_cahvor(camera.transform(anywhere), tmp_path / f"{side}.cahvor")
     files = {side: str(tmp_path / f"{side}.cahvor") for side in ("left", "right")}
     move_pair = {"baseline_m": baseline_m, "toe_in_deg": toe_in_deg}
     result, expected = (

@@ -63,7 +63,7 @@ def test_designated_point_agrees_with_rendered_pixels() -> None:
     run = run_case(p, make_streams(1))
     stop = run.stops[-1]
     column, row = (round(value) for value in stop.point_px)
-    camera = run.rig.left.cropped(column - 4, row - 4, (9, 9))
+    camera = run.rig.left.crop(column - 4, row - 4, (9, 9))
     frame = process_renderer(p.backend).render(run.world.base, PixelRays.of(camera), stop.world_from_head)
     around = frame.points_world()[3:6, 3:6].reshape(-1, 3)
     assert (frame.body[4, 4]) >= 0

@@ -43,7 +43,7 @@ def test_moved_camera_projects_moved_points_equally(camera: CameraModel) -> None
     points = points_before(camera)
     moved_points = motion.apply(points.reshape(-1, 3)).reshape(points.shape)
     # Points 100 m away are rounded to 1e-14 m; at 4 m and 1200 px/rad this is 4e-12 px.
-    assert np.allclose(camera.moved(motion).project(moved_points)[0], camera.project(points)[0], rtol=0, atol=1e-10)
+    assert np.allclose(camera.transform(motion).project(moved_points)[0], camera.project(points)[0], rtol=0, atol=1e-10)
 
 
 @given(transforms(), transforms())
@@ -51,14 +51,17 @@ def test_motions_compose(first: RigidTransform, second: RigidTransform) -> None:
     camera = Cahv.from_field_of_view(0.8, (64, 48), axis=(0, 0, -1), right=(1, 0, 0), centre=(1, 2, 3))
     # Coordinates reach 4000 m: 1e-11 is a few roundings.
     assert np.allclose(
-        vectors(camera.moved(first).moved(second)), vectors(camera.moved(second * first)), rtol=0, atol=1e-11
+        vectors(camera.transform(first).transform(second)),
+        vectors(camera.transform(second * first)),
+        rtol=0,
+        atol=1e-11,
     )
-    assert np.allclose(vectors(camera.moved(first).moved(first.inv())), vectors(camera), rtol=0, atol=1e-11)
+    assert np.allclose(vectors(camera.transform(first).transform(first.inv())), vectors(camera), rtol=0, atol=1e-11)
 
 
 def test_motion_rotates_the_lens(hazcam: Cahvore) -> None:
     turn = Rotation.from_rotvec([0.3, 0.2, 0.1])
-    moved = hazcam.moved(RigidTransform.from_rotation(turn))
+    moved = hazcam.transform(RigidTransform.from_rotation(turn))
     assert np.allclose(moved.o, turn.apply(np.array(hazcam.o)), atol=1e-15)
     assert np.array_equal(moved.r, hazcam.r)
     assert np.array_equal(moved.e, hazcam.e)
@@ -68,7 +71,7 @@ def test_motion_rotates_the_lens(hazcam: Cahvore) -> None:
 
 def test_multiple_motions_are_rejected(navcam: Cahvor) -> None:
     with pytest.raises(ValueError, match="single transform"):
-        navcam.moved(RigidTransform.identity(2))
+        navcam.transform(RigidTransform.identity(2))
 
 
 # ----- changes of the image -----
@@ -76,7 +79,7 @@ def test_multiple_motions_are_rejected(navcam: Cahvor) -> None:
 
 @pytest.mark.parametrize(("columns", "rows"), [(1, 1), (2, 2), (4, 1), (1, 4), (32, 64)])
 def test_binned_pixel_is_at_block_centre(camera: CameraModel, columns: int, rows: int) -> None:
-    binned = camera.binned(columns, rows)
+    binned = camera.bin(columns, rows)
     assert binned.size == (1024 // columns, 1024 // rows)
     points = points_before(camera)
     factors = np.array([columns, rows])
@@ -88,22 +91,22 @@ def test_binning_agrees_with_averaged_rays(navcam: Cahvor) -> None:
     """The centre of four pixels looks between their directions, exact except for curvature over half a pixel."""
     grid = navcam.pixel_grid()[500:502, 300:302].reshape(-1, 2)
     between = navcam.rays(grid)[1].mean(axis=0)
-    direction = navcam.binned(2, 2).rays(np.array([150.0, 250.0]))[1]
+    direction = navcam.bin(2, 2).rays(np.array([150.0, 250.0]))[1]
     assert np.allclose(between / np.linalg.norm(between), direction, atol=1e-9)
 
 
 def test_scaling_keeps_the_frame_edges(camera: CameraModel) -> None:
     points = points_before(camera)
     for factor in (0.5, 0.25, 2, 1.7):
-        scaled = camera.scaled(factor)
+        scaled = camera.scale(factor)
         expected = (camera.project(points)[0] + 0.5) * factor - 0.5
         assert np.allclose(scaled.project(points)[0], expected, rtol=0, atol=1e-9)
         assert scaled.size == (round(1024 * factor), round(1024 * factor))
-    assert np.allclose(vectors(camera.scaled(0.25)), vectors(camera.binned(4, 4)), rtol=0, atol=1e-12)
+    assert np.allclose(vectors(camera.scale(0.25)), vectors(camera.bin(4, 4)), rtol=0, atol=1e-12)
 
 
 def test_cropping_moves_the_origin(camera: CameraModel) -> None:
-    cropped = camera.cropped(100, 37, (512, 256))
+    cropped = camera.crop(100, 37, (512, 256))
     points = points_before(camera)
     assert cropped.size == (512, 256)
     assert np.allclose(cropped.project(points)[0], camera.project(points)[0] - [100, 37], rtol=0, atol=1e-10)
@@ -112,14 +115,14 @@ def test_cropping_moves_the_origin(camera: CameraModel) -> None:
 @given(st.integers(0, 20), st.integers(0, 30), st.sampled_from([1, 2, 4]), st.sampled_from([1, 2, 4]))
 def test_cropping_and_binning_commute(column: int, row: int, columns: int, rows: int) -> None:
     camera = Cahv.from_field_of_view(1.0, (256, 256), axis=(0, 0, -1), right=(1, 0, 0))
-    one = camera.cropped(column * columns, row * rows, (32 * columns, 16 * rows)).binned(columns, rows)
-    other = camera.binned(columns, rows).cropped(column, row, (32, 16))
+    one = camera.crop(column * columns, row * rows, (32 * columns, 16 * rows)).bin(columns, rows)
+    other = camera.bin(columns, rows).crop(column, row, (32, 16))
     assert one.size == other.size
     assert np.allclose(vectors(one), vectors(other), rtol=0, atol=1e-12)
 
 
 def test_changes_keep_the_lens(hazcam: Cahvore) -> None:
-    changed = hazcam.cropped(1, 2, (512, 256)).binned(2, 2).scaled(3)
+    changed = hazcam.crop(1, 2, (512, 256)).bin(2, 2).scale(3)
     for name in "caore":
         assert np.array_equal(getattr(changed, name), getattr(hazcam, name))
     assert changed.linearity == hazcam.linearity
@@ -128,17 +131,17 @@ def test_changes_keep_the_lens(hazcam: Cahvore) -> None:
 def test_invalid_changes_are_rejected(navcam: Cahvor) -> None:
     for columns, rows in ((3, 1), (1, 7), (0, 1), (-2, 1), (2048, 1)):
         with pytest.raises(ValueError, match="cannot bin"):
-            navcam.binned(columns, rows)
+            navcam.bin(columns, rows)
     for factor in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match="positive, finite"):
-            navcam.scaled(factor)
+            navcam.scale(factor)
     with pytest.raises(ValueError, match="size"):
-        navcam.scaled(1e-6)
+        navcam.scale(1e-6)
     for column, row, size in ((-1, 0, (4, 4)), (0, 1020, (4, 5)), (1024, 0, (1, 1))):
         with pytest.raises(ValueError, match="leaves the frame"):
-            navcam.cropped(column, row, size)
+            navcam.crop(column, row, size)
     with pytest.raises(ValueError, match="size"):
-        navcam.cropped(0, 0, (0, 4))
+        navcam.crop(0, 0, (0, 4))
 
 
 # ----- linear stand-ins -----

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from marsyard.sim.dynamics import SwingDescent, SwingParameters
 from marsyard.sim.dynamics.kernels.swing import Chain, WindField, aerodynamic_force, derivatives
-from marsyard.sim.dynamics.swing import Modes, chain_of
+from marsyard.sim.dynamics.swing import Modes, build_chain
 
 START = np.array([100.0, -50.0, 2100.0])
 GROUND_M = 100.0
@@ -95,7 +95,7 @@ def test_energy_and_momentum_balance_of_drag_and_friction(seed: int) -> None:
     conserved.
     """
     p = SwingParameters(**(WILD | {"nod_damping_ratio": 0.1}))
-    chain = chain_of(p, Modes.of(p, GRAVITY), GRAVITY, 2000.0)
+    chain = build_chain(p, Modes.of(p, GRAVITY), GRAVITY, 2000.0)
     y, wind = _draw_state(np.random.default_rng(seed)), _make_calm_wind()
     rates, force = derivatives(y, chain, wind), aerodynamic_force(y, chain, wind)
     n, dn, e, de = y[6:18].reshape(4, 3)
@@ -125,7 +125,7 @@ def test_energy_and_momentum_balance_of_drag_and_friction(seed: int) -> None:
 
 def test_drag_and_friction_only_dissipate_energy() -> None:
     p = SwingParameters(**WILD)
-    chain = chain_of(p, Modes.of(p, GRAVITY), GRAVITY, 2000.0)
+    chain = build_chain(p, Modes.of(p, GRAVITY), GRAVITY, 2000.0)
     rng = np.random.default_rng(0)
     for _ in range(50):
         y = _draw_state(rng)
@@ -137,7 +137,7 @@ def _linearise(p: SwingParameters) -> tuple[Chain, Modes]:
     """A chain with constant air density, which falls at a constant rate."""
     thin = p.model_copy(update={"density_scale_height_m": 1e15})
     modes = Modes.of(thin, GRAVITY)
-    return chain_of(thin, modes, GRAVITY, 2000.0), modes
+    return build_chain(thin, modes, GRAVITY, 2000.0), modes
 
 
 def _eigenvalues_by_matrices(p: SwingParameters, chain: Chain, modes: Modes) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.validation.motion import View, supersampled
+from benchmarks.validation.motion import View, supersample
 from benchmarks.validation.raycast import meet_triangles
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
@@ -62,7 +62,7 @@ def rocky() -> View:
 def reference(renderer: Renderer, rocky: View) -> np.ndarray:
     """The rocks rendered with 256 rays per pixel; ground and texture have the smoothness of a pixel."""
     single = replace(rocky, scene=replace(rocky.scene, edge_rays=1))
-    return supersampled(renderer, replace(single, footprint=float(SAMPLES)), SAMPLES)
+    return supersample(renderer, replace(single, footprint=float(SAMPLES)), SAMPLES)
 
 
 def test_subpixel_rays_are_evenly_distributed() -> None:
@@ -131,7 +131,7 @@ def test_plane_horizon_is_at_the_mesh_border(renderer: Renderer) -> None:
     scene = Scene(surface, (0.0, 0.0), SUN, law, mesh_finest_m=0.04, mesh_reach_m=200.0, mesh_lines=801)
     camera = _make_camera((128, 64), 8e-3)
     pose = rigid(Rotation.from_euler("x", 7.0, degrees=True), np.array([0.0, 0.0, 1.0]))
-    border, _ = camera.moved(pose).project(np.array([[200.0, -30.0, 0.0], [200.0, 30.0, 0.0]]))
+    border, _ = camera.transform(pose).project(np.array([[200.0, -30.0, 0.0], [200.0, 30.0, 0.0]]))
     # Pixel 63 ends at 63.5.
     expected = 63.5 - np.interp(np.arange(128), *border[np.argsort(border[:, 0])].T)
     errors = []

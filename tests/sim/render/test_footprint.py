@@ -58,7 +58,7 @@ def test_footprint_without_objects_or_sun_is_everywhere() -> None:
 def test_footprint_does_not_change_images() -> None:
     """Bitwise equal over ground with many rocks under a low sun."""
     ground = SiteGround.of(site("gusev").model_copy(update={"descent": ROCKY}))
-    rays = PixelRays.of(preset("mer-descent-flown").cameras()[0].binned(4, 4))
+    rays = PixelRays.of(preset("mer-descent-flown").cameras()[0].bin(4, 4))
     pose = nadir_pose(ground.surface, 300.0, 200.0, 400.0)
     scene = site_scene(ground, Eye.of(rays, pose, ground.surface), Sun(direction(1.0, 0.3)))
     assert len(scene.objects) > 50
@@ -77,7 +77,7 @@ def test_potentially_visible_objects_give_equal_images(elevation: float) -> None
     terrain = terrain.model_copy(update={"outer_scale_m": 10.0, "craters_per_km2": 0.0})
     rocks = RockParameters(abundance=0.1, smallest_m=0.05)
     ground = SiteGround.of(site("gusev").model_copy(update={"descent": terrain.model_copy(update={"rocks": rocks})}))
-    rays = PixelRays.of(preset("research-navcam").cameras()[0].cropped(400, 380, (161, 161)))
+    rays = PixelRays.of(preset("research-navcam").cameras()[0].crop(400, 380, (161, 161)))
     pose = mast_pose(ground.surface, 12.0, 11.0, 1.5, 30.0, -14.0)
     for azimuth in (0.5, 3.0):
         eye = Eye(12.0, 11.0, 1.5, rays.pixel_rad, 0.5, 1.2, 25.0)

@@ -79,17 +79,17 @@ def test_spots_on_a_plane_are_at_projected_pixels(renderer: Renderer, descent_ca
     frame = renderer.render(scene, PixelRays.of(camera), pose)
     copies = np.arange(-2, 3) * surface.period_m
     everywhere = np.concatenate([spots + np.array([dx, dy, 0.0]) for dx in copies for dy in copies])
-    pixels, visible = camera.moved(pose).project(everywhere)
+    pixels, visible = camera.transform(pose).project(everywhere)
     inside = visible & (np.abs(pixels - 511.5) < 495.0).all(axis=-1)
     result = np.stack([_centroid(frame.radiance, near) for near in pixels[inside]])
-    expected = np.stack([_expected_centroid(camera.moved(pose), spot) for spot in everywhere[inside]])
+    expected = np.stack([_expected_centroid(camera.transform(pose), spot) for spot in everywhere[inside]])
     error = result - expected
     assert inside.sum() > 400
     assert np.sqrt(np.mean(np.sum(error**2, axis=-1))) < 0.05
     assert np.sqrt(np.mean(np.sum((result - pixels[inside]) ** 2, axis=-1))) < 0.05
     assert np.abs(error.mean(axis=0)).max() < 0.003
     # The distortion is significant: a pinhole camera would shift the spots by pixels.
-    pinhole, _ = descent_camera(r=(0.0, 0.0, 0.0)).moved(pose).project(everywhere[inside])
+    pinhole, _ = descent_camera(r=(0.0, 0.0, 0.0)).transform(pose).project(everywhere[inside])
     assert np.linalg.norm(pinhole - pixels[inside], axis=-1).max() > 20.0
 
 
@@ -105,7 +105,7 @@ def test_world_points_are_on_the_plane_and_on_rays(
     assert np.isfinite(points).all()
     assert np.abs((points[..., 2] + 3.0) / frame.range_m).max() < 1e-5
     np.testing.assert_allclose(frame.points_world(100), points[::100, ::100], rtol=0.0, atol=1e-9)
-    pixels, visible = camera.moved(pose).project(points)
+    pixels, visible = camera.transform(pose).project(points)
     assert visible.all()
     # Rays have single precision: 6e-8 rad is 1e-4 px.
     assert np.abs(pixels - camera.pixel_grid()).max() < 1e-3

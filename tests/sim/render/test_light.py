@@ -61,7 +61,7 @@ def test_the_opposition_spot_is_at_the_antisolar_point(
     sun = Sun(direction(np.radians(30.0), np.radians(80.0)))
     law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
     radiance = _render(renderer, camera, FLAT, sun, law)
-    at, visible = camera.moved(NADIR).project(NADIR.translation - 500.0 * sun.direction)
+    at, visible = camera.transform(NADIR).project(NADIR.translation - 500.0 * sun.direction)
     assert visible
     peak = np.unravel_index(radiance.argmax(), radiance.shape)
     # Within one pixel.

@@ -45,7 +45,7 @@ def test_descent_image_motion_matches_the_camera(
 ) -> None:
     texture = Texture(3.0, (0.03,) * 6)
     scene = Scene(rough, (380.0, 200.0), SUN, Photometry(), ground_texture=texture)
-    camera = descent_camera().cropped(256, 256, (512, 512))
+    camera = descent_camera().crop(256, 256, (512, 512))
     pose = rigid(Rotation.from_euler("zyx", [20.0, 5.0, -4.0], degrees=True), np.array([380.0, 200.0, 2000.0]))
     for motion in measure(renderer, View(scene, camera, pose), np.array([0.3, 0.75])):
         assert len(motion.error) >= 200

@@ -86,7 +86,7 @@ def test_the_opposition_peak_is_opposite_the_sun(
     law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
     pose = rigid(Rotation.from_euler("zx", [40.0, 8.0], degrees=True), np.array([0.0, 0.0, 800.0]))
     for opposite in np.array([[150.3, 201.8], [330.6, 255.1]]):
-        _, ray = camera.moved(pose).rays(opposite)
+        _, ray = camera.transform(pose).rays(opposite)
         frame = renderer.render(Scene(flat, (0.0, 0.0), Sun(-ray), law), PixelRays.of(camera), pose)
         radiance = frame.radiance.astype(np.float64)
         weight = np.clip(radiance - radiance.max() + 0.1 * np.ptp(radiance), 0.0, None)

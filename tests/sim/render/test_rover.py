@@ -71,7 +71,7 @@ def test_head_does_not_occlude_its_cameras(azimuth_deg: float, elevation_deg: fl
     stance = settle(MER, Plane(), 0.0, 0.0, EAST)
     objects = rover_objects(MER, stance, pair.geometry, *angles, baseline_m=0.2)
     world_from_head = stance.world_from_rover * pair.geometry.rover_from_head(*angles)
-    for camera in (pair.left.moved(world_from_head), pair.right.moved(world_from_head)):
+    for camera in (pair.left.transform(world_from_head), pair.right.transform(world_from_head)):
         # The central part of the image, which shows the targets.
         u, v = np.meshgrid(np.linspace(430.0, 590.0, 9), np.linspace(430.0, 590.0, 9))
         origins, directions = camera.rays(np.stack([u.ravel(), v.ravel()], axis=1))

@@ -48,7 +48,7 @@ def test_images_do_not_depend_on_threads(
     scene = Scene(
         rough, (380.0, 200.0), light, Photometry(), rocks, Texture(3.0, (0.03,) * 6), Texture(0.5, (0.05,) * 3)
     )
-    rays = PixelRays.of(descent_camera().cropped(400, 400, (161, 161)))
+    rays = PixelRays.of(descent_camera().crop(400, 400, (161, 161)))
     pose = rigid(Rotation.from_euler("x", 4.0, degrees=True), np.array([380.0, 200.0, 400.0]))
     monkeypatch.setattr("marsyard.sim.render.renderer.run_in_parts", partial(run_in_parts, threads=1))
     alone = renderer.render(scene, rays, pose)

@@ -99,7 +99,7 @@ def test_constant_errors_grow_as_in_a_full_rate_propagation() -> None:
     )
     approach = Approach(SHORT, -2.0)
     for seed in range(3):
-        imu = Imu.drawn(constant, (approach.start_s, 0.0), np.random.default_rng(seed))
+        imu = Imu.draw(constant, (approach.start_s, 0.0), np.random.default_rng(seed))
         fast = approach.errors(imu, np.random.default_rng(0))
         [(attitude, velocity)] = _propagate_at_full_rate(imu, approach, range(1))
         # First order in errors of up to 10 mrad, with steps of 2.4 deg of spin.
@@ -110,7 +110,7 @@ def test_constant_errors_grow_as_in_a_full_rate_propagation() -> None:
 def test_noise_grows_as_in_a_full_rate_propagation() -> None:
     noisy = perfect(rate_hz=20.0, angular_random_walk_deg_sqrt_h=1.0, velocity_random_walk_ug_sqrt_hz=3000.0)
     approach = Approach(SHORT, -2.0)
-    imu = Imu.drawn(noisy, (approach.start_s, 0.0), np.random.default_rng(0))
+    imu = Imu.draw(noisy, (approach.start_s, 0.0), np.random.default_rng(0))
     fast = [approach.errors(imu, np.random.default_rng(seed)) for seed in range(400)]
     slow = _propagate_at_full_rate(imu, approach, range(120))
     attitude_fast, velocity_fast = (
@@ -127,7 +127,7 @@ def test_noise_grows_as_in_a_full_rate_propagation() -> None:
 def test_scale_error_rotates_attitude_about_spin_axis() -> None:
     p = SHORT.model_copy(update={"cruise_s": 900.0, "spin_scale_ppm": 20.0})
     approach = Approach(p, 0.0)
-    imu = Imu.drawn(perfect(gyro_scale_ppm=1e4), (approach.start_s, 0.0), np.random.default_rng(0))
+    imu = Imu.draw(perfect(gyro_scale_ppm=1e4), (approach.start_s, 0.0), np.random.default_rng(0))
     calibrated = approach.calibrate(imu, np.random.default_rng(1))
     flat = Approach(p.model_copy(update={"entry_off_nadir_deg": 0.0, "deploy_off_nadir_deg": 0.0}), 0.0)
     error = flat.errors(calibrated, np.random.default_rng(0)).attitude_rad
@@ -142,7 +142,7 @@ def test_descent_attitude_error_is_a_few_tenths_of_a_degree() -> None:
     errors = []
     for seed in range(150):
         rng = np.random.default_rng(seed)
-        imu = approach.calibrate(Imu.drawn(ImuParameters(), (approach.start_s, 0.0), rng), rng)
+        imu = approach.calibrate(Imu.draw(ImuParameters(), (approach.start_s, 0.0), rng), rng)
         errors.append(approach.errors(imu, rng).attitude_rad)
     spread = np.degrees(np.std(errors, axis=0))
     # 1 deg/h for 1140 s along the spin axis and 20 ppm of 38 turns give 0.32 and 0.27 deg about the entry direction.

@@ -11,7 +11,7 @@ def test_clock_offset_is_common_and_jitter_is_independent() -> None:
     offsets, jitters = [], []
     for seed in range(400):
         rng = np.random.default_rng(seed)
-        clock = Clock.drawn(parameters, rng)
+        clock = Clock.draw(parameters, rng)
         errors = clock.tags(np.array([1.0, 2.0]), rng) - [1.0, 2.0]
         offsets.append(clock.offset_s)
         jitters.append((errors[0] - errors[1]) / np.sqrt(2.0))
@@ -24,4 +24,4 @@ def test_clock_offset_is_common_and_jitter_is_independent() -> None:
 
 def test_error_free_tags_are_exact() -> None:
     rng = np.random.default_rng(0)
-    np.testing.assert_array_equal(Clock.drawn(ClockParameters(), rng).tags(np.array([1.5, 2.5]), rng), [1.5, 2.5])
+    np.testing.assert_array_equal(Clock.draw(ClockParameters(), rng).tags(np.array([1.5, 2.5]), rng), [1.5, 2.5])

@@ -18,7 +18,7 @@ DARK = np.zeros_like(EVEN)
 
 def _make_detector(shape: tuple[int, int] = EVEN.shape, **changes: object) -> Detector:
     parameters = DetectorParameters.model_validate(PERFECT | changes)
-    return Detector.drawn(np.ones(shape, dtype=np.float32), parameters, np.random.default_rng(0))
+    return Detector.draw(np.ones(shape, dtype=np.float32), parameters, np.random.default_rng(0))
 
 
 def test_photon_transfer_gives_gain() -> None:
@@ -66,7 +66,7 @@ def test_equal_streams_give_equal_images() -> None:
 
 
 def test_calibration_response_has_the_specified_error() -> None:
-    detector = Detector.drawn(
+    detector = Detector.draw(
         EVEN, DetectorParameters(response_spread=0.02, calibration_error=0.005), np.random.default_rng(3)
     )
     true = detector.response.reshape(16, 4, 48).mean(axis=1)
@@ -77,7 +77,7 @@ def test_calibration_response_has_the_specified_error() -> None:
 
 def test_indivisible_rows_are_rejected() -> None:
     with pytest.raises(ValueError, match="cannot be summed"):
-        Detector.drawn(EVEN[:63], DetectorParameters(), np.random.default_rng(0))
+        Detector.draw(EVEN[:63], DetectorParameters(), np.random.default_rng(0))
 
 
 def test_dimes_removes_the_smear() -> None:
@@ -188,7 +188,7 @@ def test_subframe_has_the_pixels_of_the_full_frame() -> None:
     parameters = DetectorParameters(
         transfer_row_s=0.0, clear_row_s=0.0, optics=SHARP, defects=DefectParameters(hot_fraction=0.02)
     )
-    full = Detector.drawn(EVEN, parameters, np.random.default_rng(6))
+    full = Detector.draw(EVEN, parameters, np.random.default_rng(6))
     part = full.window(8, 16, (24, 32))
     scene = np.random.default_rng(2).random(EVEN.shape, dtype=np.float32)
     np.testing.assert_array_equal(part.charge(scene[16:48, 8:32]), full.charge(scene)[16:48, 8:32])

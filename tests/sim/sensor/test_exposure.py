@@ -12,7 +12,7 @@ ASKED = AutoExposureParameters()
 
 def _make_detector(exposure_s: float) -> Detector:
     parameters = DetectorParameters(exposure_s=exposure_s, rows_summed=1, transfer_row_s=0.0, clear_row_s=0.0)
-    return Detector.drawn(np.ones_like(GROUND), parameters, np.random.default_rng(1))
+    return Detector.draw(np.ones_like(GROUND), parameters, np.random.default_rng(1))
 
 
 @pytest.mark.parametrize("start_s", [0.0005, 0.02, 0.5])

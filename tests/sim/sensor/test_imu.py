@@ -39,7 +39,7 @@ def test_allan_deviation_shows_random_walk_and_bias_instability() -> None:
     )
     rng = np.random.default_rng(0)
     hours = 12.0 * 3600.0
-    imu = Imu.drawn(parameters, (0.0, hours), rng)
+    imu = Imu.draw(parameters, (0.0, hours), rng)
     rates = imu.increments(STILL, 0.0, hours, rng).delta_angles_rad * rate
 
     def expected(tau: float) -> float:
@@ -57,7 +57,7 @@ def test_allan_deviation_shows_random_walk_and_bias_instability() -> None:
 
 
 def test_static_ideal_unit_measures_gravity() -> None:
-    imu = Imu.drawn(perfect(), (0.0, 1.0), np.random.default_rng(0))
+    imu = Imu.draw(perfect(), (0.0, 1.0), np.random.default_rng(0))
     increments = imu.increments(STILL, 0.0, 1.0, np.random.default_rng(1))
     assert increments.times_s.size == 401
     np.testing.assert_array_equal(increments.delta_angles_rad, 0.0)
@@ -68,7 +68,7 @@ def test_scale_and_misalignment_apply_to_true_increments() -> None:
     parameters = perfect(
         gyro_scale_ppm=1000.0, gyro_misalignment_mrad=5.0, accelerometer_scale_ppm=2000.0, accelerometer_bias_mg=1.0
     )
-    imu = Imu.drawn(parameters, (0.0, 1.0), np.random.default_rng(3))
+    imu = Imu.draw(parameters, (0.0, 1.0), np.random.default_rng(3))
     increments = imu.increments(Swaying(spin_rad_s=1.0), 0.0, 1.0, np.random.default_rng(1))
     turn = np.array([imu.gyro.misalignment[0, 2], imu.gyro.misalignment[1, 2], 1.0 + imu.gyro.scale[2]])
     np.testing.assert_allclose(increments.delta_angles_rad.sum(axis=0), turn, atol=1e-12)
@@ -80,7 +80,7 @@ def test_scale_and_misalignment_apply_to_true_increments() -> None:
 
 def test_rounding_errors_do_not_accumulate() -> None:
     parameters = perfect(gyro_count_rad=1e-3, gyro_bias_deg_h=1.0 / DEG_H)
-    imu = Imu.drawn(parameters, (0.0, 10.0), np.random.default_rng(0))
+    imu = Imu.draw(parameters, (0.0, 10.0), np.random.default_rng(0))
     measured = imu.increments(STILL, 0.0, 10.0, np.random.default_rng(0)).delta_angles_rad
     np.testing.assert_allclose(measured / 1e-3, np.rint(measured / 1e-3), atol=1e-9)
     true = imu.gyro.bias * (np.arange(1, 4001)[:, None] / 400.0)
@@ -89,7 +89,7 @@ def test_rounding_errors_do_not_accumulate() -> None:
 
 def test_bias_follows_temperature() -> None:
     warm_up = WarmUp(start_s=10.0, change_k=20.0, time_constant_s=100.0)
-    imu = Imu.drawn(perfect(gyro_bias_deg_h_k=0.5, warm_up=warm_up), (0.0, 2000.0), np.random.default_rng(0))
+    imu = Imu.draw(perfect(gyro_bias_deg_h_k=0.5, warm_up=warm_up), (0.0, 2000.0), np.random.default_rng(0))
     bias = imu.gyro.bias_at(np.array([0.0, 10.0, 110.0, 2000.0]))
     np.testing.assert_array_equal(bias[:2], 0.0)
     np.testing.assert_allclose(bias[2], imu.gyro.bias_per_k * 20.0 * (1.0 - np.exp(-1.0)), rtol=1e-12)
@@ -98,7 +98,7 @@ def test_bias_follows_temperature() -> None:
 
 def test_drawn_errors_have_the_specified_spreads() -> None:
     parameters = ImuParameters()
-    units = [Imu.drawn(parameters, (0.0, 10.0), np.random.default_rng(seed)) for seed in range(400)]
+    units = [Imu.draw(parameters, (0.0, 10.0), np.random.default_rng(seed)) for seed in range(400)]
     milli_g = 1e-3 * STANDARD_GRAVITY_M_S2
     # 1,200 values each determine the spread to 2 %; the tolerance is four times that.
     for samples, sd in (
@@ -114,6 +114,6 @@ def test_drawn_errors_have_the_specified_spreads() -> None:
 
 
 def test_span_without_samples_is_rejected() -> None:
-    imu = Imu.drawn(perfect(), (0.0, 1.0), np.random.default_rng(0))
+    imu = Imu.draw(perfect(), (0.0, 1.0), np.random.default_rng(0))
     with pytest.raises(ValueError, match="no sample"):
         imu.boundaries(0.0, 0.001)

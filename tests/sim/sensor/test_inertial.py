@@ -30,7 +30,7 @@ def _navigate(
     motion: Swaying, parameters: ImuParameters, errors: NavigationErrors = NO_ERRORS, seed: int = 0
 ) -> tuple[Imu, InertialSolution]:
     rng = np.random.default_rng(seed)
-    imu = Imu.drawn(parameters, SPAN, rng)
+    imu = Imu.draw(parameters, SPAN, rng)
     start = motion.state(SPAN[0])
     attitude, velocity = errors.apply(start.attitude, start.velocity_m_s)
     increments = imu.increments(motion, *SPAN, rng)
@@ -99,14 +99,14 @@ def test_ten_millisecond_tag_error_shifts_ground_by_21_metres() -> None:
     rotated = (solution.attitude(tag)[0] * turning.state(3.75).attitude.inv()).magnitude()
     assert 2000.0 * np.tan(rotated) == pytest.approx(20.9, abs=0.1)
     # A clock offset shared with the unit has no effect.
-    imu = Imu.drawn(perfect(clock=ClockParameters(offset_s=0.01)), SPAN, np.random.default_rng(0))
+    imu = Imu.draw(perfect(clock=ClockParameters(offset_s=0.01)), SPAN, np.random.default_rng(0))
     increments = imu.increments(turning, *SPAN, np.random.default_rng(0))
     shared = InertialSolution.propagate(increments, turning.state(SPAN[0]).attitude, np.zeros(3), GRAVITY)
     assert (shared.attitude(tag)[0] * turning.state(3.75).attitude.inv()).magnitude() < 1e-9
 
 
 def test_large_jitter_keeps_times_increasing() -> None:
-    imu = Imu.drawn(perfect(clock=ClockParameters(jitter_sd_s=0.01)), SPAN, np.random.default_rng(0))
+    imu = Imu.draw(perfect(clock=ClockParameters(jitter_sd_s=0.01)), SPAN, np.random.default_rng(0))
     increments = imu.increments(BUSY, *SPAN, np.random.default_rng(0))
     assert np.all(np.diff(increments.times_s) >= 0.0)
     start = BUSY.state(SPAN[0])

@@ -35,7 +35,7 @@ def _move_mast(mast: Mast, azimuths_deg: list[float]) -> list[MastState]:
 
 
 def test_error_free_mast_points_as_commanded() -> None:
-    mast = Mast.drawn(EXACT, MER_MAST, _rng())
+    mast = Mast.draw(EXACT, MER_MAST, _rng())
     state = mast.point(mast.rest, 0.4, -0.3, _rng())
     assert state.true_rad == state.readings_rad == (0.4, -0.3)
     expected = MER_MAST.rover_from_head(0.4, -0.3)
@@ -43,7 +43,7 @@ def test_error_free_mast_points_as_commanded() -> None:
 
 
 def test_backlash_lags_by_half_and_absorbs_short_reversals() -> None:
-    mast = Mast.drawn(EXACT.model_copy(update={"backlash_deg": 0.2}), MER_MAST, _rng())
+    mast = Mast.draw(EXACT.model_copy(update={"backlash_deg": 0.2}), MER_MAST, _rng())
     up, repeated, back_a_little, back, far = (
         np.degrees(state.true_rad[0]) for state in _move_mast(mast, [10.0, 10.0, 9.9, 9.5, -20.0])
     )
@@ -55,16 +55,16 @@ def test_backlash_lags_by_half_and_absorbs_short_reversals() -> None:
 
 def test_zero_error_is_constant_in_a_run() -> None:
     parameters = EXACT.model_copy(update={"zero_deg": 0.3})
-    zeros = np.degrees([Mast.drawn(parameters, MER_MAST, _rng(n)).zeros_rad for n in range(400)])
+    zeros = np.degrees([Mast.draw(parameters, MER_MAST, _rng(n)).zeros_rad for n in range(400)])
     # 800 draws: 0.3 within four standard errors.
     assert np.std(zeros) == pytest.approx(0.3, abs=4.0 * 0.3 / np.sqrt(1600.0))
-    mast = Mast.drawn(parameters, MER_MAST, _rng())
+    mast = Mast.draw(parameters, MER_MAST, _rng())
     for state in _move_mast(mast, [10.0, -40.0, 5.0]):
         assert np.subtract(state.readings_rad, state.true_rad) == pytest.approx(mast.zeros_rad)
 
 
 def test_encoders_and_motors_are_quantised() -> None:
-    mast = Mast.drawn(EXACT.model_copy(update={"count_deg": 0.05, "settling_deg": 0.2}), MER_MAST, _rng())
+    mast = Mast.draw(EXACT.model_copy(update={"count_deg": 0.05, "settling_deg": 0.2}), MER_MAST, _rng())
     states = _move_mast(mast, list(np.linspace(-30.0, 30.0, 400)))
     counts = np.degrees([state.readings_rad[0] for state in states]) / 0.05
     assert counts == pytest.approx(np.rint(counts), abs=1e-9)
@@ -76,7 +76,7 @@ def test_encoders_and_motors_are_quantised() -> None:
 
 
 def test_mast_stops_at_its_limits_and_reports_it() -> None:
-    mast = Mast.drawn(EXACT, MER_MAST, _rng())
+    mast = Mast.draw(EXACT, MER_MAST, _rng())
     state = mast.point(mast.rest, 0.0, -2.0, _rng())
     assert np.degrees(state.readings_rad[1]) == pytest.approx(-87.0)
 
@@ -88,7 +88,7 @@ def test_mer_navcam_position_matches_opportunity_labels() -> None:
         (-0.340449, -0.10962, (0.442604, -0.0611635, -1.25106)),
         (0.254358, -0.20924, (0.508813, -0.0504884, -1.24881)),
     ):
-        left = mast.left.moved(mast.geometry.rover_from_head(azimuth, elevation))
+        left = mast.left.transform(mast.geometry.rover_from_head(azimuth, elevation))
         expected = np.array([centre[0], -centre[1], -centre[2] + 0.29])
         assert left.c == pytest.approx(expected, abs=0.003)
 
@@ -96,7 +96,7 @@ def test_mer_navcam_position_matches_opportunity_labels() -> None:
 @pytest.mark.parametrize("name", MASTS)
 def test_ideal_calibration_equals_the_design(name: str) -> None:
     design = stereo_mast(name)
-    head = StereoHead.drawn(design, PERFECT, _rng())
+    head = StereoHead.draw(design, PERFECT, _rng())
     for calibrated, true in ((head.calibrated.left, design.left), (head.calibrated.right, design.right)):
         for vector in ("c", "a", "h", "v"):
             assert getattr(calibrated, vector) == pytest.approx(getattr(true, vector), abs=1e-9)
@@ -115,7 +115,7 @@ def _triangulated_m(left: CameraModel, right: CameraModel, pixels: list[np.ndarr
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_disparity_error_causes_range_error_of_eq_1(name: str, seed: int) -> None:
     design = stereo_mast(name)
-    head = StereoHead.drawn(design, PERFECT.model_copy(update={"disparity_error_px": 0.5}), _rng(seed))
+    head = StereoHead.draw(design, PERFECT.model_copy(update={"disparity_error_px": 0.5}), _rng(seed))
     error, range_m = head.disparity_error_px(10.0), 10.0
     assert 0.0 < abs(error) <= 0.5
     assert head.disparity_error_px(2.0) == pytest.approx(error, rel=0.02)
@@ -131,14 +131,14 @@ def test_disparity_error_causes_range_error_of_eq_1(name: str, seed: int) -> Non
 def test_disparity_errors_are_uniform_within_their_bound() -> None:
     design = stereo_mast("research-navcam")
     parameters = PERFECT.model_copy(update={"disparity_error_px": 0.5})
-    errors = np.array([StereoHead.drawn(design, parameters, _rng(n)).disparity_error_px(1e4) for n in range(150)])
+    errors = np.array([StereoHead.draw(design, parameters, _rng(n)).disparity_error_px(1e4) for n in range(150)])
     assert np.abs(errors).max() <= 0.5 + 1e-6
     assert np.std(errors) == pytest.approx(0.5 / np.sqrt(3.0), rel=0.15)
 
 
 def test_row_errors_and_common_rotations_shift_images() -> None:
     design, point = stereo_mast("research-navcam"), np.array([50.0, 0.0, 0.0])
-    across = StereoHead.drawn(design, PERFECT.model_copy(update={"epipolar_error_px": 1.0}), _rng(5)).calibrated
+    across = StereoHead.draw(design, PERFECT.model_copy(update={"epipolar_error_px": 1.0}), _rng(5)).calibrated
     rows = [camera.project(point)[0][1] for camera in (across.left, across.right)]
     columns = [camera.project(point)[0][0] for camera in (across.left, across.right)]
     expected = [camera.project(point)[0][0] for camera in (design.left, design.right)]
@@ -146,7 +146,7 @@ def test_row_errors_and_common_rotations_shift_images() -> None:
     draw = _rng(5)
     draw.uniform()
     assert abs(rows[0] - rows[1]) == pytest.approx(abs(draw.standard_normal()), rel=1e-3)
-    rotated = StereoHead.drawn(design, PERFECT.model_copy(update={"alignment_deg": 1.0}), _rng(5))
+    rotated = StereoHead.draw(design, PERFECT.model_copy(update={"alignment_deg": 1.0}), _rng(5))
     shifts = [
         one.project(point)[0] - other.project(point)[0]
         for one, other in ((rotated.calibrated.left, design.left), (rotated.calibrated.right, design.right))
@@ -158,7 +158,7 @@ def test_row_errors_and_common_rotations_shift_images() -> None:
 
 def test_focal_length_errors_scale_the_image() -> None:
     design = stereo_mast("research-navcam")
-    head = StereoHead.drawn(design, PERFECT.model_copy(update={"focal_error": 0.01}), _rng(3))
+    head = StereoHead.draw(design, PERFECT.model_copy(update={"focal_error": 0.01}), _rng(3))
     point = np.array([10.0, 2.0, 1.0])
     for calibrated, true in ((head.calibrated.left, design.left), (head.calibrated.right, design.right)):
         centre = np.array(true.image_centre)

@@ -47,8 +47,8 @@ def _run_filter(
 ) -> tuple[FlownPath, Imu, NavigationSolution]:
     path, rng = _make_path(seed), np.random.default_rng([seed, 1])
     span = path.span_s
-    imu = Imu.drawn(imu_class, span, rng)
-    receiver, compass = RtkReceiver.drawn(rtk_class, span, rng), TiltCompass.drawn(compass_class, rng)
+    imu = Imu.draw(imu_class, span, rng)
+    receiver, compass = RtkReceiver.draw(rtk_class, span, rng), TiltCompass.draw(compass_class, rng)
     increments = imu.increments(path, *span, rng)
     solutions = receiver.measure(path, receiver.sampling.within(*span), rng)
     readings = compass.measure(path, compass.sampling.within(*span), rng)
@@ -157,8 +157,8 @@ def test_filter_resets_after_persistent_rejection() -> None:
     """A filter with an initial error of 20 m rejects all solutions, but resets after one second."""
     path, rng = _make_path(3), np.random.default_rng(4)
     span = path.span_s
-    imu, receiver = Imu.drawn(SMALL_UNIT, span, rng), RtkReceiver.drawn(RtkParameters(float_fraction=0.0), span, rng)
-    compass = TiltCompass.drawn(COMPASS, rng)
+    imu, receiver = Imu.draw(SMALL_UNIT, span, rng), RtkReceiver.draw(RtkParameters(float_fraction=0.0), span, rng)
+    compass = TiltCompass.draw(COMPASS, rng)
     solutions = receiver.measure(path, receiver.sampling.within(*span), rng)
     readings = compass.measure(path, compass.sampling.within(*span), rng)
     navigation = NavigationFilter(FilterParameters(), SMALL_UNIT, receiver.parameters, COMPASS, GRAVITY)

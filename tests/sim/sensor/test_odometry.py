@@ -39,7 +39,7 @@ def _estimate_poses(
     drives: list[Drive], parameters: OdometryParameters, seed: int, visual: bool = False
 ) -> tuple[Odometer, PoseEstimate]:
     rng = np.random.default_rng(seed)
-    odometer = Odometer.drawn(parameters, drives[0].start.world_from_rover, rng)
+    odometer = Odometer.draw(parameters, drives[0].start.world_from_rover, rng)
     estimate = odometer.first
     for driven in drives:
         estimate = odometer.step(estimate, driven, rng, visual)

@@ -73,6 +73,6 @@ def test_dust_attenuates_and_is_not_calibrated() -> None:
     assert 0.03 < (transmission < 0.99).mean() < 0.4
     assert np.abs(np.diff(transmission, axis=1)).max() < 0.4 * 1.5 / 8.0
     even = np.ones((128, 128), dtype=np.float32)
-    clean, soiled = (Detector.drawn(even, DetectorParameters(optics=o), np.random.default_rng(1)) for o in (MER, dusty))
+    clean, soiled = (Detector.draw(even, DetectorParameters(optics=o), np.random.default_rng(1)) for o in (MER, dusty))
     assert soiled.response.sum() < clean.response.sum()
     np.testing.assert_array_equal(soiled.calibration.flat_field, clean.calibration.flat_field)

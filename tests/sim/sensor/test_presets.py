@@ -88,7 +88,7 @@ def test_each_preset_exposes_an_image(name: str) -> None:
     camera = preset(name)
     fall_off = natural_fall_off(camera.cameras()[0])[::8, ::8]
     p = camera.detector.model_copy(update={"rows_summed": 1, "transfer_row_s": 0.0, "clear_row_s": 0.0})
-    detector = Detector.drawn(np.ascontiguousarray(fall_off), p, np.random.default_rng(0))
+    detector = Detector.draw(np.ascontiguousarray(fall_off), p, np.random.default_rng(0))
     counts = detector.expose(0.3 * np.ones_like(fall_off), np.random.default_rng(1))
     rows, columns = counts.shape
     level = np.median(counts[rows // 2 - 5 : rows // 2 + 5, columns // 2 - 5 : columns // 2 + 5]) / p.full_scale_dn

@@ -66,11 +66,11 @@ FLAT = _make_surface(np.zeros((64, 64)))
 
 
 def _make_radar(rng: np.random.Generator, **errors: object) -> Instrument:
-    return RadarAltimeter.drawn(RadarParameters.model_validate(errors), FLAT, rng)
+    return RadarAltimeter.draw(RadarParameters.model_validate(errors), FLAT, rng)
 
 
 def _make_gps(rng: np.random.Generator, **errors: object) -> Instrument:
-    return Gps.drawn(GpsParameters.model_validate(errors), (-10.0, 30.0), rng)
+    return Gps.draw(GpsParameters.model_validate(errors), (-10.0, 30.0), rng)
 
 
 PERFECT: dict[Callable[..., Instrument], dict[str, object]] = {
@@ -120,7 +120,7 @@ def test_readings_have_constant_rate_and_random_phase() -> None:
     sampling = Sampling(10.0, 0.03)
     np.testing.assert_allclose(sampling.within(0.0, 0.35), [0.03, 0.13, 0.23, 0.33])
     np.testing.assert_allclose(sampling.latest(np.array([0.0, 0.1, 0.329, 3.75])), [-0.07, 0.03, 0.23, 3.73])
-    phases = [Sampling.drawn(10.0, np.random.default_rng(seed)).phase_s for seed in range(200)]
+    phases = [Sampling.draw(10.0, np.random.default_rng(seed)).phase_s for seed in range(200)]
     assert 0.0 <= min(phases) < 0.01
     assert 0.09 < max(phases) < 0.1
 
@@ -131,7 +131,7 @@ def test_radar_scale_is_common_and_noise_is_independent() -> None:
     common, noise = [], []
     for seed in range(300):
         rng = np.random.default_rng(seed)
-        radar = RadarAltimeter.drawn(parameters, FLAT, rng)
+        radar = RadarAltimeter.draw(parameters, FLAT, rng)
         first, second = radar.measure(static, np.array([0.0, 1.0]), rng).values
         common.append(0.5 * (first + second) - 1000.0)
         noise.append((first - second) / np.sqrt(2.0))
@@ -149,7 +149,7 @@ def test_radar_is_quantised_and_limited_in_range() -> None:
     parameters = RadarParameters(
         scale_error=0.0, noise=0.0, count_m=0.5, max_range_m=1990.0, min_range_m=1700.0, clock=ClockParameters()
     )
-    radar = RadarAltimeter.drawn(parameters, FLAT, np.random.default_rng(0))
+    radar = RadarAltimeter.draw(parameters, FLAT, np.random.default_rng(0))
     values = radar.measure(DESCENT, np.array([0.0, 1.0, 1.001, 5.0]), np.random.default_rng(0)).values
     np.testing.assert_array_equal(values, [np.nan, 1925.0, 1925.0, np.nan])
     with pytest.raises(ValueError, match="less than max_range_m"):
@@ -237,7 +237,7 @@ def test_laser_measures_slant_range_along_its_axis() -> None:
 
 def test_laser_unit_adds_its_errors() -> None:
     perfect = LaserParameters(noise_m=0.0, count_m=0.0, clock=ClockParameters())
-    unit = RangingUnit.drawn(perfect, np.random.default_rng(0))
+    unit = RangingUnit.draw(perfect, np.random.default_rng(0))
     readings = unit.readings(np.arange(3.0), np.array([10.0, np.inf, 301.0]), np.random.default_rng(0))
     np.testing.assert_array_equal(readings.values, [10.0, np.nan, np.nan])
 
@@ -252,7 +252,7 @@ def test_receiver_errors_have_the_specified_spreads() -> None:
     true = DESCENT.motion(time).positions_m[0]
     for seed in range(200):
         rng = np.random.default_rng(seed)
-        gps = Gps.drawn(RTK, (0.0, 10.0), rng)
+        gps = Gps.draw(RTK, (0.0, 10.0), rng)
         errors.append(gps.measure(DESCENT, time, rng).values[0] - true)
     # 400 and 200 values determine spreads to 3.5 % and 5 %; the tolerance is three times that.
     assert np.std(np.array(errors)[:, :2]) == pytest.approx(np.hypot(0.01, 0.01), rel=0.11)

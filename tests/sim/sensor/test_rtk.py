@@ -14,7 +14,7 @@ SPAN = (0.0, 400.0)
 
 def _measure(seed: int, times: np.ndarray, **changes: object) -> tuple[RtkReceiver, RtkSolutions]:
     rng = np.random.default_rng(seed)
-    receiver = RtkReceiver.drawn(RtkParameters.model_validate(changes), SPAN, rng)
+    receiver = RtkReceiver.draw(RtkParameters.model_validate(changes), SPAN, rng)
     return receiver, receiver.measure(MOTION, times, rng)
 
 

@@ -25,7 +25,7 @@ PERFECT: dict[str, object] = dict.fromkeys(
 
 def _read(motion: Swaying, times: np.ndarray, seed: int = 0, **changes: object) -> TiltCompassReadings:
     rng = np.random.default_rng(seed)
-    unit = TiltCompass.drawn(TiltCompassParameters.model_validate(PERFECT | changes), rng)
+    unit = TiltCompass.draw(TiltCompassParameters.model_validate(PERFECT | changes), rng)
     return unit.measure(motion, times, rng)
 
 
@@ -73,7 +73,7 @@ def test_iron_causes_one_and_two_cycle_heading_errors() -> None:
     around = np.radians(np.arange(0.0, 360.0, 45.0))
     off = []
     for seed in range(300):
-        unit = TiltCompass.drawn(parameters, np.random.default_rng(seed))
+        unit = TiltCompass.draw(parameters, np.random.default_rng(seed))
         expected = unit.deviation_rad(around)
         rotated = [Swaying(tilt=Rotation.from_euler("z", 0.5 * np.pi - azimuth)) for azimuth in around]
         one = np.random.default_rng(0)
