@@ -74,11 +74,15 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> interf
             raise bad_answer(f"covariance_m2_s2 is not symmetric: {covariance.tolist()}")
         if scale == 0.0 or float(np.linalg.eigvalsh(covariance)[0]) <= 0.0:
             raise bad_answer(f"covariance_m2_s2 is not positive definite: {covariance.tolist()}")
-    span, given = None, answer.span_s
-    if given is not None:
-        if not isinstance(given, tuple) or len(given) != 2 or not all(isinstance(n, float | int) for n in given):
-            raise bad_answer(f"span_s is {given!r}; allowed: a tuple of two time tags, or None")
-        span = (float(given[0]), float(given[1]))
+    span, answered = None, answer.span_s
+    if answered is not None:
+        if (
+            not isinstance(answered, tuple)
+            or len(answered) != 2
+            or not all(isinstance(n, float | int) for n in answered)
+        ):
+            raise bad_answer(f"span_s is {answered!r}; allowed: a tuple of two time tags, or None")
+        span = (float(answered[0]), float(answered[1]))
         if not (np.all(np.isfinite(span)) and span[0] <= span[1]):
             raise bad_answer(f"span_s is {span}; allowed: two finite time tags, the first not after the second")
         if tags_s and not tags_s[0] <= span[0] <= span[1] <= tags_s[-1]:
@@ -93,8 +97,8 @@ def check_site(answer: Any) -> interface.SiteEstimate:
     _check_type("the answer", answer, interface.SiteEstimate)
     _check_type("outcome", answer.outcome, interface.SiteOutcome)
     if (answer.outcome is interface.SiteOutcome.NO_SAFE_SITE) != (answer.site_world is None):
-        given = "none" if answer.site_world is None else "one"
-        fault = f"but site_world: {given} is given; allowed: none with NO_SAFE_SITE only"
+        answered = "none" if answer.site_world is None else "one"
+        fault = f"but site_world: {answered} is given; allowed: none with NO_SAFE_SITE only"
         raise bad_answer(f"outcome is {answer.outcome.name}, {fault}")
     return interface.SiteEstimate(answer.outcome, _check_numbers("site_world", answer.site_world, (3,)), answer.details)
 

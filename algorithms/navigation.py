@@ -84,9 +84,9 @@ class TerrainMap:
         The latest sighting of a rock replaces earlier ones.
         """
         rims = ((rock, rock.place_m + rock.radius_m * _FOOTPRINT_POINTS) for rock in rocks)
-        seen = {rock.name: rock for rock, rim in rims if wedge.covers(rim).any()}
-        kept = tuple(rock for rock in self.obstacles if rock.name not in seen)
-        return TerrainMap((*self.wedges, wedge), kept + tuple(seen.values()))
+        newly_seen = {rock.name: rock for rock, rim in rims if wedge.covers(rim).any()}
+        kept = tuple(rock for rock in self.obstacles if rock.name not in newly_seen)
+        return TerrainMap((*self.wedges, wedge), kept + tuple(newly_seen.values()))
 
     def contains(self, positions_m: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
         """Whether positions (east, north) lie in any wedge."""
@@ -176,8 +176,8 @@ def navigate(
         lookahead = position + path.points(np.arange(0.0, min(path.length_m, options.lookahead_m), 0.1)) @ heading.T
         disc = lookahead[:, None] + options.half_width_m * _FOOTPRINT_POINTS
         if _is_clear(lookahead, avoided, options) and bool(terrain.contains(disc).all()):
-            whole = np.asarray(position + path.points(np.linspace(0.0, path.length_m, 60)) @ heading.T)
-            return NavigationPlan(NavigationOutcome.PATH, path.commands(step_m, backwards), whole)
+            footprint = np.asarray(position + path.points(np.linspace(0.0, path.length_m, 60)) @ heading.T)
+            return NavigationPlan(NavigationOutcome.PATH, path.commands(step_m, backwards), footprint)
     return NavigationPlan(NavigationOutcome.NO_PATH, (), none)
 
 

@@ -110,12 +110,12 @@ class Comparison:
 
 def compare(now: Mapping[str, Sequence[float]], kept: Mapping[str, Sequence[float]]) -> list[Comparison]:
     """Compare every path that both records contain."""
-    found = []
+    regressions = []
     for name in now.keys() & kept.keys():
         ours, before = np.asarray(now[name]), np.asarray(kept[name])
         test = stats.ttest_ind(ours - np.log(ALLOWED), before, equal_var=False, alternative="greater")
-        found.append(Comparison(name, float(np.exp(ours.mean() - before.mean())), float(test.pvalue)))
-    return sorted(found, key=lambda one: one.name)
+        regressions.append(Comparison(name, float(np.exp(ours.mean() - before.mean())), float(test.pvalue)))
+    return sorted(regressions, key=lambda one: one.name)
 
 
 def select_slower(found: Sequence[Comparison]) -> list[Comparison]:

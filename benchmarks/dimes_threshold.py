@@ -30,8 +30,8 @@ def derive_threshold(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
     """Threshold, distribution of discrepancies, and effect of the check on one wrong track."""
     rng = np.random.default_rng(inputs.seed)
     errors = derivation.right_track_errors(inputs, rng)
-    found = derivation.discrepancies(errors, inputs.imu_sd_m_s, rng)
-    threshold = derivation.threshold_m_s(found.single, inputs.kept, inputs.step_m_s)
+    results = derivation.discrepancies(errors, inputs.imu_sd_m_s, rng)
+    threshold = derivation.threshold_m_s(results.single, inputs.kept, inputs.step_m_s)
     harms = [
         {
             "tracks_per_pair": tracks,
@@ -48,15 +48,15 @@ def derive_threshold(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
         "inputs": asdict(inputs),
         "track_error_rms_m_s": float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))),
         "discrepancy_quantiles_m_s": {
-            "one right track in each pair": _quantiles(found.single),
-            "best of two right tracks in each pair": _quantiles(found.best),
+            "one right track in each pair": _quantiles(results.single),
+            "best of two right tracks in each pair": _quantiles(results.best),
         },
         "kept": {
-            "one right track in each pair": float(np.mean(found.single < threshold)),
-            "best of two right tracks in each pair": float(np.mean(found.best < threshold)),
+            "one right track in each pair": float(np.mean(results.single < threshold)),
+            "best of two right tracks in each pair": float(np.mean(results.best < threshold)),
         },
-        "kept_quantile_m_s": float(np.quantile(found.single, inputs.kept)),
-        "kept_quantile_90_percent_bounds_m_s": quantile_bounds(found.single, inputs.kept, 0.95),
+        "kept_quantile_m_s": float(np.quantile(results.single, inputs.kept)),
+        "kept_quantile_90_percent_bounds_m_s": quantile_bounds(results.single, inputs.kept, 0.95),
         "threshold_m_s": threshold,
         "one_wrong_track": harms,
     }

@@ -51,13 +51,13 @@ class Descent:
 def recorded(campaign_name: str, cases: int) -> list[Descent]:
     """Record the first cases of a descent campaign."""
     campaign = load_campaign(campaign_name, ["parameters.algorithm=benchmarks.estimators:Recorder"])
-    found = []
+    descents = []
     for case in range(cases):
         Recorder.given.clear()
         row = campaign.scenario.run(campaign.parameters(case), campaign.streams(case)).row
         velocity = np.array([row["velocity_true_x_m_s"], row["velocity_true_y_m_s"]])
-        found.append(Descent(Recorder.given[0], velocity, bool(row["feasible_overlap"])))
-    return found
+        descents.append(Descent(Recorder.given[0], velocity, bool(row["feasible_overlap"])))
+    return descents
 
 
 @dataclass(frozen=True)

@@ -97,37 +97,37 @@ def _frames_of_sizes(sides: Sequence[int]) -> list[tuple[float, float]]:
     scene, surface = descent_scene()
     camera, pose = camera_optics(CameraParameters()).camera, descent_pose(surface)
     renderer = process_renderer(default_backend())
-    found = []
+    points = []
     for side in sides:
         corner = (camera.size[0] - side) // 2
         rays = PixelRays.of(camera.crop(corner, corner, (side, side)))
-        found.append((float(side**2), _minimum(partial(renderer.render, scene, rays, pose))))
-    return found
+        points.append((float(side**2), _minimum(partial(renderer.render, scene, rays, pose))))
+    return points
 
 
 def _frames_of_meshes(lines: Sequence[int]) -> list[tuple[float, float]]:
     scene, surface = descent_scene()
     rays, pose = camera_optics(CameraParameters()).rays, descent_pose(surface)
     renderer = process_renderer(default_backend())
-    found = []
+    points = []
     for count in lines:
         # same extent as the default mesh, with wider spacing for fewer lines
         finest = scene.mesh_finest_m * (scene.mesh_lines - 1) / (count - 1)
         of_count = replace(scene, mesh_lines=count, mesh_finest_m=finest)
         cost = _minimum(partial(renderer.render, of_count, rays, pose))
-        found.append((2.0 * (count - 1) ** 2, cost))
-    return found
+        points.append((2.0 * (count - 1) ** 2, cost))
+    return points
 
 
 def _cases_over_terrains(samples: Sequence[int]) -> list[tuple[float, float]]:
-    found = []
+    points = []
     for count in samples:
         campaign = load_campaign("dimes-smoke", [f"terrain.samples={count}", "retain.showcase=none"])
         # always the same case, because run times differ between cases
         parameters = campaign.with_values({**campaign.draws(0), "location.terrain": 0})
         run = partial(campaign.scenario.run, parameters, campaign.streams(0))
-        found.append((float(count**2), _minimum(run)))
-    return found
+        points.append((float(count**2), _minimum(run)))
+    return points
 
 
 def _campaigns(cases: Sequence[int]) -> list[tuple[float, float]]:
@@ -195,13 +195,13 @@ def main() -> None:
     """Measure, store and draw."""
     cv2.setNumThreads(1)
     mpl.rcParams["svg.hashsalt"] = "marsyard"
-    found = curves()
-    for curve in found:
+    measured = curves()
+    for curve in measured:
         points = ", ".join(f"{size:g}: {cost:.3g}" for size, cost in curve.points)
         print(f"{curve.name:<32}{points} {curve.cost}; size^{curve.power:.2f} at the end")
     KEPT.parent.mkdir(exist_ok=True)
-    KEPT.write_text(json.dumps([asdict(curve) for curve in found], indent=1) + "\n")
-    draw(found).savefig(FIGURE, metadata={"Date": None})
+    KEPT.write_text(json.dumps([asdict(curve) for curve in measured], indent=1) + "\n")
+    draw(measured).savefig(FIGURE, metadata={"Date": None})
     print(f"kept in {KEPT}, drawn as {FIGURE}")
 
 

@@ -46,7 +46,7 @@ def figures(repeats: int) -> list[Figure]:
     given = _descent_mesh()
     theirs = _pyrender_shaded(given)
     paired = [(core_seconds(ours, 1)[0], core_seconds(theirs, 1)[0]) for _ in range(repeats)]
-    found = [
+    timings = [
         Figure("descent frame with shadows and detector", [mine for mine, _ in paired], bar=0.2),
         *on_all_cores(repeats),
         Figure("pyrender's shaded frame of a mesh as fine, with shadows", [other for _, other in paired]),
@@ -54,11 +54,13 @@ def figures(repeats: int) -> list[Figure]:
     ]
     if importlib.util.find_spec("pyvista") is not None:
         command = [sys.executable, "-m", "benchmarks.renderers"]
-        found.append(Figure("PyVista's (VTK's) frame of that mesh, with shadows", _elsewhere(command, given, repeats)))
+        timings.append(
+            Figure("PyVista's (VTK's) frame of that mesh, with shadows", _elsewhere(command, given, repeats))
+        )
     if BLENDER in os.environ:
         command = [os.environ[BLENDER], str(Path(__file__).with_name("blender_frame.py"))]
-        found.append(Figure("Blender Cycles' frame of that mesh, 16 samples a pixel", _elsewhere(command, given, 2)))
-    return found
+        timings.append(Figure("Blender Cycles' frame of that mesh, 16 samples a pixel", _elsewhere(command, given, 2)))
+    return timings
 
 
 def _descent_mesh() -> dict[str, Any]:

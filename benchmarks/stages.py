@@ -37,20 +37,20 @@ def stages(run: Callable[[], object], repeats: int) -> list[Figure]:
 
     Python's profiler slows stages with many small calls (flight, instruments) by up to a half.
     """
-    found = profile_stages(run, repeats, STAGES)
-    return [Figure(f"  of a case, profiled: {name}", values) for name, values in found.items()]
+    timings = profile_stages(run, repeats, STAGES)
+    return [Figure(f"  of a case, profiled: {name}", values) for name, values in timings.items()]
 
 
 def profile_stages(run: Callable[[], object], repeats: int, stages: Stages) -> dict[str, list[float]]:
     """The same as `stages` for given stages, by name."""
     run()
-    found: dict[str, list[float]] = {name: [] for name in (*stages, REST)}
+    timings: dict[str, list[float]] = {name: [] for name in (*stages, REST)}
     for _ in range(repeats):
         profile = cProfile.Profile(time.process_time)
         profile.runcall(run)
         for name, seconds in _of_each_stage(profile, stages).items():
-            found[name].append(seconds)
-    return found
+            timings[name].append(seconds)
+    return timings
 
 
 def _of_each_stage(profile: cProfile.Profile, stages: Stages) -> dict[str, float]:

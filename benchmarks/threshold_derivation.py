@@ -102,12 +102,12 @@ def descent_camera() -> CameraModel:
 def right_track_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> TrackErrors:
     """Velocity errors of two correct tracks in each pair of `inputs.descents` descents with feasible overlap."""
     camera, options = descent_camera(), DimesOptions()
-    found: list[Float[np.ndarray, "2 2 2"]] = []
-    while len(found) < inputs.descents:
+    tracks: list[Float[np.ndarray, "2 2 2"]] = []
+    while len(tracks) < inputs.descents:
         errors = _descent_errors(inputs, camera, options, rng)
         if errors is not None:
-            found.append(errors)
-    return np.stack(found)
+            tracks.append(errors)
+    return np.stack(tracks)
 
 
 def _descent_errors(

@@ -105,8 +105,8 @@ def runs(repeats: int) -> list[Figure]:
         "legs": [{"motion": "approach", "step_fraction": 0.1, "goal_m": 2.0}],
     }
     parameters = RoverScenarioParameters.model_validate(of_run)
-    taken = core_seconds(lambda: run_case(parameters, Streams(1, "benchmark", 0)), repeats)
-    return [Figure("a rover's run from 10 m to 2 m, rendered", taken, bar=1.5)]
+    elapsed_s = core_seconds(lambda: run_case(parameters, Streams(1, "benchmark", 0)), repeats)
+    return [Figure("a rover's run from 10 m to 2 m, rendered", elapsed_s, bar=1.5)]
 
 
 def figures(repeats: int) -> list[Figure]:

@@ -57,16 +57,16 @@ def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     return write_evaluation(evaluate_run(directory, requirements))
 
 
-def write_evaluation(found: Judged) -> Path:
+def write_evaluation(evaluation: Judged) -> Path:
     """Write the report of an evaluated campaign into its folder."""
-    run, how, verdicts, whole = found.run, found.how, found.verdicts, found.whole
+    run, how, verdicts, whole = evaluation.run, evaluation.how, evaluation.verdicts, evaluation.whole
     directory = run.directory
     drawn = replace(run, frame=how.draw(run.frame), whole=how.draw(run.whole))
     metric = primary_metric(drawn.frame, run.requirements)
     bound = next((v.bound for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
     subject = Subject(drawn, metric, bound)
     further = [section for make in section_makers() if (section := make(subject)) is not None]
-    twin = summary(found, subject, further)
+    twin = summary(evaluation, subject, further)
     algorithms = judged_algorithms(run.record)
     write_whole(directory / TWIN_FILE, json.dumps(twin, indent=2, allow_nan=False) + "\n")
     write_whole(directory / VERIFICATION_FILE, verification_csv(requirement_evidence(run.name, verdicts, algorithms)))

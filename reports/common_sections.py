@@ -145,22 +145,22 @@ def drivers_section(subject: Subject) -> Section | None:
     if subject.bound is not None:
         responses["failures"] = (~rates.success_mask(frame, metric, subject.bound)).astype(np.float64)
     ranked = {name: ranked_drivers(frame, metric, response) for name, response in responses.items()}
-    known = {name: found for name, found in ranked.items() if found}
+    known = {name: strongest for name, strongest in ranked.items() if strongest}
     if not known:
         return None
     note = note_text("common.drivers", confidence=format_fraction(CONFIDENCE))
     head = ["Condition", "Cases", "Rank correlation", "Interval", "Share", "Interval", "p"]
     blocks = []
-    for name, found in known.items():
+    for name, strongest in known.items():
         rows = []
-        for column, one, p in found:
+        for column, one, p in strongest:
             ranks = [coefficient(one.correlation), f"{coefficient(one.lower)} to {coefficient(one.upper)}"]
             share = [percent(one.share), rates.range_text(one.share_lower, one.share_upper)]
             rows.append([label(column), f"{one.n:,}", *ranks, *share, p_text(p)])
         blocks.append(Block(heading=f"Drivers of {name}", grid=Grid(head, rows)))
     data = {
-        name: [{"condition": column, **asdict(one), "corrected_p": p} for column, one, p in found]
-        for name, found in known.items()
+        name: [{"condition": column, **asdict(one), "corrected_p": p} for column, one, p in strongest]
+        for name, strongest in known.items()
     }
     return Section("explained", "Explained", "Drivers of errors and failures", [*blocks, Block(note=note)], data)
 
@@ -171,14 +171,14 @@ Ranked = Sequence[tuple[str, Driver, float]]
 def ranked_drivers(frame: pd.DataFrame, metric: str, response: Float[np.ndarray, " n"]) -> Ranked:
     """Conditions with the explained variance of a response and corrected p, in falling order."""
     groups = rates.terrain_groups(frame)
-    found: Mapping[str, Driver] = {
+    drivers: Mapping[str, Driver] = {
         column: one
         for column in driver_columns(frame, metric, MAX_CONDITIONS)
         if (one := driver(numbers(frame, column), response, groups, CONFIDENCE)) is not None
     }
-    p_values = dict(zip(found, holm([one.p_value for one in found.values()]), strict=True))
-    order = sorted(found, key=lambda column: (-found[column].share, column))
-    return [(column, found[column], p_values[column]) for column in order]
+    p_values = dict(zip(drivers, holm([one.p_value for one in drivers.values()]), strict=True))
+    order = sorted(drivers, key=lambda column: (-drivers[column].share, column))
+    return [(column, drivers[column], p_values[column]) for column in order]
 
 
 #: Up to this ratio of the axis' ends it has ticks within its decades.
@@ -268,11 +268,11 @@ def curve_figure(points: Sequence[Point], name: str, asked: float | None) -> Fig
     """An estimate and its bounds against the number of cases."""
     figure, axes = new_axes(4.2, 2.8)
     cases, estimates, lower, upper = np.array([(one.cases, one.estimate, one.lower, one.upper) for one in points]).T
-    known = np.concatenate([estimates, lower, upper, [math.nan if asked is None else asked]])
-    known = known[np.isfinite(known)]
-    if known.size:
-        margin = 0.06 * float(np.ptp(known)) or 0.06
-        bottom, top = float(known.min()) - margin, float(known.max()) + margin
+    finite = np.concatenate([estimates, lower, upper, [math.nan if asked is None else asked]])
+    finite = finite[np.isfinite(finite)]
+    if finite.size:
+        margin = 0.06 * float(np.ptp(finite)) or 0.06
+        bottom, top = float(finite.min()) - margin, float(finite.max()) + margin
         axes.set_ylim(bottom, top)
         axes.fill_between(
             cases, np.where(np.isfinite(lower), lower, bottom), np.where(np.isfinite(upper), upper, top),
@@ -316,23 +316,23 @@ def consistencies(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
     judged = str(frame["algorithm"].iloc[0]) if "algorithm" in frame and len(frame) else "judged"
     frames = {judged: frame, **{name: select_algorithm(frame, name) for name in compared_names(frame)}}
     by_name = {name: numbers(own, NEES) for name, own in frames.items() if NEES in own}
-    known = {name: nees[np.isfinite(nees)] for name, nees in by_name.items()}
-    return {name: consistency(nees) for name, nees in known.items() if nees.size}
+    finite = {name: nees[np.isfinite(nees)] for name, nees in by_name.items()}
+    return {name: consistency(nees) for name, nees in finite.items() if nees.size}
 
 
 def consistency_section(subject: Subject) -> Section | None:
     """Consistency of stated covariances with errors; None if no algorithm states any."""
-    found = consistencies(subject.frame)
-    if not found:
+    results = consistencies(subject.frame)
+    if not results:
         return None
     rows = []
-    for name, one in found.items():
+    for name, one in results.items():
         inside = f"{percent(one['inside'])} ({rates.range_text(one['inside_lower'], one['inside_upper'])})"
         band = f"{number(one['lower'])} to {number(one['upper'])}"
         rows.append([name, f"{one['n']:,}", number(one["mean"]), band, inside, one["word"]])
     head = ["Algorithm", "Estimates", "Mean NEES", "95 % band", "Within 95 % ellipse", "Covariances are"]
     blocks = [Block(grid=Grid(head, rows), note=note_text("common.consistency", parts=PARTS))]
-    return Section("consistency", "Consistency", "Stated covariances against errors", blocks, found)
+    return Section("consistency", "Consistency", "Stated covariances against errors", blocks, results)
 
 
 def _fault_outcomes(rows: Rows, subject: Subject) -> dict[str, Bool[np.ndarray, " n"]]:

@@ -88,14 +88,14 @@ def select_algorithm(frame: pd.DataFrame, name: str) -> pd.DataFrame:
     """The rows with a compared algorithm in place of the judged one."""
     prefix = f"{name}."
     own = {str(column): str(column).removeprefix(prefix) for column in frame.columns if str(column).startswith(prefix)}
-    kept = frame.drop(columns=[column for column in own.values() if column in frame])
-    return kept.rename(columns=own)
+    renamed = frame.drop(columns=[column for column in own.values() if column in frame])
+    return renamed.rename(columns=own)
 
 
 def contender(frame: pd.DataFrame, name: str, metric: str | None, bound: float | None) -> Contender:
     """Results of the judged algorithm in the rows."""
     magnitude = np.abs(numbers(frame, metric)) if metric is not None else np.full(len(frame), np.nan)
-    known = magnitude[np.isfinite(magnitude)]
+    finite = magnitude[np.isfinite(magnitude)]
     within = None
     if metric is not None and bound is not None:
         within = int(success_mask(frame, metric, bound).sum()) if metric in frame else 0
@@ -105,8 +105,8 @@ def contender(frame: pd.DataFrame, name: str, metric: str | None, bound: float |
         answered=int(frame["answered"].eq(True).sum()),
         failed=int(frame["outcome"].isin(rates.ENGINE_FAILURES).sum()),
         succeeded=within,
-        median=float(np.median(known)) if known.size else math.nan,
-        p95=float(np.quantile(known, 0.95)) if known.size else math.nan,
+        median=float(np.median(finite)) if finite.size else math.nan,
+        p95=float(np.quantile(finite, 0.95)) if finite.size else math.nan,
     )
 
 
@@ -137,11 +137,11 @@ def comparison(
     contenders += [contender(own, name, metric, bound) for name, own in others.items()]
     if metric is None:
         return contenders, []
-    found = [difference(frame, own, name, metric, bound) for name, own in others.items() if metric in own]
-    of_success, of_errors = (holm([getattr(one, key) for one in found]) for key in ("success_p", "error_p"))
+    differences = [difference(frame, own, name, metric, bound) for name, own in others.items() if metric in own]
+    of_success, of_errors = (holm([getattr(one, key) for one in differences]) for key in ("success_p", "error_p"))
     return contenders, [
         replace(one, success_p=success, error_p=error)
-        for one, success, error in zip(found, of_success, of_errors, strict=True)
+        for one, success, error in zip(differences, of_success, of_errors, strict=True)
     ]
 
 
@@ -210,12 +210,12 @@ class Figure:
     @property
     def text(self) -> str:
         """The rate with its cases, or median and 95 % quantile."""
-        known = self.known
-        if known.size == 0:
+        values = self.known
+        if values.size == 0:
             return NOTHING
         if self.larger_is_better:
-            return f"{percent(self.level)} of {known.size:,}"
-        return f"{number(self.level)}, 95 % {number(float(np.quantile(known, 0.95)))}"
+            return f"{percent(self.level)} of {values.size:,}"
+        return f"{number(self.level)}, 95 % {number(float(np.quantile(values, 0.95)))}"
 
     @property
     def known(self) -> Float[np.ndarray, " known"]:
@@ -225,10 +225,10 @@ class Figure:
     @property
     def level(self) -> float:
         """The rate, or the median; NaN for no cases."""
-        known = self.known
-        if known.size == 0:
+        values = self.known
+        if values.size == 0:
             return math.nan
-        return float(known.mean() if self.larger_is_better else np.median(known))
+        return float(values.mean() if self.larger_is_better else np.median(values))
 
 
 @dataclass(frozen=True)
@@ -244,7 +244,7 @@ class Contrast:
 def list_figures(run: StoredRun) -> tuple[pd.DataFrame, list[Figure]]:
     """The drawn cases of a campaign, and its figures: success by requirement, answers, completion, and magnitudes."""
     frame = read_sampling_design(run.configuration).draw(run.frame)
-    found: dict[str, Figure] = {}
+    figures: dict[str, Figure] = {}
     metrics = dict.fromkeys([primary_metric(frame, run.requirements)])
     for asked in run.requirements:
         name, metric, bound = str(asked.get("id", "?")), str(asked.get("metric", "")), asked.get("bound")
@@ -257,16 +257,16 @@ def list_figures(run: StoredRun) -> tuple[pd.DataFrame, list[Figure]]:
             continue
         limit, scale = (float(x) if isinstance(x, int | float) else math.nan for x in (bound, asked.get("scale", 1)))
         success = success_mask(frame, metric, limit, scale)
-        found[name] = Figure(name, True, np.where(chosen, success.astype(np.float64), np.nan))
+        figures[name] = Figure(name, True, np.where(chosen, success.astype(np.float64), np.nan))
         if is_bounded:
             metrics[metric] = None
     for measured in filter(None, metrics):
         magnitude = np.abs(numbers(frame, measured))
-        found[measured] = Figure(label(measured), False, np.where(np.isfinite(magnitude), magnitude, np.nan))
+        figures[measured] = Figure(label(measured), False, np.where(np.isfinite(magnitude), magnitude, np.nan))
     if rates.is_flag(frame, "answered"):
-        found["answered"] = Figure("answered", True, rates.members(frame, "valid").astype(np.float64))
-    found["came to an end"] = Figure("came to an end", True, rates.members(frame, "completed").astype(np.float64))
-    return frame, list(found.values())
+        figures["answered"] = Figure("answered", True, rates.members(frame, "valid").astype(np.float64))
+    figures["came to an end"] = Figure("came to an end", True, rates.members(frame, "completed").astype(np.float64))
+    return frame, list(figures.values())
 
 
 def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[Contrast]]:

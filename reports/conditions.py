@@ -79,9 +79,9 @@ def cuts(frame: pd.DataFrame) -> Iterator[tuple[str, list[tuple[str, Bool[np.nda
                 yield column, list(zip(map(plain_value, values), chosen, strict=True))
             elif kinds > 2 and pd.api.types.is_numeric_dtype(frame[column].dtype):
                 measured = numbers(frame, column)
-                known = measured[np.isfinite(measured)]
-                bins = int(np.clip(known.size // CASES_PER_BIN, 2, MAX_BINS))
-                edges = np.unique(np.quantile(known, np.linspace(0.0, 1.0, bins + 1)))
+                finite = measured[np.isfinite(measured)]
+                bins = int(np.clip(finite.size // CASES_PER_BIN, 2, MAX_BINS))
+                edges = np.unique(np.quantile(finite, np.linspace(0.0, 1.0, bins + 1)))
                 positions = np.where(np.isfinite(measured), np.digitize(measured, edges[1:-1]), -1)
                 names = [f"{number(low)} to {number(high)}" for low, high in pairwise(edges.tolist())]
                 yield column, [(name, positions == k) for k, name in enumerate(names)]
@@ -98,11 +98,11 @@ def terrain_spread(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
     """
     groups = rates.terrain_groups(frame)
     values = numbers(frame, part)
-    known = np.isfinite(values) & rates.members(frame, "valid")
-    if groups is None or not known.any():
+    finite = np.isfinite(values) & rates.members(frame, "valid")
+    if groups is None or not finite.any():
         return None
-    _, index = np.unique(groups[known], return_inverse=True)
-    errors, sizes = values[known], np.bincount(index).astype(np.float64)
+    _, index = np.unique(groups[finite], return_inverse=True)
+    errors, sizes = values[finite], np.bincount(index).astype(np.float64)
     n, k = errors.size, sizes.size
     if k < 2 or n == k:
         return None

@@ -149,12 +149,12 @@ def _pairs(axes: Axes, drawn: Sequence[Drawn]) -> None:
     for place, one in enumerate(drawn):
         axes.text(place + 0.5, place + 0.5, one.short_name.replace("_", "\n"), fontsize=8, **_CENTRED)
     for row, column in below:
-        found = rank_correlation(numbers[row], numbers[column])
-        if math.isnan(found):
+        correlation = rank_correlation(numbers[row], numbers[column])
+        if math.isnan(correlation):
             continue
         # bold: beyond 3.3 / sqrt(n - 1), which is unlikely by chance
-        beyond = abs(found) > 3.3 / math.sqrt(max(numbers[0].size - 1, 1))
-        text = f"{found + 0.0:+.2f}".replace("-", "−") if abs(found) >= 0.005 else "0.00"
+        beyond = abs(correlation) > 3.3 / math.sqrt(max(numbers[0].size - 1, 1))
+        text = f"{correlation + 0.0:+.2f}".replace("-", "−") if abs(correlation) >= 0.005 else "0.00"
         style = _CENTRED | {"fontweight": "bold" if beyond else "normal", "color": SERIES[1] if beyond else MUTED}
         axes.text(row + 0.5, column + 0.5, text, fontsize=8, **style)
     axes.set(xlim=(0, size), ylim=(size, 0))

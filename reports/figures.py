@@ -79,28 +79,28 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
     if len(parts) < 2:
         return None
     points = np.column_stack([numbers(frame, part) for part in parts])
-    known = np.isfinite(points).all(axis=1)
-    if not known.any():
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.any():
         return None
     ellipse = error_ellipse(points, ELLIPSE)
-    reach = 1.08 * float(np.abs(points[known]).max()) or 1.0
+    limit = 1.08 * float(np.abs(points[finite]).max()) or 1.0
     if not close and bound is not None and bound > 0.0:
-        near = 1.05 * axis_edge(np.abs(points[known]).max(axis=1), bound)
-        reach = min(reach, near) if reach > 1.15 * bound else 1.15 * bound
+        inner_limit = 1.05 * axis_edge(np.abs(points[finite]).max(axis=1), bound)
+        limit = min(limit, inner_limit) if limit > 1.15 * bound else 1.15 * bound
     if close and ellipse is not None:
-        reach = max(reach, ellipse.reach)
+        limit = max(limit, ellipse.reach)
     figure, axes = new_axes(5.0, 4.9)
-    inside = (np.abs(points) <= reach).all(axis=1)
+    inside = (np.abs(points) <= limit).all(axis=1)
     for kind in categories(frame, metric, bound):
-        x, y = points[kind.chosen & known & inside].T
+        x, y = points[kind.chosen & finite & inside].T
         _draw_points(axes, x, y, kind)
-        x, y = np.clip(points[kind.chosen & known & ~inside], -reach, reach).T
+        x, y = np.clip(points[kind.chosen & finite & ~inside], -limit, limit).T
         _draw_points(axes, x, y, kind, hollow=True)
-    if (known & ~inside).any():
-        axes.plot([], [], "o", markerfacecolor="none", color=INK, label=f"{(known & ~inside).sum():,} beyond the axes")
+    if (finite & ~inside).any():
+        axes.plot([], [], "o", markerfacecolor="none", color=INK, label=f"{(finite & ~inside).sum():,} beyond the axes")
     if bound is not None:
         axes.add_patch(Circle((0, 0), bound, fill=False, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3))
-        if bound <= reach * math.sqrt(2.0):  # else the circle lies outside the axes
+        if bound <= limit * math.sqrt(2.0):  # else the circle lies outside the axes
             axes.plot([], [], "--", color=REQUIREMENT, label=f"requirement {bound:g} {split_unit(metric)[1]}")
     if ellipse is not None:
         outline: dict[str, Any] = {"fill": False, "color": INK, "linewidth": 1.4, "linestyle": ":", "zorder": 3}
@@ -109,7 +109,7 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
         axes.plot([], [], ":", color=INK, label=f"{format_fraction(ELLIPSE)} ellipse")
     axes.axhline(0.0, color=MUTED, linewidth=0.8, zorder=1)
     axes.axvline(0.0, color=MUTED, linewidth=0.8, zorder=1)
-    axes.set(xlim=(-reach * 1.04, reach * 1.04), ylim=(-reach * 1.04, reach * 1.04), aspect="equal")
+    axes.set(xlim=(-limit * 1.04, limit * 1.04), ylim=(-limit * 1.04, limit * 1.04), aspect="equal")
     axes.set(xlabel=label(parts[0]), ylabel=label(parts[1]))
     axes.legend(bbox_to_anchor=(0.5, -0.14), **_BELOW)
     return figure
@@ -133,8 +133,8 @@ def axis_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float
 def needs_enlarged_figure(frame: pd.DataFrame, metric: str, bound: float | None) -> bool:
     """Whether all errors are so small against the bound that a figure of their own extent is needed."""
     magnitude = np.abs(numbers(frame, metric))
-    known = magnitude[np.isfinite(magnitude)]
-    return bound is not None and known.size > 0 and 0.0 < float(known.max()) < 0.6 * bound
+    finite = magnitude[np.isfinite(magnitude)]
+    return bound is not None and finite.size > 0 and 0.0 < float(finite.max()) < 0.6 * bound
 
 
 @in_page_style
@@ -197,24 +197,24 @@ def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: 
     Cases without an error are ticks on the upper edge, errors beyond the axis hollow marks below it.
     """
     x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
-    known = np.isfinite(x) & np.isfinite(magnitude)
+    finite = np.isfinite(x) & np.isfinite(magnitude)
     silent = np.isfinite(x) & ~np.isfinite(magnitude)
-    if not (known | silent).any():
+    if not (finite | silent).any():
         return None
     figure, axes = new_axes(4.2, 3.2)
-    edge = _scatter_edge(magnitude[known], bound)
+    edge = _scatter_edge(magnitude[finite], bound)
     top = 1.12 * edge
     kinds = categories(frame, metric, bound)
     for kind in kinds:
-        inside, beyond = (kind.chosen & known & which for which in (magnitude <= edge, magnitude > edge))
+        inside, beyond = (kind.chosen & finite & which for which in (magnitude <= edge, magnitude > edge))
         _draw_points(axes, x[inside], magnitude[inside], kind)
         _draw_points(axes, x[beyond], np.full(beyond.sum(), 1.06 * edge), kind, hollow=True)
     if len(kinds) > 1 and not axis_columns(metric, [str(name) for name in frame.columns]):
         # otherwise the scatter figure has the legend
         axes.legend(bbox_to_anchor=(0.5, -0.18), **_BELOW)
-    bins = min(int(known.sum()) // _CASES_PER_POINT, _MAX_POINTS)
+    bins = min(int(finite.sum()) // _CASES_PER_POINT, _MAX_POINTS)
     if bins >= _MIN_POINTS:  # median (solid) and 95 % quantile (dotted) of bins of equally many cases
-        of_x, limited = x[known], np.minimum(magnitude[known], 1.06 * edge)
+        of_x, limited = x[finite], np.minimum(magnitude[finite], 1.06 * edge)
         parts = np.array_split(np.argsort(of_x, kind="stable"), bins)
         middles = [float(np.median(of_x[part])) for part in parts]
         for quantile, line in ((0.5, "-"), (0.95, ":")):
@@ -240,8 +240,8 @@ def _scatter_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> f
 def count_beyond_axis(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> int:
     """Number of hollow marks of `error_scatter_against`."""
     x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
-    known = magnitude[np.isfinite(x) & np.isfinite(magnitude)]
-    return int((known > _scatter_edge(known, bound)).sum())
+    finite = magnitude[np.isfinite(x) & np.isfinite(magnitude)]
+    return int((finite > _scatter_edge(finite, bound)).sum())
 
 
 @in_page_style
@@ -271,8 +271,8 @@ def _annotate(axes: Axes, text: str, at: tuple[Any, Any], shift: tuple[int, int]
 
 def _magnitudes(frame: pd.DataFrame, metric: str, bound: float | None) -> tuple[Float[np.ndarray, " known"], float]:
     magnitude = np.abs(numbers(frame, metric))
-    known = magnitude[np.isfinite(magnitude)]
-    return known, axis_edge(known, bound)
+    finite = magnitude[np.isfinite(magnitude)]
+    return finite, axis_edge(finite, bound)
 
 
 def _draw_points(

@@ -146,15 +146,15 @@ class RateTable:
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
         """The rates that have cases."""
-        found = self.rates(frame) if callable(self.rates) else {one.name: one.of(frame) for one in self.rates}
+        rates_by_name = self.rates(frame) if callable(self.rates) else {one.name: one.of(frame) for one in self.rates}
         rows = [
             [name, rates.fraction_text(one), rates.interval_text(one, shared=self.shared)]
-            for name, one in found.items()
+            for name, one in rates_by_name.items()
             if isinstance(one, Share) and one.n
         ]
         grid = Grid(["", self.cases, f"{format_fraction(CONFIDENCE)} interval"], rows)
         blocks = [Block(heading=self.heading, grid=grid, note=self.note)] if rows else []
-        return blocks, {self.data: {name: asdict(one) for name, one in found.items()}}
+        return blocks, {self.data: {name: asdict(one) for name, one in rates_by_name.items()}}
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ class Presentation:
 @cache
 def presentations() -> tuple[Presentation, ...]:
     """The presentations of all systems in the order of the registry; an unusable one is left out with a warning."""
-    found: list[Presentation] = []
+    selected: list[Presentation] = []
     for system in systems():
         if not system.report:
             continue
@@ -87,11 +87,11 @@ def presentations() -> tuple[Presentation, ...]:
             _warn(f"{stated} cannot be imported: {error}")
             continue
         if isinstance(presentation, Presentation):
-            found.append(presentation)
+            selected.append(presentation)
         else:
             kind = type(presentation).__name__
             _warn(f"{stated} is a {kind}; allowed: a marsyard.reports.presentation.Presentation")
-    return tuple(found)
+    return tuple(selected)
 
 
 def _warn(reason: str) -> None:
@@ -141,9 +141,9 @@ def read_arrays(
     products: Products, shapes: Mapping[str, tuple[int | None, ...]], *, finite: bool = False
 ) -> list[Float[np.ndarray, "..."]] | None:
     """Products by name and shape, optionally finite; None if one of them is something else."""
-    found = [check_shape(products.get(name), *shape) for name, shape in shapes.items()]
-    known = [one for one in found if one is not None and (not finite or np.isfinite(one).all())]
-    return known if len(known) == len(shapes) else None
+    arrays = [check_shape(products.get(name), *shape) for name, shape in shapes.items()]
+    valid = [one for one in arrays if one is not None and (not finite or np.isfinite(one).all())]
+    return valid if len(valid) == len(shapes) else None
 
 
 #: Cases of each kind (largest errors, no answer, random); the pictures of one take about half a megabyte of a page.
@@ -192,8 +192,8 @@ def notable_cases(run: StoredRun) -> list[int]:
 def _by_error(rows: pd.DataFrame, metric: str) -> tuple[list[int], list[int]]:
     """Cases with an error, largest first, and cases without one."""
     cases, sizes = rows["case"].to_numpy(dtype=np.int64), np.abs(numbers(rows, metric))
-    known = np.isfinite(sizes)
-    return cases[known][np.argsort(-sizes[known], kind="stable")].tolist(), cases[~known].tolist()
+    finite = np.isfinite(sizes)
+    return cases[finite][np.argsort(-sizes[finite], kind="stable")].tolist(), cases[~finite].tolist()
 
 
 def _pick(first: list[int], *kinds: list[int]) -> list[int]:

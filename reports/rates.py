@@ -80,10 +80,10 @@ def terrain_groups(chosen: pd.DataFrame) -> Int[np.ndarray, " n"] | None:
     """Terrain index of each case from 0; None if unknown for all. A case of unknown terrain has its own index."""
     if "terrain" not in chosen or bool(chosen["terrain"].isna().all()):
         return None
-    codes, known = pd.factorize(chosen["terrain"])
+    codes, terrain_names = pd.factorize(chosen["terrain"])
     groups = np.array(codes, dtype=np.int64)
     alone = groups < 0
-    groups[alone] = len(known) + np.arange(int(alone.sum()))
+    groups[alone] = len(terrain_names) + np.arange(int(alone.sum()))
     return groups
 
 

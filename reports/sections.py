@@ -98,8 +98,8 @@ def outcome_grid(frame: pd.DataFrame) -> Grid:
 def worst_cases(run: StoredRun, metric: str, pictured: Collection[str] = ()) -> CaseTable:
     """The cases with the largest errors; `pictured` are the cases with pictures on the page."""
     magnitude = np.abs(numbers(run.whole, metric))
-    known = np.flatnonzero(np.isfinite(magnitude))
-    order = known[np.argsort(-magnitude[known], kind="stable")]
+    finite = np.flatnonzero(np.isfinite(magnitude))
+    order = finite[np.argsort(-magnitude[finite], kind="stable")]
     columns = [metric, *axis_columns(metric, [str(name) for name in run.whole.columns])]
     return _case_table(run, order, [*columns, *_conditions(run, metric)], pictured)
 
@@ -258,8 +258,8 @@ def driver_plates(frame: pd.DataFrame, metric: str, bound: float | None) -> list
     """A metric against the conditions that may drive it, with rank correlations."""
     drawn, magnitude, groups = [], np.abs(numbers(frame, metric)), terrain_groups(frame)
     for k, column in enumerate(driver_columns(frame, metric)):
-        found = driver(numbers(frame, column), magnitude, groups, CONFIDENCE)
-        text = f"{label(column)}." if found is None else f"{label(column)}: rank correlation {rank_text(found)}."
+        result = driver(numbers(frame, column), magnitude, groups, CONFIDENCE)
+        text = f"{label(column)}." if result is None else f"{label(column)}: rank correlation {rank_text(result)}."
         beyond = figures.count_beyond_axis(frame, metric, column, bound)
         if beyond:
             text = f"{text} {count(beyond, 'error')} beyond the axis: hollow, at its upper edge."
@@ -320,10 +320,10 @@ def choose_points(frame: pd.DataFrame, metric: str) -> Int[np.ndarray, " n"]:
     if len(frame) <= MAX_POINTS:
         return np.arange(len(frame))
     magnitude = np.abs(numbers(frame, metric))
-    known = np.isfinite(magnitude)
+    finite = np.isfinite(magnitude)
     crashed = engine_failed(frame)
-    worst = np.argsort(-np.where(known, magnitude, -1.0), kind="stable")
-    notable = [part[:MAX_NOTABLE] for part in (worst, np.flatnonzero(~known & ~crashed), np.flatnonzero(crashed))]
+    worst = np.argsort(-np.where(finite, magnitude, -1.0), kind="stable")
+    notable = [part[:MAX_NOTABLE] for part in (worst, np.flatnonzero(~finite & ~crashed), np.flatnonzero(crashed))]
     return np.sort(pd.unique(np.concatenate([*notable, np.arange(len(frame))]))[:MAX_POINTS])
 
 

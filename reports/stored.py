@@ -56,8 +56,12 @@ class StoredRun:
     @property
     def requirements(self) -> list[Mapping[str, Any]]:
         """The requirements of the campaign."""
-        asked = self.recorded("requirements")
-        return [item for item in asked if isinstance(item, Mapping)] if isinstance(asked, list | tuple) else []
+        stored_requirements = self.recorded("requirements")
+        return (
+            [item for item in stored_requirements if isinstance(item, Mapping)]
+            if isinstance(stored_requirements, list | tuple)
+            else []
+        )
 
     @property
     def command(self) -> tuple[str, tuple[str, ...]] | None:
@@ -70,8 +74,8 @@ class StoredRun:
 
     def recorded(self, key: str) -> Any:
         """Value of a key in the record or in its configuration; None if missing."""
-        found = self.record.get(key)
-        return found if found is not None else self.configuration.get(key)
+        value = self.record.get(key)
+        return value if value is not None else self.configuration.get(key)
 
     def parameter(self, *path: str) -> Any:
         """A parameter of the campaign's file; None if missing."""
@@ -103,7 +107,7 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
     if requirements is not None:
         record["requirements"] = list(requirements)
     try:
-        frame, whole = _frames(path, record)
+        frame, total = _frames(path, record)
     except (OSError, ValueError) as error:
         raise StoreError(f"{path} cannot be read: {error}") from error
     try:
@@ -112,7 +116,7 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
         names = []
     kept = sorted(int(name) for name in names if name.isascii() and name.isdigit())
     kept.sort(key=lambda case: case != record.get("showcase"))
-    return StoredRun(directory, frame, whole, record, tuple(kept))
+    return StoredRun(directory, frame, total, record, tuple(kept))
 
 
 def _frames(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:

@@ -164,12 +164,12 @@ class Verdict:
         if math.isnan(self.bounds_confidence) or self.bounds_confidence == self.upper_confidence == self.confidence:
             return ""
         lower, upper = (f"{100.0 * level:.4g} %" for level in (self.bounds_confidence, self.upper_confidence))
-        kept = f"so that all looks together keep {format_fraction(self.confidence)}"
+        joint_note = f"so that all looks together keep {format_fraction(self.confidence)}"
         if lower == upper:
-            return f"The campaign is judged more than once: its bounds are at {lower} confidence, {kept}."
+            return f"The campaign is judged more than once: its bounds are at {lower} confidence, {joint_note}."
         return (
             f"The campaign is judged more than once: its lower bound is at {lower} confidence and its upper bound at "
-            f"{upper}, {kept}."
+            f"{upper}, {joint_note}."
         )
 
 

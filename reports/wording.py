@@ -37,9 +37,9 @@ def requirement_text(asked: Any, metric: str) -> str:
 def population_text(population: str) -> str:
     """A population in words: ``valid answers``, ``cases with room``, ``valid answers with room``."""
     parts = population.split(" and ")
-    whole = next((_POPULATIONS[part] for part in parts if part in _POPULATIONS), "cases")
+    base = next((_POPULATIONS[part] for part in parts if part in _POPULATIONS), "cases")
     flags = [part.removeprefix("with_").replace("_", " ") for part in parts if part not in _POPULATIONS]
-    return f"{whole} with {' and '.join(flags)}" if flags else whole
+    return f"{base} with {' and '.join(flags)}" if flags else base
 
 
 def number(value: float) -> str:

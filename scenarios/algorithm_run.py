@@ -114,7 +114,7 @@ def run_algorithm(ask: Callable[[], object], check: Callable[[object], Answer]) 
     started = time.process_time()
     try:
         raw = ask()
-        taken = time.process_time() - started
+        elapsed_s = time.process_time() - started
         answer = check(raw)
     except Exception as error:
         row: dict[str, Scalar] = {"estimation_time_s": time.process_time() - started}
@@ -123,7 +123,7 @@ def run_algorithm(ask: Callable[[], object], check: Callable[[object], Answer]) 
             return AlgorithmRun(None, Failure(error.fault.name, str(error), ""), row)
         fault = Fault.OUT_OF_MEMORY if isinstance(error, MemoryError) else Fault.CRASHED
         return AlgorithmRun(None, Failure(fault.name, describe_error(error), traceback.format_exc()), row)
-    row = {"estimation_time_s": answer_time_s(answer, taken)}
+    row = {"estimation_time_s": answer_time_s(answer, elapsed_s)}
     details = getattr(answer, "details", None)
     if isinstance(details, ProgramDetails):
         row[STDERR] = details.stderr

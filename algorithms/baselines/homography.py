@@ -72,15 +72,15 @@ class HomographyEstimator:
         )
         if homography is None or not inliers.any():
             return None
-        kept = inliers.ravel().astype(bool)
-        middle = points[0][kept].mean(axis=0).astype(np.float64)
+        inlier = inliers.ravel().astype(bool)
+        middle = points[0][inlier].mean(axis=0).astype(np.float64)
         moved = homography @ np.array([*middle, 1.0])
         if abs(moved[2]) < 1e-9:
             return None
-        found = moved[:2] / moved[2]
-        count = int(kept.sum())
-        valid = count >= o.min_inliers and distortion(homography, moved[2], found) <= o.max_distortion
-        return PairMatch(np.asarray(found - middle), float(count), valid)
+        point = moved[:2] / moved[2]
+        count = int(inlier.sum())
+        valid = count >= o.min_inliers and distortion(homography, moved[2], point) <= o.max_distortion
+        return PairMatch(np.asarray(point - middle), float(count), valid)
 
 
 def distortion(homography: Float[np.ndarray, "3 3"], depth: float | np.floating, place: Vector2) -> float:

@@ -96,11 +96,11 @@ def find_common_square(
     reach = np.tan(options.max_off_nadir_rad) * float(min(first.centre[2], second.centre[2]))
     per_side = 2 * int(np.ceil(reach / (COARSE_STEP_PX * gsd))) + 1
     lattice = binning.ground_lattice(np.zeros(2), per_side, COARSE_STEP_PX * gsd)
-    seen = np.ones(lattice.shape[:2], dtype=bool)
+    visible = np.ones(lattice.shape[:2], dtype=bool)
     for view in (first, second):
-        seen &= binning.inside_frame(view, lattice, options.border_px, options.max_off_nadir_rad)
+        visible &= binning.inside_frame(view, lattice, options.border_px, options.max_off_nadir_rad)
     # chessboard distance to the nearest invisible point: half sides of squares
-    steps = cv2.distanceTransform(np.pad(seen, 1).astype(np.uint8), cv2.DIST_C, 3)[1:-1, 1:-1]
+    steps = cv2.distanceTransform(np.pad(visible, 1).astype(np.uint8), cv2.DIST_C, 3)[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(steps)), steps.shape)
     side = min(2 * (int(steps[row, column]) - 1) * COARSE_STEP_PX, options.max_side_px)
     return (lattice[row, column], side, gsd) if side >= options.min_side_px else None
@@ -108,8 +108,10 @@ def find_common_square(
 
 def rectify_pair(first: binning.View, second: binning.View, options: CommonOptions) -> PairPatches | None:
     """Both images of a pair over their common ground; None if it is too small."""
-    found = find_common_square(first, second, options)
-    return found and PairPatches(binning.rectify_patch(first, *found), binning.rectify_patch(second, *found), found[2])
+    square = find_common_square(first, second, options)
+    return square and PairPatches(
+        binning.rectify_patch(first, *square), binning.rectify_patch(second, *square), square[2]
+    )
 
 
 def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, options: CommonOptions) -> VelocityEstimate:

@@ -85,8 +85,8 @@ def place_camera(camera: CameraModel, world_from_body: Rotation, altitude_m: flo
     The altitude is that of the body's origin; the camera's height follows from its lever arm.
     """
     lever = world_from_body.as_matrix() @ camera.c
-    placed = rigid(world_from_body, np.array([-lever[0], -lever[1], altitude_m]))
-    return camera.transform(placed), np.array([0.0, 0.0, altitude_m + lever[2]])
+    camera_pose = rigid(world_from_body, np.array([-lever[0], -lever[1], altitude_m]))
+    return camera.transform(camera_pose), np.array([0.0, 0.0, altitude_m + lever[2]])
 
 
 def build_view(
@@ -100,17 +100,17 @@ def build_view(
     is.
     """
     columns, rows = bin_factors(image.counts.shape, binned_size)
-    known = image.calibration
+    detector = image.calibration
     camera, centre = place_camera(image.camera.bin(columns, rows), world_from_body, altitude_m)
-    shared = before.flat_field if before is not None and before.calibration is known else None
+    shared = before.flat_field if before is not None and before.calibration is detector else None
     return View(
-        signal=bin_mean(image.counts.astype(np.float32), columns, rows) - np.float32(known.offset_dn),
-        flat_field=bin_mean(known.flat_field, columns, rows) if shared is None else shared,
+        signal=bin_mean(image.counts.astype(np.float32), columns, rows) - np.float32(detector.offset_dn),
+        flat_field=bin_mean(detector.flat_field, columns, rows) if shared is None else shared,
         camera=camera,
         centre=centre,
         time_s=image.time_s,
-        calibration=known,
-        rows_summed=known.rows_summed * rows,
+        calibration=detector,
+        rows_summed=detector.rows_summed * rows,
     )
 
 

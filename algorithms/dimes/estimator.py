@@ -27,10 +27,10 @@ def match_corner(
     options: DimesOptions,
 ) -> Vector2:
     """Row and column in the window of the matched template's upper left pixel, refined as the options require."""
-    whole = np.array([peak.row, peak.column], dtype=np.float64)
+    integer_peak = np.array([peak.row, peak.column], dtype=np.float64)
     if not options.subpixel:
-        return whole
-    start = whole + biquadratic_offset(surface, peak)
+        return integer_peak
+    start = integer_peak + biquadratic_offset(surface, peak)
     aligned = refine_shift(template, window, start) if options.align and not peak.on_border else None
     return start if aligned is None else aligned
 
@@ -120,11 +120,11 @@ def conclude(
 ) -> VelocityEstimate:
     """Combine the tracks of both pairs with the IMU."""
     first, second = ([(one.index, one.velocity_m_s) for one in pair.tracks if one.valid] for pair in pairs)
-    found = combinations(first, second, interval_velocities_m_s)
-    if found and found[0].discrepancy_m_s < imu_threshold_m_s:
-        velocity = pairs[1].tracks[found[0].second].velocity_m_s
-        return VelocityEstimate(VelocityOutcome.VALID, velocity, DimesDetails(pairs, found, found[0]))
-    outcome = VelocityOutcome.IMU_MISMATCH if found else VelocityOutcome.NO_VALID_TRACK
+    candidates = combinations(first, second, interval_velocities_m_s)
+    if candidates and candidates[0].discrepancy_m_s < imu_threshold_m_s:
+        velocity = pairs[1].tracks[candidates[0].second].velocity_m_s
+        return VelocityEstimate(VelocityOutcome.VALID, velocity, DimesDetails(pairs, candidates, candidates[0]))
+    outcome = VelocityOutcome.IMU_MISMATCH if candidates else VelocityOutcome.NO_VALID_TRACK
     if not all(pair.tracks for pair in pairs):
         outcome = VelocityOutcome.NO_TEMPLATE_AREA
-    return VelocityEstimate(outcome, None, DimesDetails(pairs, found, None))
+    return VelocityEstimate(outcome, None, DimesDetails(pairs, candidates, None))

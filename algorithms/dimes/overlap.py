@@ -114,8 +114,8 @@ def template_candidates(
     """All feasible template positions on the coarse grid."""
     limit = options.max_off_nadir_rad
     pixels = grid_pixels(first.size, options.grid_step_px)
-    ground, seen = binning.ground_from_pixels(first, pixels, limit)
-    pixels, ground = pixels[seen], ground[seen]
+    ground, visible = binning.ground_from_pixels(first, pixels, limit)
+    pixels, ground = pixels[visible], ground[visible]
     for view, half in ((second, 0.0), (first, geometry.template_half_m), (second, geometry.window_half_m)):
         outline = binning.square_outline(half, 3) if half > 0.0 else np.zeros((1, 2))
         room = binning.inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1)

@@ -89,8 +89,8 @@ def combinations(
 ) -> tuple[Combination, ...]:
     """All combinations of valid tracks (index, velocity) of both pairs, best agreement first."""
     change = (interval_velocities_m_s[1] - interval_velocities_m_s[0])[:2]
-    found = [Combination(i, j, float(np.hypot(*(b - a - change)))) for (i, a), (j, b) in product(first, second)]
-    return tuple(sorted(found, key=lambda c: c.discrepancy_m_s))
+    candidates = [Combination(i, j, float(np.hypot(*(b - a - change)))) for (i, a), (j, b) in product(first, second)]
+    return tuple(sorted(candidates, key=lambda c: c.discrepancy_m_s))
 
 
 def propagate_velocity(

@@ -189,16 +189,16 @@ def _write_images(folder: Path, images: Sequence[DetectorImage], pictures: Pictu
     written: list[dict[str, Any]] = []
     fields: dict[str, Float[np.ndarray, "rows columns"]] = {}
     for number, image in enumerate(images, start=1):
-        name, camera, known = f"image_{number}.{pictures}", f"camera_{number}.cahvor", image.calibration
+        name, camera, detector = f"image_{number}.{pictures}", f"camera_{number}.cahvor", image.calibration
         write_picture(folder / name, image.counts)
         write_cahvor(image.camera, folder / camera, frame=BODY_FRAME)
-        flat = next((path for path, one in fields.items() if np.array_equal(one, known.flat_field)), None)
+        flat = next((path for path, one in fields.items() if np.array_equal(one, detector.flat_field)), None)
         if flat is None:
             flat = f"flat_field_{len(fields) + 1}.f64"
-            fields[flat] = known.flat_field
-            known.flat_field.astype("<f8").tofile(folder / flat)
+            fields[flat] = detector.flat_field
+            detector.flat_field.astype("<f8").tofile(folder / flat)
         rows, columns = image.counts.shape
-        calibration = {"flat_field": flat, **{one: getattr(known, one) for one in _CALIBRATION}}
+        calibration = {"flat_field": flat, **{one: getattr(detector, one) for one in _CALIBRATION}}
         size = {"columns": columns, "rows": rows}
         written.append({"file": name, "camera": camera, "time_s": image.time_s, **size, "calibration": calibration})
     return written

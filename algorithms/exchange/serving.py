@@ -76,8 +76,8 @@ def read_numbers(answer: Mapping[str, Any], name: str, shape: tuple[int, ...]) -
     if value is None:
         return None
     if not _is_nested(value, shape):
-        given = shorten(json.dumps(value).encode())
-        raise bad_answer(f"{name} is {given}; allowed: numbers in the shape {list(shape)}")
+        received = shorten(json.dumps(value).encode())
+        raise bad_answer(f"{name} is {received}; allowed: numbers in the shape {list(shape)}")
     return np.array(value, dtype=np.float64)
 
 

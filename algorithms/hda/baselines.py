@@ -185,8 +185,8 @@ def match_disparities(
         speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
-    found = matcher.compute(*pictures).astype(np.float64) * DISPARITY_UNIT
-    return np.where(found >= max(min_disparity, 1), found, np.nan)
+    disparities = matcher.compute(*pictures).astype(np.float64) * DISPARITY_UNIT
+    return np.where(disparities >= max(min_disparity, 1), disparities, np.nan)
 
 
 def semi_global_structure(scene: LandingScene, motion: Motion, options: HdaOptions) -> Matches:
@@ -201,10 +201,10 @@ def semi_global_structure(scene: LandingScene, motion: Motion, options: HdaOptio
     depths = np.full(len(pixels), np.nan)
     pair = rectify_views(scene.views, motion.second_from_first)
     if pair is not None:
-        found = match_disparities(scene.views, pair, motion.second_from_first, bounds)
+        disparities = match_disparities(scene.views, pair, motion.second_from_first, bounds)
         rays = pair.rectified_from_first.apply(np.column_stack([places, np.ones(len(places))]))
         column, row = np.rint(pair.camera.project(rays)[0]).astype(np.int64).T
-        depths = pair.focal_px * pair.baseline_m / found[row, column] / rays[:, 2]
+        depths = pair.focal_px * pair.baseline_m / disparities[row, column] / rays[:, 2]
     accepted = (depths > bounds[0]) & (depths < bounds[1])
     fates = np.where(accepted, Fate.ACCEPTED, Fate.OUT_OF_BOUNDS).astype(np.uint8)
     points = points_at_depth(places, depths)

@@ -60,10 +60,10 @@ def flat_fielded(image: DetectorImage) -> UInt16[np.ndarray, "rows columns"]:
     this correction, and half a per cent with it. Frame transfer is removed first: at 10 ms it is half of the exposure's
     light in the last of the MER camera's 1,024 rows.
     """
-    known = image.calibration
-    response = np.maximum(known.flat_field, MIN_RESPONSE).astype(np.float32)
-    signal = image.counts - np.float32(known.offset_dn)
-    signal = remove_frame_transfer(signal, known, known.rows_summed).astype(np.float32, copy=False)
+    detector = image.calibration
+    response = np.maximum(detector.flat_field, MIN_RESPONSE).astype(np.float32)
+    signal = image.counts - np.float32(detector.offset_dn)
+    signal = remove_frame_transfer(signal, detector, detector.rows_summed).astype(np.float32, copy=False)
     return np.asarray(np.rint(np.clip(signal / response, 0.0, 65535.0)).astype(np.uint16))
 
 

@@ -74,10 +74,10 @@ def epipolar_segments(
     room = np.ones(len(places), dtype=bool)
     for depth in bounds_m:
         moved = second_from_first.apply(points_at_depth(places, np.full(len(places), depth)))
-        pixels, seen = project_points(second.camera, moved)
+        pixels, visible = project_points(second.camera, moved)
         with np.errstate(invalid="ignore"):
             inside = (pixels >= border_px) & (pixels <= np.array(second.camera.size) - 1.0 - border_px)
-        room &= seen & inside.all(axis=1)
+        room &= visible & inside.all(axis=1)
         ends.append(pixels)
     return ends[0], ends[1], room
 
@@ -112,10 +112,10 @@ def match_pixels(
     places = undistort(first.camera, pixels)
     starts, ends, room = epipolar_segments(second, second_from_first, places, bounds_m, border)
     pixels, places, starts, ends = pixels[room], places[room], starts[room], ends[room]
-    whole = pixels.astype(np.int64)
-    found = matching.search_segments(first.counts, second.counts, whole, starts, ends, options.search_half_px)
+    rounded = pixels.astype(np.int64)
+    matches = matching.search_segments(first.counts, second.counts, rounded, starts, ends, options.search_half_px)
     matched, correlations = matching.refine_shifts(
-        first.counts, second.counts, whole[:, ::-1], (found - whole)[:, ::-1], options.search_half_px
+        first.counts, second.counts, rounded[:, ::-1], (matches - rounded)[:, ::-1], options.search_half_px
     )
     depths = triangulate(places, undistort(second.camera, matched), second_from_first)
     fates = np.full(len(pixels), Fate.ACCEPTED, dtype=np.uint8)
@@ -124,7 +124,7 @@ def match_pixels(
     if options.max_return_px is not None:
         left = np.flatnonzero(fates == Fate.ACCEPTED)
         way = return_distance(
-            views, second_from_first, whole[left], found[left], places[left], bounds_m, options.search_half_px
+            views, second_from_first, rounded[left], matches[left], places[left], bounds_m, options.search_half_px
         )
         fates[left[way > options.max_return_px]] = Fate.NOT_RETURNED
     accepted = fates == Fate.ACCEPTED

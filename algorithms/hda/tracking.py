@@ -81,8 +81,8 @@ def select_features(counts: Counts, options: HdaOptions) -> Points2:
     best = blocks.reshape(*blocks.shape[:2], -1).argmax(axis=-1)
     row, column = (i * side for i in np.indices(best.shape))
     row, column = row + best // side, column + best % side
-    found = np.isfinite(blocks.max(axis=(2, 3)))
-    return np.column_stack([column[found], row[found]]).astype(np.float64)
+    has_peak = np.isfinite(blocks.max(axis=(2, 3)))
+    return np.column_stack([column[has_peak], row[has_peak]]).astype(np.float64)
 
 
 #: Limits of an alignment: a height change of a fifth stretches the image by a quarter, and the first steps overshoot.

@@ -42,11 +42,13 @@ def shifted_patch(coefficients: Raster, corner: Vector2, shape: tuple[int, int])
     All pixels share the fraction of the shift: the spline is a separable filter of six taps. The patch must lie at
     least three pixels inside the image.
     """
-    whole = np.floor(corner)
-    places = (corner - whole)[:, np.newaxis] - _TAPS
+    integer_part = np.floor(corner)
+    places = (corner - integer_part)[:, np.newaxis] - _TAPS
     taps = np.stack([_BASIS(places), _SLOPE(places)])
     samples = np.empty((3, *shape))
-    quintic.sample_with_derivatives(coefficients, int(whole[0]), int(whole[1]), taps[:, 0], taps[:, 1], samples)
+    quintic.sample_with_derivatives(
+        coefficients, int(integer_part[0]), int(integer_part[1]), taps[:, 0], taps[:, 1], samples
+    )
     return samples
 
 

@@ -106,8 +106,8 @@ def aim_at_pixel(target: PixelTarget, mast: MastCalibration, options: VttOptions
     margin = 0.5 * options.search_px + SURROUND
     box = box_around(target.pixel[None], margin, mast.left)
     curve = epipolar_pixels(mast.left.rays(target.pixel), mast.left, mast.right, options.seed_range_m)
-    seen = curve[mast.right.in_frame(curve)]
-    if box is None or len(seen) == 0:
+    visible = curve[mast.right.in_frame(curve)]
+    if box is None or len(visible) == 0:
         return None
-    right_box = box_around(seen, 0.5 * options.template_px + options.epipolar_tolerance_px + SURROUND, mast.right)
+    right_box = box_around(visible, 0.5 * options.template_px + options.epipolar_tolerance_px + SURROUND, mast.right)
     return None if right_box is None else MastAim(target.azimuth_rad, target.elevation_rad, box, right_box)

@@ -219,14 +219,14 @@ class VisualTargetTracker:
             predicted = expected_position(self.track, measurements.world_from_rover)
             return TargetUpdate(TrackingState.FAILURE, (), predicted)
         if self.track.sighting is None:
-            found = seed_track(self.track, measurements, self.options)
+            result = seed_track(self.track, measurements, self.options)
         else:
-            found = follow_track(self.track, self.track.sighting, measurements, self.options, self.matcher)
-        self.track = advance_track(self.track, found, measurements, self.options)
-        position = found.position_rover
+            result = follow_track(self.track, self.track.sighting, measurements, self.options, self.matcher)
+        self.track = advance_track(self.track, result, measurements, self.options)
+        position = result.position_rover
         if position is None:
             position = expected_position(self.track, measurements.world_from_rover)
-        return TargetUpdate(self.track.state, found.losses, position, found.details)
+        return TargetUpdate(self.track.state, result.losses, position, result.details)
 
 
 @dataclass(frozen=True)
@@ -312,12 +312,12 @@ def follow_track(
     stop = Stop.of(measurements)
     new_from_old = matching.pose_change(last.world_from_head, stop.world_from_head)
     expected = np.asarray(new_from_old.apply(last.position_head.copy()))
-    seen = matching.lever_pixels(last.position_head, last.camera, stop.left, new_from_old, options.roll_lever_m)
-    if seen is None:
+    lever_px = matching.lever_pixels(last.position_head, last.camera, stop.left, new_from_old, options.roll_lever_m)
+    if lever_px is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(False, None))
-    predicted = seen[0]
+    predicted = lever_px[0]
     magnification = matching.magnification(last.position_head, last.camera.c, expected, stop.left.c)
-    change = matching.Change(magnification, matching.roll_angle(seen))
+    change = matching.Change(magnification, matching.roll_angle(lever_px))
     window, window_corner = matching.search_window(measurements.left, predicted, options.search_px)
     details = VttDetails(False, predicted, window, window_corner, change)
     applied = matching.Change(change.magnification if options.scale else 1.0, change.roll_rad if options.roll else 0.0)

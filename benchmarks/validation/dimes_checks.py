@@ -65,14 +65,14 @@ def _stored_median_m_s() -> float:
 def estimators(quick: bool) -> Iterator[Measure]:
     descents = recorded("dimes-smoke", 4 if quick else 48)
     for name, estimator in ESTIMATORS.items():
-        found = run_estimator(estimator, descents)
-        valid = found.valid
+        results = run_estimator(estimator, descents)
+        valid = results.valid
         rms = float(np.sqrt(np.mean(valid**2))) if valid.size else float("nan")
         wrong = int(np.sum(valid > REQUIREMENT_M_S))
         how = (
             f"{valid.size} of {len(descents)} descents of dimes-smoke answered, {wrong} wrong by more than 5 m/s, "
             f"largest error {valid.max() if valid.size else float('nan'):.2g} m/s, "
-            f"{1e3 * float(np.median(found.seconds)):.0f} core-ms a triple"
+            f"{1e3 * float(np.median(results.seconds)):.0f} core-ms a triple"
         )
         yield Measure(f"velocity error, rms: {name}", rms, "m/s", None, how)
 

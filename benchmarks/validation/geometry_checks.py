@@ -131,9 +131,9 @@ def cast_ranges(view: View, count: int, farthest: float, step: float) -> Ranges:
         """Ranges at shifted pixels, and whether the ray hits an object."""
         origins, directions = camera.rays(pixels + np.array([right, down]))
         origins = np.array(origins)
-        found = ground.cast(origins, directions, 1.3 * farthest, step)
+        hits = ground.cast(origins, directions, 1.3 * farthest, step)
         objects = meet_triangles(view.scene.objects, origins, directions)
-        return np.minimum(found, objects), objects < found
+        return np.minimum(hits, objects), objects < hits
 
     here, is_object = cast(0.0, 0.0)
     away = np.ones(len(here), dtype=bool)

@@ -75,9 +75,9 @@ class Reference:
         angle, size = rng.uniform(0.0, 2.0 * np.pi, n), rng.uniform(*wrong_by_m_s, n)
         wrong = np.column_stack([size * np.cos(angle), size * np.sin(angle)])
         tracks[np.arange(n), rng.integers(2, size=n), rng.integers(templates, size=n)] += wrong
-        found = _discrepancies(tracks, self.imu).reshape(n, -1)
-        second = tracks[np.arange(n), 1, found.argmin(axis=1) % templates]
-        passed = found.min(axis=1) < threshold_m_s
+        discrepancies = _discrepancies(tracks, self.imu).reshape(n, -1)
+        second = tracks[np.arange(n), 1, discrepancies.argmin(axis=1) % templates]
+        passed = discrepancies.min(axis=1) < threshold_m_s
         right = passed & (np.linalg.norm(second, axis=1) <= REQUIRED_M_S)
         return float(right.mean()), float(np.mean(~passed))
 

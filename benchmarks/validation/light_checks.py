@@ -107,10 +107,10 @@ def _shadow_row(name: str, view: View, sun: Sun, count: int, farthest: float, st
     theirs = (facing > 0.0) & ~hidden
     agree = float(np.mean(ours == theirs))
     cast = (facing > 0.0) & hidden
-    found = f", of which {np.mean(~ours[cast]):.0%} are dark in the picture" if cast.any() else ""
+    dark_text = f", of which {np.mean(~ours[cast]):.0%} are dark in the picture" if cast.any() else ""
     how = (
         f"{pixels.size} random pixels, {np.mean(facing <= 0.0):.1%} turned from the sun, "
-        f"{np.mean(cast):.1%} in cast shadow{found}; {np.mean(theirs & ~ours):.2%} wrongly dark"
+        f"{np.mean(cast):.1%} in cast shadow{dark_text}; {np.mean(theirs & ~ours):.2%} wrongly dark"
     )
     # about three times the maximum disagreement from the air (0.03 %), and twice that from a mast (0.24 %)
     bar = 0.999 if farthest > FARTHEST_FROM_A_MAST_M else 0.995

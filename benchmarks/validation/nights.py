@@ -72,9 +72,9 @@ def quiet_nights(nights: int, seed: int) -> int:
             night = history.begin(None)
             for kind in KINDS:
                 history.add(night, NightCampaign(kind, "", "", "PASS", 0, ""), yard.night(kind))
-            found = changes(compare_night(history, night))
-            history.finish(night, FINISHED, [(one.campaign, one.figure, one.p_value, one.worse) for one in found])
-            alarms += bool(found)
+            flagged = changes(compare_night(history, night))
+            history.finish(night, FINISHED, [(one.campaign, one.figure, one.p_value, one.worse) for one in flagged])
+            alarms += bool(flagged)
     return alarms
 
 

@@ -42,7 +42,7 @@ class Ground:
 
     def cast(self, origins: np.ndarray, directions: np.ndarray, farthest: float, step: float) -> np.ndarray:
         """Distance of each ray to the ground by steps of at most `step` metres and bisection; infinite if none."""
-        found = np.full(len(directions), np.inf)
+        ranges = np.full(len(directions), np.inf)
         with np.errstate(divide="ignore"):
             above = np.where(directions[:, 2] < 0.0, (self.highest - origins[:, 2]) / directions[:, 2], 0.0)
             below = np.where(directions[:, 2] < 0.0, (self.lowest - origins[:, 2]) / directions[:, 2], np.inf)
@@ -52,8 +52,8 @@ class Ground:
             longest = float((stop - start)[order].max())
             count = max(int(BLOCK / (longest / step + 2)), 1)
             block, order = order[-count:], order[:-count]
-            found[block] = self._cast_block(origins[block], directions[block], start[block], stop[block], step)
-        return found
+            ranges[block] = self._cast_block(origins[block], directions[block], start[block], stop[block], step)
+        return ranges
 
     def _cast_block(
         self, origins: np.ndarray, directions: np.ndarray, start: np.ndarray, stop: np.ndarray, step: float
@@ -87,14 +87,14 @@ class Ground:
 
 def meet_triangles(objects: Objects, origins: np.ndarray, directions: np.ndarray, nearest: float = 0.0) -> np.ndarray:
     """Distance of each ray to the nearest triangle beyond `nearest`; infinite if none."""
-    found = np.full(len(directions), np.inf)
+    ranges = np.full(len(directions), np.inf)
     for body in range(len(objects)):
         corners = objects.triangles[objects.first_triangle[body] : objects.first_triangle[body + 1]]
         rays = _passing(corners, origins, directions)
         if rays.size:
             distance = _nearest_of(corners, origins[rays], directions[rays], nearest)
-            found[rays] = np.minimum(found[rays], distance)
-    return found
+            ranges[rays] = np.minimum(ranges[rays], distance)
+    return ranges
 
 
 def _passing(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -111,7 +111,7 @@ def _nearest_of(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray
     a, b, c = (corners[None, :, k] for k in range(3))
     first, second = b - a, c - a
     normal = np.cross(first, second)
-    found = np.empty(len(directions))
+    ranges = np.empty(len(directions))
     size = max(BLOCK // (4 * corners.shape[0]), 1)
     for at in range(0, len(directions), size):
         origin, direction = origins[at : at + size, None], directions[at : at + size, None]
@@ -123,5 +123,5 @@ def _nearest_of(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray
             p = np.sum(second * across, axis=-1) * scale
             q = -np.sum(first * across, axis=-1) * scale
         hit = (p >= -1e-12) & (q >= -1e-12) & (p + q <= 1.0 + 1e-12) & (t > nearest)
-        found[at : at + size] = np.where(hit, t, np.inf).min(axis=1)
-    return found
+        ranges[at : at + size] = np.where(hit, t, np.inf).min(axis=1)
+    return ranges

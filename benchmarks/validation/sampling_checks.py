@@ -98,9 +98,9 @@ def collisions(found: np.ndarray) -> int:
 def run_streams(quick: bool) -> Iterator[Measure]:
     """Count equal seeds of neighbouring campaigns, cases and streams."""
     names = stream_names()
-    found = all_seeds(CAMPAIGNS // 5 if quick else CAMPAIGNS, CASES // 10 if quick else CASES, names)
-    how = f"{len(found):,} streams: {len(names)} names, cases from 0, root seeds from 0, two campaigns; 128-bit seeds"
-    yield Measure("seeds of two random streams that are equal", collisions(found), "pairs", 0.0, how)
+    results = all_seeds(CAMPAIGNS // 5 if quick else CAMPAIGNS, CASES // 10 if quick else CASES, names)
+    how = f"{len(results):,} streams: {len(names)} names, cases from 0, root seeds from 0, two campaigns; 128-bit seeds"
+    yield Measure("seeds of two random streams that are equal", collisions(results), "pairs", 0.0, how)
 
 
 CHECKS = (Check("streams", "Random streams", run_streams),)

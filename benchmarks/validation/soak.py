@@ -168,12 +168,12 @@ def _run_with_kills(
 def _processes(folder: Path) -> list[int]:
     """Ids of living processes that carry the mark of the soak test."""
     mark = f"{_MARK}={folder}".encode()
-    found = []
+    problems = []
     for process in Path("/proc").glob("[1-9]*"):
         with suppress(OSError):
             if mark in (process / "environ").read_bytes():
-                found.append(int(process.name))
-    return found
+                problems.append(int(process.name))
+    return problems
 
 
 def _draw_fault(campaign: Any, case: int) -> str:
@@ -186,17 +186,17 @@ def isolation(quick: bool) -> Iterator[Measure]:
     """Run the soak test with misbehaving and healthy cases, and compare it with healthy cases."""
     cases, kills, share = (60, 1, 0.4) if quick else (300, 3, 0.4)
     with TemporaryDirectory() as name:
-        found = soak(Path(name), cases, kills, share, (5.0, 40.0))
-    healthy = found.deeds.count("")
-    kinds = len(set(found.deeds)) - 1
-    how = f"{cases} cases, {cases - healthy} of which misbehave in {kinds} ways; killed {found.kills} times"
-    yield Measure("soak: campaigns that did not end by themselves", float(not found.ended), "", 0, how)
-    yield Measure("soak: outcomes that are not those of the deed", len(found.wrong_outcomes), "", 0, how)
-    yield Measure("soak: rows of cases that answered, changed by others", len(found.changed), "", 0, how)
-    yield Measure("soak: processes left", found.processes, "", 0, how)
-    yield Measure("soak: temporary files left", found.files, "", 0, how)
-    yield Measure("soak: time of the campaign", found.seconds, "s", None, how)
-    for text in found.wrong_outcomes:
+        result = soak(Path(name), cases, kills, share, (5.0, 40.0))
+    healthy = result.deeds.count("")
+    kinds = len(set(result.deeds)) - 1
+    how = f"{cases} cases, {cases - healthy} of which misbehave in {kinds} ways; killed {result.kills} times"
+    yield Measure("soak: campaigns that did not end by themselves", float(not result.ended), "", 0, how)
+    yield Measure("soak: outcomes that are not those of the deed", len(result.wrong_outcomes), "", 0, how)
+    yield Measure("soak: rows of cases that answered, changed by others", len(result.changed), "", 0, how)
+    yield Measure("soak: processes left", result.processes, "", 0, how)
+    yield Measure("soak: temporary files left", result.files, "", 0, how)
+    yield Measure("soak: time of the campaign", result.seconds, "s", None, how)
+    for text in result.wrong_outcomes:
         print(text)
 
 

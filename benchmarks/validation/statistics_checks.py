@@ -50,8 +50,8 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
     for name, draw, mean, spread in draws:
         for what, interval in intervals:
             truth = mean if what == "mean" else spread
-            found = (interval(draw(30), 0.95) for _ in range(trials))
-            covered = _fraction((low <= truth <= high for low, high in found), trials)
+            interval_pairs = (interval(draw(30), 0.95) for _ in range(trials))
+            covered = _fraction((low <= truth <= high for low, high in interval_pairs), trials)
             how = f"{trials} samples of 30; BCa, widened; bar: nominal less three deviations of the simulation"
             yield Measure(
                 f"95 % interval of the {what}, {name}", covered, "", _min_coverage(0.95, trials), how, "at least"
@@ -108,9 +108,9 @@ def run_shared(quick: bool) -> Iterator[Measure]:
     truths = {"mean": 0.0, "standard deviation": 1.0, "95 % quantile": float(stats.norm.ppf(0.95))}
     for correlation in (0.05, 0.3, 0.9):
         for terrains in (12, 60, 250):
-            found = [_check_coverage(*_errors(rng, correlation, terrains), truths) for _ in range(trials)]
+            coverage = [_check_coverage(*_errors(rng, correlation, terrains), truths) for _ in range(trials)]
             for what, nominal in (("mean", 0.95), ("standard deviation", 0.95), ("95 % quantile", CONFIDENCE)):
-                covered = float(np.min(np.mean([one[what] for one in found], axis=0)))
+                covered = float(np.min(np.mean([one[what] for one in coverage], axis=0)))
                 interval = "bounds" if what.endswith("quantile") else "interval"
                 claim = f"{100 * nominal:.0f} % {interval} of the {what}, "
                 claim += f"correlation {correlation}, {terrains} terrains"

@@ -59,13 +59,13 @@ def driven(number: int, camera: str) -> dict[str, Scalar]:
 def drift(quick: bool) -> Iterator[Measure]:
     """Drift at 2 m of selectable targets (unoccluded and lit) that are designated at 10 m."""
     wanted = 3 if quick else 50
-    found: list[dict[str, Scalar]] = []
+    all_rows: list[dict[str, Scalar]] = []
     for camera in CAMERAS:
         rows = (driven(number, camera) for number in count(1000))
         chosen = list(islice((row for row in rows if row["selectable"]), wanted))
         yield from _drifts(chosen, camera, judged=False)
-        found += chosen
-    yield from _drifts(found, "both cameras", judged=True)
+        all_rows += chosen
+    yield from _drifts(all_rows, "both cameras", judged=True)
 
 
 def _drifts(rows: list[dict[str, Scalar]], name: str, *, judged: bool) -> Iterator[Measure]:
@@ -99,14 +99,17 @@ def stereo(quick: bool) -> Iterator[Measure]:
     for camera in CAMERAS:
         rows = [_designation_errors(number, camera) for number in range(10 if quick else 60)]
         pairs = [row for row in rows if row is not None]
-        found = [row for row in pairs if np.isfinite(row[0])]
-        errors, expected = np.array(found).reshape(-1, 2).T
+        measured = [row for row in pairs if np.isfinite(row[0])]
+        errors, expected = np.array(measured).reshape(-1, 2).T
         ratio = float(np.sqrt(np.mean(errors**2) / np.mean(expected**2)))
         how = f"first pairs of {len(errors)} runs of vtt-accuracy at rocks of 1.5 m, disparity wrong by 1/3 px rms"
         yield Measure(f"stereo range error at 10 m over Eq. 1, less 1: {camera}", abs(ratio - 1.0), "", RANGE_BAR, how)
         how = f"of {len(pairs)} selectable targets; the row above leaves them out"
         yield _measure_losses(
-            f"first stereo pairs in which the target is not found: {camera}", len(pairs) - len(found), len(pairs), how
+            f"first stereo pairs in which the target is not found: {camera}",
+            len(pairs) - len(measured),
+            len(pairs),
+            how,
         )
 
 

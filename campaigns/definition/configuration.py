@@ -242,8 +242,8 @@ def validation_problems(error: ValidationError, model: type[BaseModel]) -> list[
         elif detail["type"] == "value_error":
             message = message.removeprefix("Value error, ")
         else:
-            shown = repr(given) if isinstance(given, str | int | float | bool) else type(given).__name__
-            message = f"{message[:1].lower()}{message[1:]}, got {shown}"
+            value_text = repr(given) if isinstance(given, str | int | float | bool) else type(given).__name__
+            message = f"{message[:1].lower()}{message[1:]}, got {value_text}"
         key: Key = ()
         node: Any = model
         for part in location:

@@ -207,9 +207,9 @@ def _validate(where: str, tables: Mapping[str, Any], overridden: Mapping[tuple[s
     """Campaign of the tables of a file, its parameters completed with their defaults."""
     problems: list[Problem] = []
 
-    def note(found: Iterable[tuple[Key, str]], prefix: Key = ()) -> None:
+    def note(new_problems: Iterable[tuple[Key, str]], prefix: Key = ()) -> None:
         """Note problems at keys, located in the file or in the option of the command line that sets the key."""
-        for key, message in found:
+        for key, message in new_problems:
             key, location = (*prefix, *key), where
             for path, option in overridden.items():
                 shared = min(len(key), len(path))

@@ -55,14 +55,14 @@ def shipped_requirements() -> Mapping[str, StatedRequirement]:
 @cache
 def _read_shipped() -> tuple[Mapping[str, StatedRequirement], tuple[str, ...]]:
     """Requirements of the systems' files, and the problems of unusable files."""
-    found: dict[str, StatedRequirement] = {}
+    by_id: dict[str, StatedRequirement] = {}
     problems: list[str] = []
     for path in dict.fromkeys(system.requirements for system in systems() if system.requirements):
         try:
-            found = {one.id: one for one in read_requirements(path)} | found
+            by_id = {one.id: one for one in read_requirements(path)} | by_id
         except ConfigurationError as error:
             problems.append(str(error))
-    return found, tuple(problems)
+    return by_id, tuple(problems)
 
 
 def select_applicable(stated: Sequence[StatedRequirement], campaign: str) -> list[dict[str, Any]]:

@@ -62,11 +62,11 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
                 raise CampaignError(f"--cluster {address}: no scheduler answers: {error}") from error
             try:
                 self._client.wait_for_workers(1, timeout=_REACH_S)
-                found = self._client.run(_identify_code)
+                identities = self._client.run(_identify_code)
             except TimeoutError as error:
                 raise CampaignError(f"--cluster {address}: the scheduler has no workers") from error
             own_code, own = _identify_code()
-            for worker, (code, versions) in found.items():
+            for worker, (code, versions) in identities.items():
                 if code != own_code:
                     raise CampaignError(f"worker {worker} has other code of Marsyard than this program")
                 differing = sorted(name for name in own if own[name] != versions.get(name))

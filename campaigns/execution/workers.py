@@ -408,8 +408,8 @@ def free_memory() -> float:
         text = Path("/proc/meminfo").read_text()
     except OSError:
         return math.inf
-    found = re.search(r"^MemAvailable:\s+(\d+) kB", text, re.MULTILINE)
-    return float(found[1]) * 1024.0 if found else math.inf
+    match = re.search(r"^MemAvailable:\s+(\d+) kB", text, re.MULTILINE)
+    return float(match[1]) * 1024.0 if match else math.inf
 
 
 @dataclass(frozen=True)

@@ -268,8 +268,8 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
         absent = name not in row and (stated.has_flag(name) or stated.has_number(name))
         return absent or name in (numbers if kind == NUMBERS else flags)
 
-    found = find_unknown_columns(configuration.requirements, flags, numbers, is_known)
-    problems = [Problem(configuration.name, key_text(key), message) for key, message in found]
+    unknown_columns = find_unknown_columns(configuration.requirements, flags, numbers, is_known)
+    problems = [Problem(configuration.name, key_text(key), message) for key, message in unknown_columns]
     if problems:
         stopped = Problem(str(directory), "", "the campaign was stopped; the rows so far are kept")
         raise ConfigurationError([*problems, stopped])

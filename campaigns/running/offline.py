@@ -111,14 +111,14 @@ def _check_answers(task: Task[Any, Any], configuration: CampaignConfiguration, a
     if task.offline is None:
         raise CampaignError(f"{configuration.name} cannot be answered in a table")
     try:
-        found = read_answers(answers, task.offline)
+        answer = read_answers(answers, task.offline)
     except ValueError as error:
         raise CampaignError(str(error)) from error
     total = configuration.total_cases
-    unknown = sorted(case for case in found if case >= total)
+    unknown = sorted(case for case in answer if case >= total)
     if unknown:
         raise CampaignError(f"{answers}: there is no case {_list_first(unknown)}; allowed: 0 to {total - 1}")
-    missing = [case for case in range(total) if case not in found]
+    missing = [case for case in range(total) if case not in answer]
     if missing:
         failures = list(task.offline.outcomes.__members__)[1:]
         advice = f"a case without one is stated with its outcome, such as {failures[0]}"

@@ -113,8 +113,8 @@ def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) 
     except (UnknownScenarioError, ValidationError) as error:
         problems = [("scenario", str(error))]
         if isinstance(error, ValidationError):
-            found = validation_problems(error, campaign.scenario.parameters_type)
-            problems = [(key_text(("parameters", *key)), message) for key, message in found]
+            errors = validation_problems(error, campaign.scenario.parameters_type)
+            problems = [(key_text(("parameters", *key)), message) for key, message in errors]
         hint = "modules of your own are searched for in the current folder"
         problems.append(("", f"nothing was run or changed; {hint}: start the command where the campaign was run"))
         raise ConfigurationError([Problem(str(directory), *problem) for problem in problems]) from error

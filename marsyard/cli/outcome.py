@@ -86,11 +86,11 @@ def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
 
     Raises StoreError where the folder holds no campaign with rows, or the report cannot be written.
     """
-    found = evaluate_run(directory, requirements)
-    if requirements is None and found.run.recorded("state") == "finished":
-        record.update(directory, {"exit_code": found.exit_code})
+    evaluation = evaluate_run(directory, requirements)
+    if requirements is None and evaluation.run.recorded("state") == "finished":
+        record.update(directory, {"exit_code": evaluation.exit_code})
     with report_write_errors("the report"):
-        return found, write_evaluation(found)
+        return evaluation, write_evaluation(evaluation)
 
 
 def _comparison_tables(
@@ -296,10 +296,10 @@ class _Handler(SimpleHTTPRequestHandler):
         """The file that a path of the address means; one that is not there where it leads out of the site."""
         root = Path(self.directory).resolve()
         try:
-            found = Path(super().translate_path(path)).resolve()
+            target = Path(super().translate_path(path)).resolve()
         except (OSError, ValueError):  # such as a name with a zero byte
             return str(root / "no such file")
-        return str(found if found.is_relative_to(root) else root / "no such file")
+        return str(target if target.is_relative_to(root) else root / "no such file")
 
     def list_directory(self, path: object) -> None:
         """Refuses."""

@@ -134,12 +134,12 @@ def take(shot: Shot, *, detector: bool = True, both: bool = True) -> list[Pictur
     pose = camera_pose(ground.surface, of_camera.design, *position, shot.azimuth_deg, shot.elevation_deg)
     towards_sun = direction(np.radians(shot.sun_azimuth_deg), np.radians(shot.sun_elevation_deg))
     sun = Sun(towards_sun, ground.site.environment.sun_radius_rad)
-    taken = cameras if both else cameras[:1]
-    rays = [PixelRays.of(camera) for camera in taken]
+    selected = cameras if both else cameras[:1]
+    rays = [PixelRays.of(camera) for camera in selected]
     # The cameras of a pair are so close together that one scene serves both.
     scene = site_scene(ground, Eye.of(rays[0], pose, ground.surface), sun)
     pictures = []
-    for number, camera in enumerate(taken):
+    for number, camera in enumerate(selected):
         frame = process_renderer(default_backend()).render(scene, rays[number], pose)
         exposed, counts = _expose(shot, ground, camera, number, frame) if detector else (None, None)
         suffix = "" if len(cameras) == 1 else ("-left", "-right")[number]
@@ -154,10 +154,10 @@ def _mark_filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows col
     if terrain.source is None:
         return None
     holes = embed(terrain.source, terrain.samples, terrain.spacing_m).filled_samples(terrain.samples)
-    seen = np.isfinite(frame.range_m)
-    points = np.where(seen[..., None], frame.points_world(), 0.0)
+    visible = np.isfinite(frame.range_m)
+    points = np.where(visible[..., None], frame.points_world(), 0.0)
     column, row = (np.rint(points[..., axis] / terrain.spacing_m).astype(int) % terrain.samples for axis in (0, 1))
-    return np.asarray(seen & holes[row, column])
+    return np.asarray(visible & holes[row, column])
 
 
 def _expose(

@@ -68,14 +68,14 @@ def compare(
     from marsyard.reports.stored import read_run
 
     runs = [read_run(directory) for directory in (first, second)]
-    paired, found = comparison.compare_campaigns(*runs)
+    paired, differences = comparison.compare_campaigns(*runs)
     names, same_terrains = [str(run.directory) for run in runs], comparison.have_same_terrains(*runs)
     if as_json:
         data = {"first": names[0], "second": names[1], "paired": paired, "same_terrains": same_terrains}
-        typer.echo(json.dumps({**data, "figures": comparison.campaign_diff_data(found)}, indent=2))
+        typer.echo(json.dumps({**data, "figures": comparison.campaign_diff_data(differences)}, indent=2))
         return
     out = console()
-    out.print(grid_table("Side by side", comparison.campaign_diff_grid(["first", "second"], found)))
+    out.print(grid_table("Side by side", comparison.campaign_diff_grid(["first", "second"], differences)))
     out.print(f"first: {names[0]}\nsecond: {names[1]}", markup=False, highlight=False, soft_wrap=True)
     grounds = "terrain by terrain" if same_terrains else "terrains of their own against one another"
     how = "the same draws, compared in pairs" if paired else f"draws of their own, compared {grounds}"
@@ -155,9 +155,9 @@ def nightly(
             history.finish(night, INTERRUPTED)
             plans.publish(history, night, out, ())
             raise typer.Exit(Exit.INTERRUPTED) from None
-        found = changes(compare_night(history, night))
-        history.finish(night, FINISHED, [(one.campaign, one.figure, one.p_value, one.worse) for one in found])
-        plans.publish(history, night, out, found)
+        flagged = changes(compare_night(history, night))
+        history.finish(night, FINISHED, [(one.campaign, one.figure, one.p_value, one.worse) for one in flagged])
+        plans.publish(history, night, out, flagged)
         statuses = {one.exit_code for one in history.campaigns(night)}
-    statuses |= {int(Exit.FAILED) for one in found if one.worse}
+    statuses |= {int(Exit.FAILED) for one in flagged if one.worse}
     raise typer.Exit(next((one for one in (Exit.FAILED, Exit.INSUFFICIENT) if one in statuses), Exit.MET))

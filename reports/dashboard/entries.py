@@ -84,10 +84,10 @@ class Entry:
 
 def find_campaigns(directories: Sequence[Path]) -> list[Path]:
     """Campaigns in or below folders, each once, ordered by path."""
-    found: dict[Path, Path] = {}
+    reports: dict[Path, Path] = {}
     for one in (below for directory in directories for below in _below(directory, _DEPTH)):
-        found.setdefault(one.resolve(), one)
-    return sorted(found.values())
+        reports.setdefault(one.resolve(), one)
+    return sorted(reports.values())
 
 
 def _below(directory: Path, depth: int) -> Iterator[Path]:
@@ -165,9 +165,9 @@ def make_slug(path: Path, name: str) -> str:
 
 def _named(twin: Mapping[str, Any], key: str, parameters: Mapping[str, Any], stated: str) -> tuple[str, ...]:
     """Names in the rows, or that of the parameters where the rows have none."""
-    found = tuple(str(one) for one in twin.get(key) or () if str(one))
+    names = tuple(str(one) for one in twin.get(key) or () if str(one))
     one = _first(parameters, stated)
-    return found or ((one,) if one else ())
+    return names or ((one,) if one else ())
 
 
 def _first(parameters: Mapping[str, Any], key: str) -> str:
@@ -253,29 +253,29 @@ def requirement_rows(entries: Sequence[Entry], stated: Mapping[str, StatedRequir
 
 def sparkline(shown: Sequence[ShownRequirement]) -> Sparkline | None:
     """Observed rates over time against the required rate; None for fewer than two campaigns."""
-    known = [one for one in shown if math.isfinite(one.estimate) and math.isfinite(one.probability)][-_TREND:]
-    if len(known) < 2:
+    finite = [one for one in shown if math.isfinite(one.estimate) and math.isfinite(one.probability)][-_TREND:]
+    if len(finite) < 2:
         return None
-    rates = [one.estimate for one in known]
-    low = min(*rates, *(one.probability for one in known))
+    rates = [one.estimate for one in finite]
+    low = min(*rates, *(one.probability for one in finite))
     low -= 0.15 * (1.0 - low) + 1e-9
-    step = (_WIDTH - 8.0) / (len(known) - 1)
+    step = (_WIDTH - 8.0) / (len(finite) - 1)
 
     def height(rate: float) -> float:
         return round(3.0 + (_HEIGHT - 6.0) * (1.0 - rate) / (1.0 - low), 2)
 
     places = [(round(4.0 + step * k, 2), height(rate)) for k, rate in enumerate(rates)]
-    text = f"{len(known)} campaigns, rates {percent(rates[0])} to {percent(rates[-1])}"
-    return Sparkline(" ".join(f"{x},{y}" for x, y in places), places[-1], height(known[-1].probability), text)
+    text = f"{len(finite)} campaigns, rates {percent(rates[0])} to {percent(rates[-1])}"
+    return Sparkline(" ".join(f"{x},{y}" for x, y in places), places[-1], height(finite[-1].probability), text)
 
 
 def coverage(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
     """Number of requirements of each latest verdict, those without a campaign last."""
     words = [row.latest.shown.status for row in rows if row.latest is not None]
     known = [word for word in dict.fromkeys(("FAIL", "INSUFFICIENT", "MET BY RATE", "PASS", *words)) if word in words]
-    found = [(word, words.count(word)) for word in known]
+    counts = [(word, words.count(word)) for word in known]
     missing = sum(row.latest is None for row in rows)
-    return [*found, ("NO CAMPAIGN", missing)] if missing else found
+    return [*counts, ("NO CAMPAIGN", missing)] if missing else counts
 
 
 def evidence_text(shown: ShownRequirement) -> str:

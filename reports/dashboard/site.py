@@ -146,7 +146,7 @@ def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
 
 def _matrix(rows: Sequence[RequirementRow]) -> str:
     """Traceability matrix as CSV: the latest verdict of each campaign, also requirements without a campaign."""
-    found: list[dict[str, Any]] = []
+    exported: list[dict[str, Any]] = []
     shown_as = {
         "verdict": "status",
         "decided_by": "decide_by",
@@ -158,11 +158,11 @@ def _matrix(rows: Sequence[RequirementRow]) -> str:
     for row in rows:
         about = {"requirement": row.requirement, "statement": row.statement, "kind": row.kind, "source": row.source}
         if not row.cells:
-            found.append({**about, "verdict": "NO CAMPAIGN"})
+            exported.append({**about, "verdict": "NO CAMPAIGN"})
         for cell in row.cells:
             shown = {column: getattr(cell.shown, name) for column, name in shown_as.items()}
-            found.append({**about, "campaign": cell.entry.name, **algorithm_cells(cell.entry.tested), **shown})
-    return verification_csv(found)
+            exported.append({**about, "campaign": cell.entry.name, **algorithm_cells(cell.entry.tested), **shown})
+    return verification_csv(exported)
 
 
 def _render(template: str, **context: Any) -> str:

@@ -72,7 +72,7 @@ def tracks(products: Mapping[str, Any]) -> list[Track]:
         return []
     if table.size == 0 or table.shape[1] != len(names):
         return []
-    found = []
+    panels = []
     for row in (dict(zip(names, (float(value) for value in values), strict=True)) for values in table):
         if row.get("pair") not in _PAIRS or row.get("template") not in _TEMPLATES:
             continue
@@ -80,8 +80,8 @@ def tracks(products: Mapping[str, Any]) -> list[Track]:
         patch, window = (plane(products.get(f"{part}_{pair}_{template}")) for part in ("template", "window"))
         match = numeric_product(products.get(f"match_{pair}_{template}"))
         position = (float(match[0]), float(match[1])) if match is not None and match.size == 2 else None
-        found.append(Track(pair, template, row.get("valid", 0.0) == 1.0, row, patch, window, position))
-    return found
+        panels.append(Track(pair, template, row.get("valid", 0.0) == 1.0, row, patch, window, position))
+    return panels
 
 
 @in_page_style

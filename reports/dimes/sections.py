@@ -63,9 +63,9 @@ def field_test_section(subject: Subject) -> Section | None:
     frame, bound = subject.frame, subject.bound
     if not {"run", "category"}.issubset(frame.columns) or not rates.is_flag(frame, "answered"):
         return None
-    found = field_cells(subject)
+    cells = field_cells(subject)
     grid = build_grid(
-        found,
+        cells,
         {
             "Category and run": lambda one: f"{one['category']}: {one['run']}",
             "Triples": lambda one: f"{one['valid'].n:,}",
@@ -82,20 +82,20 @@ def field_test_section(subject: Subject) -> Section | None:
             "Largest error": lambda one: number(one["largest"]),
         },
     )
-    blocks = [Block(grid=grid, note=_field_note(found))]
+    blocks = [Block(grid=grid, note=_field_note(cells))]
     plates = scatter_plates(subject)
     if plates:
         note = ""
         if bound is not None and subject.metric is not None:
             note = note_text("dimes.errors", bound=f"{bound:g}", unit=split_unit(subject.metric)[1])
         blocks.append(Block(heading="Errors by category", plates=plates, note=note))
-    data = {"cells": [one | {"valid": asdict(one["valid"])} for one in found]}
+    data = {"cells": [one | {"valid": asdict(one["valid"])} for one in cells]}
     return Section("field-test", "Field test", "Runs and categories, next to the paper's Fig. 11", blocks, data)
 
 
 def field_cells(subject: Subject) -> list[dict[str, Any]]:
     """Results of every category and run, first in the paper's order, then in the rows' order."""
-    frame, found = subject.frame, []
+    frame, blocks = subject.frame, []
     named = frame[["category", "run"]].dropna().drop_duplicates()
     pairs = [(str(category), str(run)) for category, run in named.itertuples(index=False)]
     for category, run in [*(pair for pair in FIG_11 if pair in pairs), *(pair for pair in pairs if pair not in FIG_11)]:
@@ -104,7 +104,7 @@ def field_cells(subject: Subject) -> list[dict[str, Any]]:
         errors = np.abs(numbers(chosen[answered], subject.metric)) if subject.metric else np.array([])
         errors = errors[np.isfinite(errors)]
         share, paper = rates.fraction_of(answered, chosen), FIG_11.get((category, run), {}).get("percent")
-        found.append(
+        blocks.append(
             {
                 "category": category,
                 "run": run,
@@ -115,7 +115,7 @@ def field_cells(subject: Subject) -> list[dict[str, Any]]:
                 "difference_points": math.nan if paper is None else 100.0 * share.share - paper,
             }
         )
-    return found
+    return blocks
 
 
 def _difference_text(points: float) -> str:
@@ -345,11 +345,11 @@ def rank_effects(subject: Subject, metric: str) -> list[Driver]:
     ranks = correlate_weighted(stats.rankdata(x, axis=0), stats.rankdata(y), weights)
     # the sample's own value, then the interval over the resamples
     values = [ranks, slopes / y.std(), slopes / x.std(axis=0) * (high - low)]
-    found = []
+    blocks = []
     for k, name in enumerate(columns):
         intervals = [(float(one[0, k]), *rates.percentile_interval(one[1:, k])) for one in values]
-        found.append(Driver(name, float(low[k]), float(high[k]), *intervals))
-    return found
+        blocks.append(Driver(name, float(low[k]), float(high[k]), *intervals))
+    return blocks
 
 
 def regress_weighted(

@@ -170,9 +170,9 @@ def draw_site(products: Mapping[str, Any]) -> Figure:
         show_picture(axes, shown[0])
     limits = {"xlim": over.get_xlim(), "ylim": over.get_ylim()}
     if np.isfinite(maps.pixels).all():
-        known = np.where(np.isfinite(maps.elevation_m), maps.safety, np.nan)
+        finite = np.where(np.isfinite(maps.elevation_m), maps.safety, np.nan)
         over.pcolormesh(
-            maps.pixels[..., 0], maps.pixels[..., 1], known, shading="nearest", alpha=0.38,
+            maps.pixels[..., 0], maps.pixels[..., 1], finite, shading="nearest", alpha=0.38,
             vmin=0, vmax=2, cmap=SAFETY_COLOURS, rasterized=True, linewidth=0.0,
         )  # fmt: skip
     over.set(**limits)

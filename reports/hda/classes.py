@@ -60,14 +60,14 @@ RATES: Mapping[str, tuple[str, str]] = {
 def hazard_classes(frame: Rows) -> list[HazardClass]:
     """Missed hazards by size; empty if rows do not count them."""
     edges = (0.0, *CLASSES, math.inf)
-    found = []
+    rows = []
     for kind in ("roughness", "slope"):
         for name, low, high in zip(CLASS_NAMES, edges[:-1], edges[1:], strict=True):
             column = f"footprints_{kind}_{name}"
             if column in frame:
                 called, unflagged = (pooled_rate(frame, f"{column}_{part}", column) for part in ("safe", "unflagged"))
-                found.append(HazardClass(kind, low, high, called, unflagged))
-    return found
+                rows.append(HazardClass(kind, low, high, called, unflagged))
+    return rows
 
 
 def draw_classes(frame: Rows, subject: Subject, key: str) -> Drawn:
@@ -164,11 +164,11 @@ class Curve:
 def limits_section(subject: Subject) -> Section | None:
     """Features tracked by the change between the pictures; None unless flights change one condition at a time."""
     frame = landing_rows(subject)
-    found = [] if frame is None else curves(frame)
-    if not found:
+    class_curves = [] if frame is None else curves(frame)
+    if not class_curves:
         return None
     knees = build_grid(
-        found,
+        class_curves,
         {
             "Change": lambda one: one.change["name"],
             "Paper's limit": lambda one: f"{one.change['paper']:g} {one.change['unit']}",
@@ -178,7 +178,7 @@ def limits_section(subject: Subject) -> Section | None:
         },
     )
     by_size = build_grid(
-        [(one.change, at) for one in found for at in one.points],
+        [(one.change, at) for one in class_curves for at in one.points],
         {
             "Change": lambda pair: pair[0]["name"],
             "Size": lambda pair: f"{pair[1].size:g} {pair[0]['unit']}",
@@ -189,11 +189,13 @@ def limits_section(subject: Subject) -> Section | None:
     )
     caption = "Correctly tracked features, of those in both pictures; red: the paper's limits; grey: 90 %."
     blocks = [
-        Block(text=note_text("hda.limits_text"), plates=[plate(limits_figure(found), "limits", caption, wide=True)]),
+        Block(
+            text=note_text("hda.limits_text"), plates=[plate(limits_figure(class_curves), "limits", caption, wide=True)]
+        ),
         Block(heading="Knees", grid=knees, note=note_text("hda.limits")),
         Block(heading="By size", grid=by_size),
     ]
-    data = {"curves": [asdict(one) for one in found]}
+    data = {"curves": [asdict(one) for one in class_curves]}
     return Section("limits", "Limits", "Tracking by change between the pictures", blocks, data)
 
 
@@ -208,7 +210,7 @@ def curves(frame: pd.DataFrame) -> list[Curve]:
     if not flown.any() or np.any(present[:, flown].sum(axis=0) > 1):
         return []
     still = flown & ~present.any(axis=0)
-    found = []
+    rows = []
     for one, size, changed in zip(changes, sizes, present, strict=True):
         chosen = flown & (changed | still)
         rounded = np.where(changed, np.round(size, 1), 0.0)
@@ -219,8 +221,8 @@ def curves(frame: pd.DataFrame) -> list[Curve]:
                 # a flight without tracks has tracked none of the visible features
                 tracked = pooled_rate(flights, "tracks_correct", "features_in_view")
                 points.append(AtSize(float(value), tracked, len(flights), int(flag(flights, "tracked_well").sum())))
-            found.append(Curve(one, points, knee(points, 1.0), knee(points, -1.0)))
-    return found
+            rows.append(Curve(one, points, knee(points, 1.0), knee(points, -1.0)))
+    return rows
 
 
 def knee(points: Sequence[AtSize], sign: float) -> float:

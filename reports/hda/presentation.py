@@ -30,10 +30,10 @@ _LEFT_OUT = "fig1-tracks"
 def view(products: Mapping[str, Any], key: str) -> CaseView:
     """A landing case; its pictures alone without results of the paper's stages."""
     names = [name for name in figures_reached(products) if name != _LEFT_OUT]
-    seen = stages.pictures(products)
-    if not names and seen is not None:
+    picture_pair = stages.pictures(products)
+    if not names and picture_pair is not None:
         caption = "The two pictures that the algorithm was given."
-        shown = plate(draw_pictures(seen), f"{key}pictures", caption, wide=True)
+        shown = plate(draw_pictures(picture_pair), f"{key}pictures", caption, wide=True)
         return CaseView([], [shown], *_stages(products), note_text("hda.plain_legend"))
     plates = [plate(FIGURES[name](products), f"{key}{name[:4]}", _CAPTIONS[name], wide=True) for name in names]
     facts = [("Figures", ", ".join(name.split("-")[0] for name in names) or "none")]

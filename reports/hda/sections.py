@@ -87,8 +87,8 @@ THRESHOLD = kinds.SectionDeclaration(
 
 
 def _fault_words(fault: str, size: float) -> tuple[str, str]:
-    known = PAPER["fault_names"].get(fault, {"name": fault.replace("_", " "), "unit": "number"})
-    name, unit = known["name"], known.get("unit")
+    description = PAPER["fault_names"].get(fault, {"name": fault.replace("_", " "), "unit": "number"})
+    name, unit = description["name"], description.get("unit")
     if unit is None or math.isnan(size):
         return name, ""
     if unit == "share":
@@ -342,12 +342,12 @@ def run_times_section(subject: Subject) -> Section | None:
     frame, stages = landing_rows(subject), PAPER["stages"]
     if frame is None:
         return None
-    taken = np.column_stack([numbers(frame, stage["column"]) for stage in stages])
-    complete = np.isfinite(taken).all(axis=1)
-    taken, chosen, cases = taken[complete], frame[complete], int(complete.sum())
-    if not cases or not taken.sum() > 0.0:
+    durations = np.column_stack([numbers(frame, stage["column"]) for stage in stages])
+    complete = np.isfinite(durations).all(axis=1)
+    durations, chosen, cases = durations[complete], frame[complete], int(complete.sum())
+    if not cases or not durations.sum() > 0.0:
         return None
-    median, late = np.median(taken, axis=0), np.quantile(taken, 0.95, axis=0)
+    median, late = np.median(durations, axis=0), np.quantile(durations, 0.95, axis=0)
     paper, ours = sum(stage["seconds"] for stage in stages), float(median.sum())
     factor, rows, data = paper / ours, [], []
     for stage, middle, slow in zip(stages, median.tolist(), late.tolist(), strict=True):

@@ -101,8 +101,8 @@ def agreement_section(subject: Subject) -> Section | None:
 def residual_figure(frame: pd.DataFrame) -> Figure:
     """Median and 90 % residual of each case, ordered by the median."""
     medians, percentile_90 = numbers(frame, MEDIAN), numbers(frame, PERCENTILE_90)
-    known = np.flatnonzero(np.isfinite(medians))
-    order = known[np.argsort(medians[known], kind="stable")]
+    finite = np.flatnonzero(np.isfinite(medians))
+    order = finite[np.argsort(medians[finite], kind="stable")]
     places = np.arange(1, order.size + 1)
     figure, axes = new_axes(6.2, 3.2)
     for values, name, place in ((percentile_90, "90 %", 1), (medians, "median", 0)):

@@ -289,12 +289,12 @@ def summarize(
     median = float(np.median(finite)) if n else math.nan
     mean_lower, mean_upper = mean_interval(finite, confidence, shared)
     sd_lower, sd_upper = spread_interval(finite, confidence, shared)
-    found = []
+    intervals = []
     for probability in quantiles:
         # a quantile beyond all but the last value is an extrapolation, not an estimate
         is_estimate = n * min(probability, 1.0 - probability) >= 1.0 - 1e-9
         estimate = float(np.quantile(finite, probability)) if is_estimate else math.nan
-        found.append(Quantile(probability, estimate, *quantile_bounds(finite, probability, confidence, shared)))
+        intervals.append(Quantile(probability, estimate, *quantile_bounds(finite, probability, confidence, shared)))
     return ErrorSummary(
         n=n,
         missing=missing,
@@ -308,7 +308,7 @@ def summarize(
         median=median,
         robust_sd=1.4826 * float(np.median(np.abs(finite - median))) if n else math.nan,
         largest=float(np.abs(finite).max()) if n else math.nan,
-        quantiles=tuple(found),
+        quantiles=tuple(intervals),
         confidence=confidence,
     )
 
@@ -348,17 +348,17 @@ def error_ellipse(errors: Float[np.ndarray, "n 2"], probability: float) -> Error
     "Confidence, prediction and tolerance regions for the multivariate normal distribution", J. Amer. Statist. Assoc.
     61, 1966): the fraction of future errors inside is the probability on average, however small n is.
     """
-    known = errors[np.isfinite(errors).all(axis=1)]
-    n = len(known)
+    finite = errors[np.isfinite(errors).all(axis=1)]
+    n = len(finite)
     if n < _MIN_FOR_ELLIPSE:
         return None
-    centre = known.mean(axis=0)
-    values, axes = np.linalg.eigh(np.cov(known.T))
+    centre = finite.mean(axis=0)
+    values, axes = np.linalg.eigh(np.cov(finite.T))
     if values[1] <= 0.0:
         return None
     factor = 2.0 * (n - 1.0) * (n + 1.0) / (n * (n - 2.0)) * float(stats.f.ppf(probability, 2, n - 2))
     variances = np.maximum(values, 0.0)
-    principal = (known - centre) @ axes
+    principal = (finite - centre) @ axes
     with np.errstate(divide="ignore", invalid="ignore"):
         distances = np.where(variances > 0.0, principal**2 / variances, 0.0).sum(axis=1)
     angle = math.degrees(math.atan2(axes[1, 1], axes[0, 1]))

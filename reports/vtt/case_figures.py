@@ -112,7 +112,7 @@ def template_px(products: Mapping[str, Any]) -> float | None:
 
 def list_stops(products: Mapping[str, Any]) -> list[StopPictures]:
     """The stops in order, up to the first without a left subframe."""
-    found: list[StopPictures] = []
+    pictures: list[StopPictures] = []
     states, table = products.get("states"), products.get("figures")
     columns = (
         {str(name): numeric_product(values) for name, values in table.items()} if isinstance(table, Mapping) else {}
@@ -121,10 +121,10 @@ def list_stops(products: Mapping[str, Any]) -> list[StopPictures]:
     for number in _STOPS:
         left = plane(products.get(f"stop_{number}_left"))
         if left is None:
-            return found
+            return pictures
         state = states[number - 1] if isinstance(states, list) and number <= len(states) else ""
         shapes = {"corners": (2, 2), "window": (4,), "found": (2, 2), "point": (2,)}
-        found.append(
+        pictures.append(
             StopPictures(
                 number=number,
                 state=str(state).replace("_", " ").lower(),
@@ -134,7 +134,7 @@ def list_stops(products: Mapping[str, Any]) -> list[StopPictures]:
                 **{part: _shaped_or_nan(products.get(f"stop_{number}_{part}"), *of) for part, of in shapes.items()},
             )
         )
-    return found
+    return pictures
 
 
 def rover_path(products: Mapping[str, Any]) -> RoverPath | None:
@@ -285,20 +285,20 @@ def _draw_above(axes: Axes, way: RoverPath) -> None:
 def _draw_close(axes: Axes, way: RoverPath) -> None:
     """Estimates of the target relative to the designated point, joined in the order of the stops."""
     offsets = 100.0 * (way.estimates - way.target)
-    known = np.flatnonzero(np.isfinite(offsets).all(axis=1))
+    finite = np.flatnonzero(np.isfinite(offsets).all(axis=1))
     for east, north, diameter in way.rocks[:1]:
         middle = 100.0 * (np.array([east, north]) - way.target)
         axes.add_patch(Circle((middle[0], middle[1]), 50.0 * diameter, facecolor=GRID, edgecolor=MUTED, linewidth=0.8))
-    moved = float(np.linalg.norm(offsets[known[-1]] - offsets[known[0]])) if known.size else 0.0
-    axes.plot(*offsets[known].T, "-", color=SERIES[1], linewidth=1.0)
+    moved = float(np.linalg.norm(offsets[finite[-1]] - offsets[finite[0]])) if finite.size else 0.0
+    axes.plot(*offsets[finite].T, "-", color=SERIES[1], linewidth=1.0)
     text = f"target as estimated ({moved:.0f} cm from first to last)"
-    axes.plot(*offsets[known].T, "o", color=SERIES[1], markersize=5, label=text)
+    axes.plot(*offsets[finite].T, "o", color=SERIES[1], markersize=5, label=text)
     axes.plot(0.0, 0.0, "*", color=INK, markersize=12)
     axes.set(xlabel="east of the target (cm)", ylabel="north of the target (cm)")
     axes.set_title("The target as estimated")
-    width = _set_limits(axes, np.vstack([offsets[known], np.zeros((1, 2))]), 2.0)
-    for place in _choose_numbered(offsets[known], width):
-        _write_number(axes, offsets[known[place]], int(known[place]) + 1)
+    width = _set_limits(axes, np.vstack([offsets[finite], np.zeros((1, 2))]), 2.0)
+    for place in _choose_numbered(offsets[finite], width):
+        _write_number(axes, offsets[finite[place]], int(finite[place]) + 1)
 
 
 def _choose_numbered(points: Float[np.ndarray, "n 2"], width: float) -> list[int]:

@@ -57,12 +57,12 @@ def _by_camera(runs: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
 
 def camera_runs(runs: Rows) -> list[dict[str, Any]]:
     """Each camera's rates (`_RATES`, each a `Share`), and position errors and drift of its completed runs."""
-    found = []
+    rows = []
     for camera, ours in _by_camera(runs):
         reached = np.isfinite(numbers(ours, "position_error_m"))
         completed = ours[reached]
         error, drift = rates.known(completed, "position_error_m"), rates.known(completed, "drift_px")
-        found.append(
+        rows.append(
             {
                 "camera": camera,
                 "completed": rates.fraction_of(reached, ours),
@@ -78,7 +78,7 @@ def camera_runs(runs: Rows) -> list[dict[str, Any]]:
                 "drift_quantile_px": rates.quantile(drift, QUANTILE),
             }
         )
-    return found
+    return rows
 
 
 def _millimetres(name: str) -> Any:
@@ -86,15 +86,15 @@ def _millimetres(name: str) -> Any:
 
 
 def _draw_cameras(runs: Rows, subject: Subject, key: str) -> Drawn:
-    found = camera_runs(runs)
+    groups = camera_runs(runs)
     rows = [
         [one["camera"], name, rates.fraction_text(one[rate]), rates.interval_text(one[rate])]
-        for one in found
+        for one in groups
         for name, rate in _RATES.items()
     ]
     of_runs = Grid(["Camera", "", "Runs", f"{format_fraction(CONFIDENCE)} interval"], rows)
     of_errors = build_grid(
-        found,
+        groups,
         {
             "Camera": lambda one: one["camera"],
             "Median (mm)": _millimetres("median_m"),
@@ -115,7 +115,7 @@ def _draw_cameras(runs: Rows, subject: Subject, key: str) -> Drawn:
     if lost.rows:
         note = note_text("vtt.losses")
         blocks.append(Block(heading="Runs that lost the target", grid=lost, note=note))
-    data = [one | {rate: vars(one[rate]) for rate in _RATES.values()} for one in found]
+    data = [one | {rate: vars(one[rate]) for rate in _RATES.values()} for one in groups]
     return blocks, {"cameras": data}
 
 

@@ -36,8 +36,8 @@ _NEAR = 0.1
 
 def table_1_section(subject: Subject) -> Section | None:
     """Table I: computed, printed and measured; None without completed runs from the paper's 10 m to its 2 m."""
-    found = measured_accuracy(subject.frame)
-    if not found:
+    accuracy = measured_accuracy(subject.frame)
+    if not accuracy:
         return None
     computed = {row.name: row for row in table_1()}
     both = [(kind, row[name]) for name in PRINTED for kind, row in (("printed", PRINTED), ("computed", computed))]
@@ -54,12 +54,12 @@ def table_1_section(subject: Subject) -> Section | None:
     measured_note = note_text("vtt.table_1_measured", start=f"{START_M:g}", goal=f"{GOAL_M:g}")
     blocks = [
         Block(heading="Computed", grid=grid, note=note_text("vtt.table_1")),
-        Block(heading="Measured", grid=_measured_grid(found), note=measured_note),
+        Block(heading="Measured", grid=_measured_grid(accuracy), note=measured_note),
     ]
     data = {
         "computed": {name: asdict(row) for name, row in computed.items()},
         "printed": {name: asdict(row) for name, row in PRINTED.items()},
-        "measured": found,
+        "measured": accuracy,
     }
     return Section("table-1", "Table I", "Table I: accuracy of a target's position", blocks, data)
 
@@ -75,11 +75,11 @@ def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
     ends = {"range_start_m": START_M, "range_end_m": GOAL_M}
     near = [np.abs(numbers(frame, name) / distance - 1.0) < _NEAR for name, distance in ends.items()]
     completed = selectable(frame[near[0] & near[1] & np.isfinite(numbers(frame, "position_error_m"))])
-    found = []
+    rows = []
     for camera in sorted(completed["camera"].unique()):
         runs = completed[completed["camera"].eq(camera)]
         designation, pose = numbers(runs, "designation_error_m"), numbers(runs, "pose_error_m")
-        found.append(
+        rows.append(
             {
                 "camera": str(camera),
                 "runs": len(runs),
@@ -90,7 +90,7 @@ def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
                 "drift_px": rates.rms(numbers(runs, "drift_px")),
             }
         )
-    return found
+    return rows
 
 
 def _measured_grid(found: Sequence[Mapping[str, Any]]) -> Grid:
@@ -112,8 +112,8 @@ def _measured_grid(found: Sequence[Mapping[str, Any]]) -> Grid:
 def legs(subject: Subject) -> list[Mapping[str, Any]]:
     """The legs of the campaign's drive or runs."""
     drive = subject.run.parameter("drive")
-    found = table(drive).get("legs") if drive is not None else subject.run.parameter("legs")
-    return [table(leg) for leg in found] if isinstance(found, list | tuple) else []
+    leg_table = table(drive).get("legs") if drive is not None else subject.run.parameter("legs")
+    return [table(leg) for leg in leg_table] if isinstance(leg_table, list | tuple) else []
 
 
 def table_4(frame: Rows, driven: Sequence[Mapping[str, Any]]) -> Grid:
@@ -197,8 +197,8 @@ _CLASSES_DEG = (0.0, 45.0, 60.0, 65.0, 70.0, 90.0)
 
 def steps_section(subject: Subject) -> Section | None:
     """Targets tracked by step size: Fig. 8, sideways motion (5.2), turns (5.3); None unless rows share pictures."""
-    motion, found = _motion(subject), step_rates(subject)
-    if motion is None or not found:
+    motion, steps = _motion(subject), step_rates(subject)
+    if motion is None or not steps:
         return None
     lines = [
         RateLine(
@@ -207,14 +207,14 @@ def steps_section(subject: Subject) -> Section | None:
             [one["good"] for one in ours],
             {one["step"]: one["paper_percent"] / 100.0 for one in ours if one["paper_percent"] is not None},
         )
-        for name in dict.fromkeys(one["line"] for one in found)
-        if (ours := [one for one in found if one["line"] == name and one["good"].n])
+        for name in dict.fromkeys(one["line"] for one in steps)
+        if (ours := [one for one in steps if one["line"] == name and one["good"].n])
     ]
     unit = "% of the distance" if motion["per_cent"] else "deg"
     xlabel = "step (% of the target's distance)" if motion["per_cent"] else "step (deg)"
     caption = "Selectable targets tracked to the end, with intervals; open: the paper's text."
     grid = build_grid(
-        found,
+        steps,
         {
             "Tracker": lambda one: one["line"] or "vtt",
             f"Step ({unit})": lambda one: number(one["step"]).rstrip("0").rstrip("."),
@@ -231,7 +231,7 @@ def steps_section(subject: Subject) -> Section | None:
     if oblique is not None:
         blocks.append(Block(grid=oblique, note=note_text("vtt.obliquity")))
     keys = ("good", "all_targets", "false_tracks")
-    data = [one | {name: asdict(one[name]) for name in keys} for one in found]
+    data = [one | {name: asdict(one[name]) for name in keys} for one in steps]
     return Section("steps", "Steps", motion["title"], blocks, {"cells": data})
 
 
@@ -247,13 +247,13 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
     frame, motion = subject.frame, _motion(subject)
     if motion is None or not is_tracking(frame) or "step" not in frame or "skip" not in frame:
         return []
-    found = []
+    limits = []
     for line, rows in _lines(frame[frame["step"].notna()]):
         paper = motion["paper"].get(line) or motion["paper"].get("", {})
         for _, chosen in rows.groupby("skip"):
             step = float(chosen["step"].iloc[0]) * (100.0 if motion["per_cent"] else 1.0)
             good = selectable(chosen)
-            found.append(
+            limits.append(
                 {
                     "line": line,
                     "step": step,
@@ -263,7 +263,7 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
                     "paper_percent": next((p for size, p in paper.items() if abs(step - float(size)) < 0.5), None),
                 }
             )
-    return found
+    return limits
 
 
 def _lines(frame: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -282,11 +282,11 @@ def _obliquity_grid(frame: Rows) -> Grid | None:
     """Targets tracked by maximum obliquity and step size; None if rows lack obliquities."""
     if "obliquity_max_deg" not in frame:
         return None
-    seen = frame[rates.all_flags(frame, "selectable", "in_view") & frame["obliquity_max_deg"].notna().to_numpy()]
-    steps = sorted(seen["step"].unique())
+    visible = frame[rates.all_flags(frame, "selectable", "in_view") & frame["obliquity_max_deg"].notna().to_numpy()]
+    steps = sorted(visible["step"].unique())
     rows = []
     for low, high in pairwise(_CLASSES_DEG):
-        chosen = seen[seen["obliquity_max_deg"].between(low, high, inclusive="left")]
+        chosen = visible[visible["obliquity_max_deg"].between(low, high, inclusive="left")]
         if len(chosen):
             shares = [rates.flag_fraction(chosen[chosen["step"].eq(step)], "tracked") for step in steps]
             rows.append([f"{low:g} to {high:g}", *(f"{one.hits:,} of {one.n:,}" for one in shares)])

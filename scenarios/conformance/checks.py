@@ -132,8 +132,8 @@ class Suite(ABC):
         if not self.program:
             copies = "work on copies: counts.astype(...), array.copy()"
             yield Check("inputs", "leaves its inputs as they are", copies, self._leaves_inputs)
-        asked = "gives the same answers to the same case, after any other cases"
-        yield Check("deterministic", asked, self.deterministic_advice, self._repeats_answers)
+        rule = "gives the same answers to the same case, after any other cases"
+        yield Check("deterministic", rule, self.deterministic_advice, self._repeats_answers)
         faster = "be faster, or allow more with --time-limit"
         yield Check("time", f"{self.answers} within {self.limit_s:g} s", faster, self._answers_in_time)
         if self.closed_to_truth and not self.program:

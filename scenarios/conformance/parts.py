@@ -65,15 +65,15 @@ class PartSuite(Suite):
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
         form = "see docs/custom-parts.md for inputs and outputs"
-        asked = "returns the output of its kind: right shapes, finite and in order"
-        yield Check("answer", asked, form, lambda: ", ".join(_describe(self._answer(case)) for case in self.cases()))
-        asked = "reports the same columns in every case: identifiers, with numbers or truth values"
-        yield Check("columns", asked, "report every column in every case; NaN for no number", self._columns)
+        rule = "returns the output of its kind: right shapes, finite and in order"
+        yield Check("answer", rule, form, lambda: ", ".join(_describe(self._answer(case)) for case in self.cases()))
+        rule = "reports the same columns in every case: identifiers, with numbers or truth values"
+        yield Check("columns", rule, "report every column in every case; NaN for no number", self._columns)
         yield from self.common_checks()
         if self.kind is not SCORE:
-            asked = "depends on its random stream if it states so, and only then"
+            rule = "depends on its random stream if it states so, and only then"
             advice = "set random to true if it draws, and draw only from the generator in the arguments"
-            yield Check("random", asked, advice, self._depends_on_stream)
+            yield Check("random", rule, advice, self._depends_on_stream)
 
     def cases(self) -> Sequence[Any]:
         """See `Suite`."""

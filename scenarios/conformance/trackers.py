@@ -79,14 +79,14 @@ class TrackerSuite(Suite):
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
         form = "see algorithms/interface.py for aim, update and state"
-        asked = "gives a well-formed aim and answer at every stop of a drive"
-        yield Check("answer", asked, form, lambda: ", ".join(one.state.name for one in drive(self.make())))
+        rule = "gives a well-formed aim and answer at every stop of a drive"
+        yield Check("answer", rule, form, lambda: ", ".join(one.state.name for one in drive(self.make())))
         yield Check("states", "has no target before one is designated and after it is cleared", form, self._has_states)
         advice = "return a TargetUpdate with the state LOST and the reasons in losses"
         for name, blank in BLANKS.items():
             yield Check(name, f"loses its target if pictures are {name}", advice, partial(self._loses, name, blank))
-        asked = "answers if the pose jumps and pictures show other ground"
-        yield Check("pose", asked, advice, self._answers_after_jump)
+        rule = "answers if the pose jumps and pictures show other ground"
+        yield Check("pose", rule, advice, self._answers_after_jump)
         yield from self.common_checks()
 
     def cases(self) -> Sequence[PixelTarget]:

@@ -88,12 +88,12 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         response = Streams(streams.seed, streams.campaign, 0).generator("detector response")
         detector = Detector.draw(camera_optics(field_camera()).fall_off, p.detector, response)
         noise, scene = streams.generator("detector noise"), self._start_scene(key)
-        taken = [take_picture(run, scene, ground, state, detector, noise) for state in case.states]
-        pictures = [counts for counts, _ in taken]
+        shots = [take_picture(run, scene, ground, state, detector, noise) for state in case.states]
+        pictures = [counts for counts, _ in shots]
         truth = truth_velocities(p, case)[1, :2]
         measurements = measure(p, case, pictures, detector, calibrated_camera(p, streams))
         # the clouds' transmittance over the middle picture's ground at each picture, and its changes
-        light = cloud_transmittances(run, taken[1][1], [state.time_s for state in case.states])
+        light = cloud_transmittances(run, shots[1][1], [state.time_s for state in case.states])
         changes = np.abs(np.diff(light, axis=0))
         conditions = {
             **_conditions(p, case, measurements, ground.surface),

@@ -153,8 +153,8 @@ class GroundTruth:
         right = flight.states[0].attitude.apply(np.array([1.0, 0.0, 0.0]))[:2]
         right = right / np.hypot(*right)
         axes = np.array([right, [-right[1], right[0]]])
-        seen = pair.frames[0].points_world()[::8, ::8, :2].reshape(-1, 2)
-        hull = cv2.convexHull(seen[np.all(np.isfinite(seen), axis=1)].astype(np.float32))
+        points_seen = pair.frames[0].points_world()[::8, ::8, :2].reshape(-1, 2)
+        hull = cv2.convexHull(points_seen[np.all(np.isfinite(points_seen), axis=1)].astype(np.float32))
         outline = (hull[:, 0].astype(np.float64) - centre[:2]) @ axes.T
         step = STEP_DIAMETERS * limits.diameter_m
         low, high = (np.floor(end / step) * step for end in (outline.min(axis=0), outline.max(axis=0)))
@@ -203,8 +203,8 @@ class GroundTruth:
         inside &= (rows >= 0) & (columns >= 0) & (rows < shape[0]) & (columns < shape[1])
         hazard = np.full(len(cells), UNKNOWN, dtype=np.uint8)
         at = rows[inside], columns[inside]
-        known = np.where(self.footprints.safe[at], SAFE, UNSAFE)
-        hazard[inside] = np.where(self.covered[at], known, UNKNOWN)
+        site_class = np.where(self.footprints.safe[at], SAFE, UNSAFE)
+        hazard[inside] = np.where(self.covered[at], site_class, UNKNOWN)
         return hazard.reshape(points.shape[:2])
 
     def under(self, place: Float[np.ndarray, "2"]) -> Footprints | None:
@@ -268,9 +268,9 @@ class SampledMap:
         reach = 0.5 * truth.limits.diameter_m / ground.elevation.cell_m
         near = distance_transform_edt(~raw) <= reach if np.any(raw) else np.zeros_like(raw)
         slope = hazards.slope_rad[rows, columns]
-        known = inside & np.isfinite(slope) & np.isfinite(hazards.roughness_m[rows, columns])
-        safe = known & (hazards.safety[rows, columns] == Safety.SAFE)
-        return cls(known, safe, known & near[rows, columns], slope)
+        finite = inside & np.isfinite(slope) & np.isfinite(hazards.roughness_m[rows, columns])
+        safe = finite & (hazards.safety[rows, columns] == Safety.SAFE)
+        return cls(finite, safe, finite & near[rows, columns], slope)
 
 
 def hazard_counts(ground: Ground, at: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
@@ -320,11 +320,11 @@ def map_errors(ground: Ground, flight: Flight, at: SampledMap, truth: GroundTrut
     places = start[:2] + local @ ground.world_from_surface.as_matrix()[:2, :2].T
     exact = truth.relief.average(places, ground.elevation.cell_m) - start[2]
     error = ground.elevation.elevation_m - exact
-    known = np.isfinite(error)
-    values = error[known]
+    finite = np.isfinite(error)
+    values = error[finite]
     if values.size < 4:
         return {}
-    design = np.column_stack([local[known], np.ones(values.size)])
+    design = np.column_stack([local[finite], np.ones(values.size)])
     near = np.abs(values - np.median(values)) <= 5.0 * _deviation(values)
     level = values - design @ np.linalg.lstsq(design[near], values[near], rcond=None)[0]
     noise = _deviation(level)

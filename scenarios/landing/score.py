@@ -214,8 +214,8 @@ def solved_row(details: HdaDetails) -> dict[str, Scalar]:
 
 def times_row(details: object) -> dict[str, Scalar]:
     """Processor time of the stages of Table I; NaN for stages that were not reached."""
-    taken = details.times_s if isinstance(details, HdaDetails) else {}
-    return {f"{stage}_time_s": taken.get(stage, NAN) for stage in STAGES}
+    stage_times_s = details.times_s if isinstance(details, HdaDetails) else {}
+    return {f"{stage}_time_s": stage_times_s.get(stage, NAN) for stage in STAGES}
 
 
 def map_row(

@@ -121,9 +121,9 @@ def infer_summed_rows(camera: CameraModel) -> int:
     Returns 1 where the ratio is near no whole number: the pixels are not sums of square ones.
     """
     ratio = camera.focal_lengths[0] / camera.focal_lengths[1]
-    whole = round(ratio)
-    is_whole = 1 < whole <= _MAX_SUMMED_ROWS and abs(ratio - whole) <= _RATIO_TOLERANCE * whole
-    return whole if is_whole else 1
+    divisor = round(ratio)
+    is_whole = 1 < divisor <= _MAX_SUMMED_ROWS and abs(ratio - divisor) <= _RATIO_TOLERANCE * divisor
+    return divisor if is_whole else 1
 
 
 @dataclass(frozen=True)

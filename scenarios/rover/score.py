@@ -93,18 +93,18 @@ def _max(values: Float64[np.ndarray, "n"]) -> float:
 def tracking(run: Run) -> dict[str, Scalar]:
     """Table III's figures at their extremes, and the tracker's corrections."""
     figures = update_figures(run)
-    found = [one for one in run.stops if one.update.found]
+    sighted = [one for one in run.stops if one.update.found]
     drift_m = seed_error = seed_3_sigma = NAN
-    if found:
+    if sighted:
         seed, last = (
-            one.estimated.apply(np.asarray(one.update.position_rover).copy()) for one in (found[0], found[-1])
+            one.estimated.apply(np.asarray(one.update.position_rover).copy()) for one in (sighted[0], sighted[-1])
         )
-        drift_m, seed_error = float(np.linalg.norm(last - seed)), float(np.linalg.norm(found[0].error_m()))
+        drift_m, seed_error = float(np.linalg.norm(last - seed)), float(np.linalg.norm(sighted[0].error_m()))
         scale = disparity_px_m(run.rig.calibrated.left, run.rig.calibrated.right)
-        seed_3_sigma = stereo_range_error_m(found[0].range_m, scale, 1.0)
+        seed_3_sigma = stereo_range_error_m(sighted[0].range_m, scale, 1.0)
     return {
         "updates": len(run.stops),
-        "lost_updates": len(run.stops) - len(found),
+        "lost_updates": len(run.stops) - len(sighted),
         "visual_odometry_updates": run.visual_odometry_updates,
         "autonav_updates": run.autonav_updates,
         **{
@@ -280,18 +280,18 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
     arrays: dict[str, object] = {}
     for number, stop in enumerate(stops, start=1):
         left, right, details = stop.pictures.left, stop.pictures.right, stop.details
-        window, found = np.full(4, np.nan), np.full((2, 2), np.nan)
+        window, matched_px = np.full(4, np.nan), np.full((2, 2), np.nan)
         if details is not None and details.window is not None and details.window_corner is not None:
             window = np.array([*details.window_corner, *details.window.shape[::-1]], dtype=np.float64)
-        found[0] = stop.found_px(run.rig.calibrated)
+        matched_px[0] = stop.found_px(run.rig.calibrated)
         if details is not None and details.stereo is not None and stop.update.found:
-            found[1] = details.stereo.pixel
+            matched_px[1] = details.stereo.pixel
         of_stop = {
             "left": left.counts,
             "right": right.counts,
             "corners": np.array([left.corner, right.corner], dtype=np.float64),
             "window": window,
-            "found": found,
+            "found": matched_px,
             "point": stop.point_px,
         }
         arrays |= {f"stop_{number}_{name}": values for name, values in of_stop.items()}

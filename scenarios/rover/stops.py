@@ -307,5 +307,5 @@ def _is_on_edge(triangles: Triangles, foot_m: float, eye: Vector, point: Vector,
     ring /= np.linalg.norm(ring, axis=1, keepdims=True)
     # the ground about the rock is taken as level with its foot
     falls = np.maximum(-ring[:, 2], 1e-9)
-    seen = np.minimum(points.ray_distances(triangles, eye, ring), (eye[2] - foot_m) / falls)
-    return bool(np.any(seen > (1.0 + BEHIND_FRACTION) * distance))
+    visible_m = np.minimum(points.ray_distances(triangles, eye, ring), (eye[2] - foot_m) / falls)
+    return bool(np.any(visible_m > (1.0 + BEHIND_FRACTION) * distance))

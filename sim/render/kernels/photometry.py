@@ -141,9 +141,9 @@ def _add_octave(
     for k in range(x.size):
         ratio = footprint[k] / cell
         fade = max(1.0 - FADING * ratio * ratio, 0.0)
-        seen = amplitude * (fade * fade)
+        faded = amplitude * (fade * fade)
         noise = gradient_noise(x[k] / cell, y[k] / cell, z[k] / cell, octave)
-        change[k] += seen * noise - 0.5 * NOISE_VARIANCE * seen**2
+        change[k] += faded * noise - 0.5 * NOISE_VARIANCE * faded**2
 
 
 @njit(cache=True)

@@ -66,11 +66,11 @@ class Dunes(Parameters):
         # the wave travels downwind; azimuth is clockwise from north, x is east
         downwind = np.radians(90.0 - (self.wind_from_deg + 180.0))
         waves = ground.period_m / self.wavelength_m * np.array([np.cos(downwind), np.sin(downwind)])
-        whole = np.round(waves)
-        if not whole.any():
+        cycles = np.round(waves)
+        if not cycles.any():
             side = f"{ground.period_m:g} m"
             raise ValueError(f"dunes.wavelength_m is {self.wavelength_m:g}; the terrain's side is {side}")
-        wave = 2.0 * np.pi * whole / ground.period_m
+        wave = 2.0 * np.pi * cycles / ground.period_m
         across, along = (length * self.wavelength_m / np.sqrt(2.0) for length in (self.crest_length, self.regularity))
         modulation = draw_smooth_fields(ground.period_m, across, along, float(downwind), rng)
         step = max(modulation.shape[0] // ground.side, 1)
