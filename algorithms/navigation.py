@@ -78,17 +78,17 @@ class TerrainMap:
     wedges: tuple[Wedge, ...] = ()
     obstacles: tuple[Obstacle, ...] = ()
 
-    def sensed(self, wedge: Wedge, rocks: Iterable[Obstacle]) -> TerrainMap:
+    def add_wedge(self, wedge: Wedge, rocks: Iterable[Obstacle]) -> TerrainMap:
         """The map with a wedge added, and with every rock of which the wedge covers a part; occlusion is neglected.
 
         The latest sighting of a rock replaces earlier ones.
         """
         rims = ((rock, rock.place_m + rock.radius_m * _FOOTPRINT_POINTS) for rock in rocks)
-        seen = {rock.name: rock for rock, rim in rims if wedge.covers(rim).any()}
-        kept = tuple(rock for rock in self.obstacles if rock.name not in seen)
-        return TerrainMap((*self.wedges, wedge), kept + tuple(seen.values()))
+        newly_seen = {rock.name: rock for rock, rim in rims if wedge.covers(rim).any()}
+        kept = tuple(rock for rock in self.obstacles if rock.name not in newly_seen)
+        return TerrainMap((*self.wedges, wedge), kept + tuple(newly_seen.values()))
 
-    def mapped(self, positions_m: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
+    def contains(self, positions_m: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
         """Whether positions (east, north) lie in any wedge."""
         covered = np.zeros(positions_m.shape[:-1], dtype=np.bool_)
         for wedge in self.wedges:
@@ -169,15 +169,15 @@ def navigate(
     none = np.empty((0, 2))
     if float(np.hypot(*goal)) < AT_GOAL_M:
         return NavigationPlan(NavigationOutcome.AT_GOAL, (), none)
-    if not bool(terrain.mapped(position + options.half_width_m * _FOOTPRINT_POINTS).all()):
+    if not bool(terrain.contains(position + options.half_width_m * _FOOTPRINT_POINTS).all()):
         return NavigationPlan(NavigationOutcome.NOT_MAPPED, (), none)
     avoided = [rock for rock in terrain.obstacles if rock.name != target and rock.height_m > options.climb_m]
     for path in _candidates(goal, options):
         lookahead = position + path.points(np.arange(0.0, min(path.length_m, options.lookahead_m), 0.1)) @ heading.T
         disc = lookahead[:, None] + options.half_width_m * _FOOTPRINT_POINTS
-        if _is_clear(lookahead, avoided, options) and bool(terrain.mapped(disc).all()):
-            whole = np.asarray(position + path.points(np.linspace(0.0, path.length_m, 60)) @ heading.T)
-            return NavigationPlan(NavigationOutcome.PATH, path.commands(step_m, backwards), whole)
+        if _is_clear(lookahead, avoided, options) and bool(terrain.contains(disc).all()):
+            footprint = np.asarray(position + path.points(np.linspace(0.0, path.length_m, 60)) @ heading.T)
+            return NavigationPlan(NavigationOutcome.PATH, path.commands(step_m, backwards), footprint)
     return NavigationPlan(NavigationOutcome.NO_PATH, (), none)
 
 
@@ -246,9 +246,8 @@ def _candidates(goal: Float[np.ndarray, "2"], options: NavigationOptions) -> Ite
     bent = first**2 * length + second**2 * rest
     cost = np.where(fits, length + rest + options.turn_cost_m * np.abs(turn) + options.bend_cost_m2 * bent, np.inf)
     for best in np.argsort(cost, kind="stable")[: np.count_nonzero(fits)]:
-        yield _Path(
-            float(turn[best]), (float(first[best]), float(second[best])), (float(length[best]), float(rest[best]))
-        )
+        arcs = (float(first[best]), float(second[best])), (float(length[best]), float(rest[best]))
+        yield _Path(float(turn[best]), *arcs)
 
 
 def _is_clear(positions_m: Float[np.ndarray, "n 2"], rocks: Iterable[Obstacle], options: NavigationOptions) -> bool:

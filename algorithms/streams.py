@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from marsyard.algorithms.answers import check_velocity
-from marsyard.algorithms.faults import AlgorithmError, Fault
+from marsyard.algorithms.answers import bad_answer, check_velocity
 from marsyard.algorithms.interface import VelocityEstimate, VelocityStream
 from marsyard.sim.measurements import DescentMeasurements
 
@@ -42,5 +41,5 @@ def set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
 
 def _check_answer(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
     if isinstance(answer, VelocityEstimate) and answer.after_pictures:
-        raise AlgorithmError(Fault.BAD_ANSWER, "after_pictures is given; allowed: nothing there, it is filled in")
+        raise bad_answer("after_pictures is given; allowed: nothing there, it is filled in")
     return set_span(answer, tags_s)

@@ -1,4 +1,4 @@
-"""Benchmarks of run time and memory. One thread, as in a campaign's worker, unless stated otherwise."""
+"""Benchmarks of run time and memory, with one thread as in a campaign's worker unless stated otherwise."""
 
 import os
 

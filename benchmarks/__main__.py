@@ -15,7 +15,7 @@ import cv2
 from benchmarks import descent, engine, estimators, hda, pictures, renderers, reporting, starting, vtt
 from benchmarks.page import PAGE, write_page
 from benchmarks.timing import Figure
-from marsyard.sim.processor import processor_features
+from marsyard.sim.kernel_cache import processor_features
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import default_backend
 
@@ -24,11 +24,11 @@ PACKAGES = ("marsyard", "numpy", "numba", "pyrender2", "opencv-python-headless")
 
 
 def main() -> None:
-    """Run, print and store."""
+    """Run all benchmarks, print and store the figures."""
     argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__).parse_args()
     cv2.setNumThreads(1)
     figures = [
-        # first, while nothing else has grown the process
+        # first, because other benchmarks increase the memory of the process
         *pictures.memory(500),
         *descent.frame(15),
         *descent.case(7),
@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def keep(figures: list[Figure]) -> None:
-    """Write the figures with machine and versions."""
+    """Store the figures with machine and versions."""
     record = {
         "measured": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
         "machine": {"platform": platform.platform(), "processor": processor_features(), "cores": os.cpu_count()},

@@ -1,8 +1,8 @@
-"""Draw a ground by Blender Cycles: ``PYTHON blender_frame.py GROUND.npz REPEATS`` (`benchmarks.renderers`).
+"""Render a terrain mesh with Blender Cycles: ``PYTHON blender_frame.py GROUND.npz REPEATS`` (`benchmarks.renderers`).
 
-Needs nothing of Marsyard's, as Blender's ``bpy`` lives in an environment of its own; called ``cycles.py`` it would hide
-Blender's own module of that name. One thread; the last line printed
-is the core-seconds of each frame but the first, which builds the mesh's tree.
+Does not import Marsyard, because ``bpy`` needs its own environment. The name ``cycles.py`` would hide a module of
+Blender. Uses one thread. The last line of the output has the core-seconds of each frame except the first, which builds
+the acceleration structure of the mesh.
 """
 
 import json
@@ -16,11 +16,11 @@ import bpy
 import mathutils
 import numpy as np
 
-#: Side of the frames, pixels, and samples a pixel.
+#: Side of the frames in pixels, and samples per pixel.
 SIDE_PX, SAMPLES = 1024, 16
 
 
-def prepared(given: Mapping[str, Any]) -> Callable[[], object]:
+def prepare_frame(given: Mapping[str, Any]) -> Callable[[], object]:
     """Return a function that renders a frame."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
@@ -49,14 +49,14 @@ def prepared(given: Mapping[str, Any]) -> Callable[[], object]:
     scene.render.threads_mode, scene.render.threads = "FIXED", 1
     scene.render.resolution_x = scene.render.resolution_y = SIDE_PX
     scene.render.resolution_percentage = 100
-    scene.render.use_persistent_data = True  # the mesh's tree is built once
+    scene.render.use_persistent_data = True  # the acceleration structure is built once
     return lambda: bpy.ops.render.render()
 
 
 def main(file: Path, repeats: int) -> None:
-    """Render and print."""
+    """Render the frames and print their core-seconds."""
     with np.load(file) as stored:
-        draw = prepared({name: stored[name] for name in stored.files})
+        draw = prepare_frame({name: stored[name] for name in stored.files})
     draw()
     times = []
     for _ in range(repeats):

@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from benchmarks.pictures import descent_scene
-from benchmarks.stages import Stages, profiled
+from benchmarks.stages import Stages, profile_stages
 from benchmarks.timing import Figure, core_seconds
 from marsyard.sim.render.kernels.ground import height_range
 from marsyard.sim.render.kernels.strips import STRIP, FetchedCells, fetch_cells, no_cells, spline
@@ -26,7 +26,7 @@ PICTURES, SIDE_PX = 3, 1024
 SPLINES = 2
 #: Mean electrons of a pixel; above about ten, the cost of a Poisson number does not depend on the mean.
 ELECTRONS = 3e4
-#: Calls of libraries in cases.
+#: Library calls in cases.
 CALLS: Stages = {
     "triangles drawn and read back by OpenGL": (("render/backend.py", "draw"),),
     "transforms of DIMES' correlations": (("image/correlation.py", "cross_sums"),),
@@ -34,8 +34,8 @@ CALLS: Stages = {
 
 
 def bounds(run_case: Callable[[], object], repeats: int) -> list[Figure]:
-    """Lower bounds of the parts of a case, core-seconds, and their sum."""
-    calls = profiled(run_case, repeats, CALLS)
+    """Lower bounds of the parts of a case and their sum, in core-seconds."""
+    calls = profile_stages(run_case, repeats, CALLS)
     parts = {
         "splines where rays meet the ground and are shaded": core_seconds(_splines(), repeats),
         "random numbers of the detector": core_seconds(_random_numbers(), repeats),
@@ -51,11 +51,11 @@ def _splines() -> Callable[[], object]:
     surface = descent_scene()[1]
     places = np.linspace(0.0, 1000.0, SIDE_PX)
     x, y = (side.ravel() for side in np.meshgrid(places, places))
-    return lambda: [_summed(surface.levels[0], 1.0 / surface.spacing_m, x, y) for _ in range(PICTURES * SPLINES)]
+    return lambda: [_sum_fields(surface.levels[0], 1.0 / surface.spacing_m, x, y) for _ in range(PICTURES * SPLINES)]
 
 
 @njit(cache=True)
-def _summed(field: Level, scale: float, x: Array, y: Array) -> float:
+def _sum_fields(field: Level, scale: float, x: Array, y: Array) -> float:
     """Sum of heights, slopes and albedos at positions."""
     near: FetchedCells = no_cells()
     which = np.arange(STRIP)

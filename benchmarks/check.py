@@ -28,7 +28,7 @@ from benchmarks.pictures import descent_exposure
 from benchmarks.vtt import seeded_update
 from marsyard.algorithms.dimes import DimesEstimator
 from marsyard.algorithms.hda import ElevationMap, HdaEstimator, HdaOptions, hazard_maps
-from marsyard.sim.processor import processor_features
+from marsyard.sim.kernel_cache import processor_features
 
 RATIOS = Path(__file__).parent / "results" / "ratios.json"
 #: Pairs of runs of a path and the reference workload.
@@ -110,12 +110,12 @@ class Comparison:
 
 def compare(now: Mapping[str, Sequence[float]], kept: Mapping[str, Sequence[float]]) -> list[Comparison]:
     """Compare every path that both records contain."""
-    found = []
+    regressions = []
     for name in now.keys() & kept.keys():
         ours, before = np.asarray(now[name]), np.asarray(kept[name])
         test = stats.ttest_ind(ours - np.log(ALLOWED), before, equal_var=False, alternative="greater")
-        found.append(Comparison(name, float(np.exp(ours.mean() - before.mean())), float(test.pvalue)))
-    return sorted(found, key=lambda one: one.name)
+        regressions.append(Comparison(name, float(np.exp(ours.mean() - before.mean())), float(test.pvalue)))
+    return sorted(regressions, key=lambda one: one.name)
 
 
 def select_slower(found: Sequence[Comparison]) -> list[Comparison]:

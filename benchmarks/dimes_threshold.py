@@ -19,19 +19,19 @@ from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.reports.statistics.samples import quantile_bounds
 
 STORED = Path(options.__file__).with_name("imu_threshold.json")
-#: Raised when the derivation changes in a way that its inputs do not tell.
+#: Increased if the derivation changes without a change of its inputs.
 VERSION = 1
 QUANTILES = (0.5, 0.9, 0.95, 0.99, 0.995, 0.999)
-#: How wrong the wrong track is, m/s, between two bounds: at the bar itself, and anywhere up to the search range.
+#: Range of the velocity error of the wrong track, m/s: minimum error, and errors up to the search range.
 WRONG_BY_M_S = ((10.0, 10.0), (10.0, 60.0))
 
 
-def derived(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
+def derive_threshold(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
     """Threshold, distribution of discrepancies, and effect of the check on one wrong track."""
     rng = np.random.default_rng(inputs.seed)
     errors = derivation.right_track_errors(inputs, rng)
-    found = derivation.discrepancies(errors, inputs.imu_sd_m_s, rng)
-    threshold = derivation.threshold_m_s(found.single, inputs.kept, inputs.step_m_s)
+    results = derivation.discrepancies(errors, inputs.imu_sd_m_s, rng)
+    threshold = derivation.threshold_m_s(results.single, inputs.kept, inputs.step_m_s)
     harms = [
         {
             "tracks_per_pair": tracks,
@@ -48,15 +48,15 @@ def derived(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
         "inputs": asdict(inputs),
         "track_error_rms_m_s": float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))),
         "discrepancy_quantiles_m_s": {
-            "one right track in each pair": _quantiles(found.single),
-            "best of two right tracks in each pair": _quantiles(found.best),
+            "one right track in each pair": _quantiles(results.single),
+            "best of two right tracks in each pair": _quantiles(results.best),
         },
         "kept": {
-            "one right track in each pair": float(np.mean(found.single < threshold)),
-            "best of two right tracks in each pair": float(np.mean(found.best < threshold)),
+            "one right track in each pair": float(np.mean(results.single < threshold)),
+            "best of two right tracks in each pair": float(np.mean(results.best < threshold)),
         },
-        "kept_quantile_m_s": float(np.quantile(found.single, inputs.kept)),
-        "kept_quantile_90_percent_bounds_m_s": quantile_bounds(found.single, inputs.kept, 0.95),
+        "kept_quantile_m_s": float(np.quantile(results.single, inputs.kept)),
+        "kept_quantile_90_percent_bounds_m_s": quantile_bounds(results.single, inputs.kept, 0.95),
         "threshold_m_s": threshold,
         "one_wrong_track": harms,
     }
@@ -67,7 +67,7 @@ def _quantiles(values: np.ndarray) -> dict[str, float]:
 
 
 def main() -> None:
-    record = derived(derivation.ThresholdInputs())
+    record = derive_threshold(derivation.ThresholdInputs())
     STORED.write_text(json.dumps(record, indent=1) + "\n")
     print(json.dumps(record, indent=1))
     print(f"kept in {STORED}; the option's default is {DimesOptions().imu_threshold_m_s} m/s")

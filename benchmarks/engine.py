@@ -25,7 +25,7 @@ from marsyard.campaigns.store.table import write_table
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.sim.streams import Streams
 
-#: Columns of numbers of a row in the table of a million.
+#: Columns of numbers in the table of a million rows.
 COLUMNS = 30
 
 
@@ -45,7 +45,7 @@ class BusyScenario:
         return ()
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
-        """Nothing: there are no shared inputs."""
+        """There are no shared inputs."""
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         assert isinstance(parameters, BusyParameters)
@@ -130,7 +130,7 @@ def span(busy_s: float, first: int, last: int) -> Span:
     configuration = CampaignConfiguration(
         name="busy",
         scenario="benchmarks.engine:BusyScenario",
-        # after the last mark workers run small batches
+        # workers run small batches after the last mark
         cases=last + (last - first) // 10,
         parameters={"busy_s": busy_s},
         retain=Retain(showcase="none"),

@@ -16,7 +16,7 @@ from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator, V
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.sim.measurements import DescentMeasurements
 
-#: By name: what is compared.
+#: Compared estimators, by name.
 ESTIMATORS: Mapping[str, VelocityEstimator] = {
     "DIMES": DimesEstimator(),
     "DIMES, peaks by a quadric alone": DimesEstimator(DimesOptions(align=False)),
@@ -24,7 +24,7 @@ ESTIMATORS: Mapping[str, VelocityEstimator] = {
     "OpenCV's phase correlation": PhaseCorrelationEstimator(),
     "OpenCV's ORB and homography": HomographyEstimator(),
 }
-#: Runs of each estimate, of which the fastest counts: others on the machine make it slower, never faster.
+#: Runs of each estimate; the fastest counts, because other programs only add time.
 REPEATS = 3
 
 
@@ -51,13 +51,13 @@ class Descent:
 def recorded(campaign_name: str, cases: int) -> list[Descent]:
     """Record the first cases of a descent campaign."""
     campaign = load_campaign(campaign_name, ["parameters.algorithm=benchmarks.estimators:Recorder"])
-    found = []
+    descents = []
     for case in range(cases):
         Recorder.given.clear()
         row = campaign.scenario.run(campaign.parameters(case), campaign.streams(case)).row
         velocity = np.array([row["velocity_true_x_m_s"], row["velocity_true_y_m_s"]])
-        found.append(Descent(Recorder.given[0], velocity, bool(row["feasible_overlap"])))
-    return found
+        descents.append(Descent(Recorder.given[0], velocity, bool(row["feasible_overlap"])))
+    return descents
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Tried:
         return self.errors_m_s[np.isfinite(self.errors_m_s)]
 
 
-def tried(estimator: VelocityEstimator, descents: list[Descent]) -> Tried:
+def run_estimator(estimator: VelocityEstimator, descents: list[Descent]) -> Tried:
     """Run an estimator on descents."""
     errors, seconds = [], []
     for descent in descents:
@@ -93,6 +93,6 @@ def side_by_side(cases: int) -> list[Figure]:
     descents = recorded("dimes-smoke", cases)
     bars = {"DIMES": 0.015}
     return [
-        Figure(f"a triple: {name}", tried(estimator, descents).seconds.tolist(), bar=bars.get(name))
+        Figure(f"a triple: {name}", run_estimator(estimator, descents).seconds.tolist(), bar=bars.get(name))
         for name, estimator in ESTIMATORS.items()
     ]

@@ -1,8 +1,7 @@
 """Growth of costs with size: ``python -m benchmarks.growth`` draws docs/images/growth.svg.
 
-Frame over pixels and over triangles, case over the terrain's size, campaign over cases and workers (light ones, as
-many as a cluster's would be here, and by Dask), report over cases. Core-seconds, but for workers: what they are for
-is wall-clock time.
+Frame over pixels and triangles, case over terrain size, campaign over cases and workers (local workers and Dask, with
+cases that wait), report over cases. Core-seconds; wall-clock time for the number of workers.
 """
 
 from __future__ import annotations
@@ -50,10 +49,12 @@ class Curve:
 
     Attributes
     ----------
-    name, size, cost
-        Of the curve, and of its axes with their units.
+    name
+        Name of the curve.
+    size, cost
+        Labels of the axes with units.
     points
-        (size, cost) each.
+        Pairs (size, cost).
     """
 
     name: str
@@ -69,7 +70,7 @@ class Curve:
 
 
 class LightScenario(BusyScenario):
-    """Wait without computing: with more workers than cores the time is the engine's, not the cores'."""
+    """Wait without computing, so that the number of cores does not limit the number of workers."""
 
     name = "light"
 
@@ -96,37 +97,37 @@ def _frames_of_sizes(sides: Sequence[int]) -> list[tuple[float, float]]:
     scene, surface = descent_scene()
     camera, pose = camera_optics(CameraParameters()).camera, descent_pose(surface)
     renderer = process_renderer(default_backend())
-    found = []
+    points = []
     for side in sides:
         corner = (camera.size[0] - side) // 2
-        rays = PixelRays.of(camera.cropped(corner, corner, (side, side)))
-        found.append((float(side**2), _minimum(partial(renderer.render, scene, rays, pose))))
-    return found
+        rays = PixelRays.of(camera.crop(corner, corner, (side, side)))
+        points.append((float(side**2), _minimum(partial(renderer.render, scene, rays, pose))))
+    return points
 
 
 def _frames_of_meshes(lines: Sequence[int]) -> list[tuple[float, float]]:
     scene, surface = descent_scene()
     rays, pose = camera_optics(CameraParameters()).rays, descent_pose(surface)
     renderer = process_renderer(default_backend())
-    found = []
+    points = []
     for count in lines:
-        # as far as the frame's own mesh reaches, with lines further apart where they are fewer
+        # same extent as the default mesh, with wider spacing for fewer lines
         finest = scene.mesh_finest_m * (scene.mesh_lines - 1) / (count - 1)
         of_count = replace(scene, mesh_lines=count, mesh_finest_m=finest)
         cost = _minimum(partial(renderer.render, of_count, rays, pose))
-        found.append((2.0 * (count - 1) ** 2, cost))
-    return found
+        points.append((2.0 * (count - 1) ** 2, cost))
+    return points
 
 
 def _cases_over_terrains(samples: Sequence[int]) -> list[tuple[float, float]]:
-    found = []
+    points = []
     for count in samples:
         campaign = load_campaign("dimes-smoke", [f"terrain.samples={count}", "retain.showcase=none"])
-        # one case again and again: cases differ by more than terrains do
+        # always the same case, because run times differ between cases
         parameters = campaign.with_values({**campaign.draws(0), "location.terrain": 0})
         run = partial(campaign.scenario.run, parameters, campaign.streams(0))
-        found.append((float(count**2), _minimum(run)))
-    return found
+        points.append((float(count**2), _minimum(run)))
+    return points
 
 
 def _campaigns(cases: Sequence[int]) -> list[tuple[float, float]]:
@@ -145,11 +146,7 @@ def _campaign_s(cases: int, waiting_s: float, executor: ExecutorConfig) -> float
     """Wall-clock time from the first to the last completed case."""
     scenario = "benchmarks.growth:LightScenario" if waiting_s else "benchmarks.engine:BusyScenario"
     configuration = CampaignConfiguration(
-        name="growth",
-        scenario=scenario,
-        cases=cases,
-        parameters={"busy_s": waiting_s},
-        retain=Retain(showcase="none"),
+        name="growth", scenario=scenario, cases=cases, parameters={"busy_s": waiting_s}, retain=Retain(showcase="none")
     )
     watch = Stopwatch((1, cases))
     with TemporaryDirectory() as folder:
@@ -169,8 +166,8 @@ def _minimum(run: Callable[[], object]) -> float:
     return min(core_seconds(run, 3))
 
 
-def drawn(found: Sequence[Curve]) -> Figure:
-    """One panel per curve, logarithmic axes with at least a decade of cost, so that slow growth looks slow."""
+def draw(found: Sequence[Curve]) -> Figure:
+    """Draw one panel per curve, with logarithmic axes that span at least one decade of cost."""
     figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     panels = figure.subplots(2, 4).ravel()
     for axes, curve in zip(panels, found, strict=False):
@@ -198,13 +195,13 @@ def main() -> None:
     """Measure, store and draw."""
     cv2.setNumThreads(1)
     mpl.rcParams["svg.hashsalt"] = "marsyard"
-    found = curves()
-    for curve in found:
+    measured = curves()
+    for curve in measured:
         points = ", ".join(f"{size:g}: {cost:.3g}" for size, cost in curve.points)
         print(f"{curve.name:<32}{points} {curve.cost}; size^{curve.power:.2f} at the end")
     KEPT.parent.mkdir(exist_ok=True)
-    KEPT.write_text(json.dumps([asdict(curve) for curve in found], indent=1) + "\n")
-    drawn(found).savefig(FIGURE, metadata={"Date": None})
+    KEPT.write_text(json.dumps([asdict(curve) for curve in measured], indent=1) + "\n")
+    draw(measured).savefig(FIGURE, metadata={"Date": None})
     print(f"kept in {KEPT}, drawn as {FIGURE}")
 
 

@@ -12,18 +12,17 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from benchmarks.timing import Figure, core_seconds
 from marsyard.algorithms.hda import ElevationMap, HdaDetails, HdaEstimator, HdaOptions, hazard_maps
 from marsyard.algorithms.hda.baselines import SemiGlobalEstimator
-from marsyard.algorithms.hda.estimator import expected_pixels, matched_structure, motion_from_tracks
+from marsyard.algorithms.hda.estimator import expected_pixels, map_ground, matched_structure, motion_from_tracks
 from marsyard.algorithms.hda.hazards import map_resolution
-from marsyard.algorithms.hda.landing import map_ground
+from marsyard.algorithms.hda.motion import build_scene, undistort
 from marsyard.algorithms.hda.structure import scale_factor
 from marsyard.algorithms.hda.tracking import select_features, track_features
-from marsyard.algorithms.hda.view import build_scene, undistort
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DetectorCalibration, DetectorImage, LandingMeasurements, PoseMeasurement
 
-#: The XC-55's picture. A block of 73 px gives about the paper's 59 tracks, a grid of 20 px its 600 structure pixels.
+#: XC-55 camera. Blocks of 73 px give about 59 tracks and a grid of 20 px gives 600 points, as in the paper.
 CAMERA = Cahv.from_focal_length(0.006, 7.4e-6, (640, 480), axis=(0.0, 0.0, -1.0), right=(0.0, -1.0, 0.0))
 PAPER = HdaOptions(block_px=73, grid_px=20)
 #: 160 x 120 structure pixels.
@@ -32,7 +31,7 @@ TEXEL_M = 0.005
 
 
 def measurements() -> LandingMeasurements:
-    """Two pictures of textured level ground from 10 m, 0.36 m apart."""
+    """Two images of textured level ground from a height of 10 m with a baseline of 0.36 m."""
     values = np.random.default_rng(1).standard_normal((2400, 2400)).astype(np.float32)
     texture = sum(
         sigma * ndimage.gaussian_filter(values, sigma, mode="wrap", truncate=3.0) * sigma**0.5 for sigma in (4, 12, 36)
@@ -54,7 +53,7 @@ def measurements() -> LandingMeasurements:
 
 
 def _picture(texture: np.ndarray, pose: RigidTransform) -> np.ndarray:
-    camera = CAMERA.moved(pose)
+    camera = CAMERA.transform(pose)
     rays = camera.rays(camera.pixel_grid())[1]
     ground = camera.c[:2] - camera.c[2] * rays[..., :2] / rays[..., 2:]
     places = (ground / TEXEL_M + 1200.0).astype(np.float32)

@@ -44,7 +44,7 @@ def descent_exposure() -> Callable[[], object]:
     optics = camera_optics(CameraParameters())
     renderer = process_renderer(default_backend())
     pose = descent_pose(surface)
-    detector = Detector.drawn(optics.fall_off, DetectorParameters(), np.random.default_rng(0))
+    detector = Detector.draw(optics.fall_off, DetectorParameters(), np.random.default_rng(0))
     return lambda: detector.expose(renderer.render(scene, optics.rays, pose).radiance, np.random.default_rng(0))
 
 
@@ -83,7 +83,7 @@ def rover_pictures(repeats: int) -> list[Figure]:
         right=np.array([1.0, 0.0, 0.0]),
     )
     navcam = Cahvor.from_cahv(pinhole, r=np.array([0.00096, -0.002183, 0.018547]))
-    full, small = PixelRays.of(navcam), PixelRays.of(navcam.cropped(430, 560, (161, 161)))
+    full, small = PixelRays.of(navcam), PixelRays.of(navcam.crop(430, 560, (161, 161)))
     eye = np.array([50.0, 50.0, float(surface.height(50.0, 50.0)) + 1.5])
     looking = Rotation.from_euler("x", -18.0, degrees=True)
     left, right = rigid(looking, eye), rigid(looking, eye + np.array([0.2, 0.0, 0.0]))
@@ -99,7 +99,7 @@ def rover_pictures(repeats: int) -> list[Figure]:
     ]
 
 
-#: Pictures of each scene of the memory's measurement, and of how many scenes one has rocks.
+#: Images per scene in the measurement of memory; one of `ROCKY_OF` scenes has rocks.
 PICTURES_OF_A_SCENE, ROCKY_OF = 5, 4
 
 
@@ -125,7 +125,7 @@ def memory(frames: int) -> list[Figure]:
             renderer.render(scene, optics.rays, nadir_pose(ground, east, 0.0, 2000.0 - 150.0 * picture))
             sizes.append(used_memory([os.getpid()]) / 1e9)
     quarter = len(sizes) // 4
-    # medians: what a scene with rocks takes while it is loaded depends on its rocks
+    # medians, because the memory of scenes with rocks varies
     growth = float(np.median(sizes[-quarter:]) - np.median(sizes[quarter : 2 * quarter]))
     return [
         Figure(f"own memory, most over {len(sizes)} frames of {scenes} scenes, GB", [max(sizes)], bar=1.2),

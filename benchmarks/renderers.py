@@ -1,8 +1,8 @@
-"""Run times of other renderers for the ground of a descent frame.
+"""Run times of other renderers for the terrain of a descent frame.
 
-pyrender is always there. VTK (through PyVista) is measured where it is installed (``pip install .[bench]``), Blender's
-Cycles where the variable `MARSYARD_BLENDER` names a Python that has ``bpy`` (from PyPI; it asks for a NumPy older than
-ours, and so for an environment of its own). Each runs in a process of its own: they bring their own OpenGL and threads.
+pyrender is a dependency. VTK (through PyVista) is measured if it is installed (``pip install .[bench]``). Blender
+Cycles is measured if the variable `MARSYARD_BLENDER` names a Python with ``bpy`` (from PyPI, in a separate environment
+because it needs an older NumPy). VTK and Blender run in separate processes with their own OpenGL and threads.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from marsyard.sim.render.rays import VIEW_SIDE_PX
 from marsyard.sim.render.renderer import ground_mesh
 from marsyard.sim.render.scene import graded_offsets
 
-#: Side of their frames, pixels; the delivered frame's own.
+#: Side of all frames, pixels.
 SIDE_PX = 1024
-#: Nearest and farthest drawn, metres from the camera.
+#: Near and far clipping distances, metres.
 NEAR_M, FAR_M = 100.0, 40_000.0
-#: The environment variable that names a Python with ``bpy``.
+#: Environment variable with the path of a Python that has ``bpy``.
 BLENDER = "MARSYARD_BLENDER"
 
 
@@ -46,7 +46,7 @@ def figures(repeats: int) -> list[Figure]:
     given = _descent_mesh()
     theirs = _pyrender_shaded(given)
     paired = [(core_seconds(ours, 1)[0], core_seconds(theirs, 1)[0]) for _ in range(repeats)]
-    found = [
+    timings = [
         Figure("descent frame with shadows and detector", [mine for mine, _ in paired], bar=0.2),
         *on_all_cores(repeats),
         Figure("pyrender's shaded frame of a mesh as fine, with shadows", [other for _, other in paired]),
@@ -54,15 +54,17 @@ def figures(repeats: int) -> list[Figure]:
     ]
     if importlib.util.find_spec("pyvista") is not None:
         command = [sys.executable, "-m", "benchmarks.renderers"]
-        found.append(Figure("PyVista's (VTK's) frame of that mesh, with shadows", _elsewhere(command, given, repeats)))
+        timings.append(
+            Figure("PyVista's (VTK's) frame of that mesh, with shadows", _elsewhere(command, given, repeats))
+        )
     if BLENDER in os.environ:
         command = [os.environ[BLENDER], str(Path(__file__).with_name("blender_frame.py"))]
-        found.append(Figure("Blender Cycles' frame of that mesh, 16 samples a pixel", _elsewhere(command, given, 2)))
-    return found
+        timings.append(Figure("Blender Cycles' frame of that mesh, 16 samples a pixel", _elsewhere(command, given, 2)))
+    return timings
 
 
 def _descent_mesh() -> dict[str, Any]:
-    """The ground as triangles, the camera's pose (OpenGL's axes, as the body's are) and focal length, the sun."""
+    """Terrain triangles, camera pose (OpenGL axes, equal to the body axes), focal length and sun direction."""
     scene, surface = descent_scene()
     offsets = graded_offsets(scene.mesh_reach_m, 3.0, 1025)
     mesh = ground_mesh(scene.surface, scene.centre_m[0] + offsets, scene.centre_m[1] + offsets)
@@ -94,8 +96,8 @@ def _pyrender_shaded(given: Mapping[str, Any]) -> Callable[[], None]:
 def _compile_shaders_once(renderer: Any) -> None:
     """Make pyrender reuse its compiled shaders.
 
-    pyrender looks them up by the current context. PyOpenGL represents OSMesa's context by a new pointer object each
-    time, so every picture would compile its shaders again and leak about 0.3 MB. A renderer has a single context.
+    pyrender finds compiled shaders by the current context. PyOpenGL represents the OSMesa context by a new pointer
+    object each time. Without the change, every frame would compile its shaders again and leak about 0.3 MB.
     """
     programs = renderer._program_cache
     compile_program = programs.get_program
@@ -123,7 +125,7 @@ def _elsewhere(command: list[str], given: Mapping[str, Any], repeats: int) -> li
         arrays = {name: given[name] for name in ("pose", "focal_px", "sun")} | {"range_m": np.array([NEAR_M, FAR_M])}
         np.savez(file, vertices=mesh.vertices.astype(np.float32), faces=mesh.faces.astype(np.int32), **arrays)
         drawn = subprocess.run([*command, str(file), str(repeats)], check=True, capture_output=True, text=True)
-    # what they say of themselves comes before the last line
+    # the last line has the result; other lines are messages of the renderer
     return [float(value) for value in json.loads(drawn.stdout.splitlines()[-1])]
 
 
@@ -151,7 +153,7 @@ def _vtk(given: Mapping[str, Any]) -> Callable[[], object]:
 
 
 def _measure_vtk(file: Path, repeats: int) -> None:
-    """Render frames by VTK and print the core-seconds of each but the first, over all threads."""
+    """Render frames with VTK and print the core-seconds of each, summed over all threads."""
     with np.load(file) as stored:
         draw = _vtk({name: stored[name] for name in stored.files})
     print(json.dumps(core_seconds(draw, repeats)))

@@ -1,4 +1,4 @@
-"""Time, memory and size of reports of large and small campaigns, and of a dashboard over a thousand."""
+"""Time, memory and size of reports of large and small campaigns, and of a dashboard of a thousand campaigns."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from benchmarks.timing import Figure
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.store.record import SCHEMA
 
-#: Further columns of numbers: a row of `dimes-gusev` has 99 columns.
+#: Additional columns of numbers; a row of `dimes-gusev` has 99 columns.
 FURTHER = 82
 #: Cases that are generated together.
 _BLOCK = 50_000
@@ -40,7 +40,7 @@ class Cost:
 
 
 def figures(cases: int = 1_000_000, campaigns: int = 1_000) -> list[Figure]:
-    """Figures of reports and dashboard, in core-seconds, which other programs do not affect."""
+    """Figures of reports and dashboard in core-seconds, which do not depend on other programs."""
     with TemporaryDirectory() as folder:
         large, small = (synthetic_campaign(Path(folder, f"of-{count}"), count) for count in (cases, 24))
         of_large, of_small = (marsyard("report", str(run)) for run in (large, small))
@@ -49,7 +49,7 @@ def figures(cases: int = 1_000_000, campaigns: int = 1_000) -> list[Figure]:
         fresh = marsyard("dashboard", str(site.parent / "runs"), "--out", str(site))
         again = marsyard("dashboard", str(site.parent / "runs"), "--out", str(site))
         index = site / "index.html"
-        shown, filtered = opened(page, hover_a_case), opened(index, filter_campaigns)
+        shown, filtered = time_page(page, hover_a_case), time_page(index, filter_campaigns)
         return [
             Figure(f"report of {cases:,} cases", [of_large.core_s], bar=30.0),
             Figure(f"report of {cases:,} cases: memory (GB)", [of_large.memory_gb], bar=2.0),
@@ -143,7 +143,7 @@ def _twin(pattern: Path, site: str) -> dict[str, Any]:
 def marsyard(*arguments: str) -> Cost:
     """Cost of a `marsyard` command in a separate process.
 
-    A small process starts it: at `exec` Linux counts the memory of the starting process as the program's own.
+    A small process starts the command, because at `exec` Linux counts the memory of the parent for the child.
     """
     began = time.perf_counter()
     done = subprocess.run(
@@ -164,12 +164,12 @@ print(json.dumps([os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_sti
 """
 
 
-def opened(path: Path, done: Callable[[Page], None], repeats: int = 5) -> list[float]:
+def time_page(path: Path, done: Callable[[Page], None], repeats: int = 5) -> list[float]:
     """Time from opening a page in Debian's Chromium to the end of an action."""
     browser = next((found for name in ("chromium", "chromium-browser") if (found := shutil.which(name))), None)
     times = []
     with sync_playwright() as playwright:
-        # a container's root has no sandbox to give; the pages are our own
+        # root in a container cannot start the sandbox; the pages are trusted
         launched = playwright.chromium.launch(executable_path=browser, args=["--no-sandbox"])
         for _ in range(repeats):
             page = launched.new_page(viewport={"width": 1280, "height": 900})

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 
 from benchmarks.timing import Figure
 
-#: Stages by their functions: the end of the file's name, and the function. What a stage calls counts as its own.
+#: Functions of each stage, as end of the file name and function name; callees are included.
 Stages = Mapping[str, tuple[tuple[str, str], ...]]
 STAGES: Stages = {
     "terrain, its rocks": (("descent/world.py", "of"), ("descent/world.py", "scene")),
@@ -28,7 +28,7 @@ STAGES: Stages = {
     "feasible overlap": (("descent/score.py", "feasible_overlap_row"),),
 }
 
-#: What belongs to no stage.
+#: Name of the remainder.
 REST = "all else"
 
 
@@ -37,20 +37,20 @@ def stages(run: Callable[[], object], repeats: int) -> list[Figure]:
 
     Python's profiler slows stages with many small calls (flight, instruments) by up to a half.
     """
-    found = profiled(run, repeats, STAGES)
-    return [Figure(f"  of a case, profiled: {name}", values) for name, values in found.items()]
+    timings = profile_stages(run, repeats, STAGES)
+    return [Figure(f"  of a case, profiled: {name}", values) for name, values in timings.items()]
 
 
-def profiled(run: Callable[[], object], repeats: int, stages: Stages) -> dict[str, list[float]]:
+def profile_stages(run: Callable[[], object], repeats: int, stages: Stages) -> dict[str, list[float]]:
     """The same as `stages` for given stages, by name."""
     run()
-    found: dict[str, list[float]] = {name: [] for name in (*stages, REST)}
+    timings: dict[str, list[float]] = {name: [] for name in (*stages, REST)}
     for _ in range(repeats):
         profile = cProfile.Profile(time.process_time)
         profile.runcall(run)
         for name, seconds in _of_each_stage(profile, stages).items():
-            found[name].append(seconds)
-    return found
+            timings[name].append(seconds)
+    return timings
 
 
 def _of_each_stage(profile: cProfile.Profile, stages: Stages) -> dict[str, float]:

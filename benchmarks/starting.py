@@ -55,7 +55,7 @@ def _wall_s(*words: str, more: dict[str, str] | None = None, allowed: tuple[int,
     environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"} | (more or {})
     start = time.perf_counter()
     done = subprocess.run([sys.executable, "-m", "marsyard", *words], env=environment, capture_output=True, text=True)
-    taken = time.perf_counter() - start
+    elapsed_s = time.perf_counter() - start
     if done.returncode not in allowed:
         raise RuntimeError(f"marsyard {' '.join(words)} ended with {done.returncode}: {done.stderr}")
-    return taken
+    return elapsed_s

@@ -1,13 +1,13 @@
-"""The threshold of the IMU check, by Monte Carlo: how far right tracks may stray from the IMU (section II.B).
+"""Monte Carlo derivation of the threshold of the IMU check: discrepancy of correct tracks from the IMU (section II.B).
 
-The paper takes "a velocity threshold established through Monte Carlo simulation". Here that simulation is one of
-geometry: attitudes, altitudes and features are drawn, a feature is seen by the true cameras and placed on the ground by
-the measured ones, and the velocities that follow are compared as DIMES compares them. What pictures look like enters as
-an error of the match alone. Of the errors of altitude and attitude nothing is assumed to be shared between pictures
-but what is stated so: sharing makes right tracks agree better.
+The paper uses "a velocity threshold established through Monte Carlo simulation". This simulation is geometric:
+attitudes, altitudes and features are drawn. The true cameras project a feature, the measured cameras locate it on the
+ground, and the resulting velocities are compared as in DIMES. Image content enters only as an error of the match.
+Errors of altitude and attitude are independent between images unless stated as common; common errors would reduce the
+discrepancy.
 
-The threshold is the smallest multiple of `step_m_s` that keeps a stated share of the descents in which one right track
-is left in each pair, the least that DIMES can work with.
+The threshold is the smallest multiple of `step_m_s` that accepts a stated fraction of descents with one correct track
+in each pair, the minimum for DIMES.
 """
 
 from __future__ import annotations
@@ -29,37 +29,37 @@ from marsyard.sim.measurements import DetectorCalibration
 
 @dataclass(frozen=True)
 class ThresholdInputs:
-    """What the Monte Carlo draws from; standard deviations are of normal distributions.
+    """Distributions of the Monte Carlo simulation; standard deviations are of normal distributions.
 
     Attributes
     ----------
     descents
-        Descents with room for two templates in each pair.
+        Number of descents with feasible overlap for two templates in each pair.
     seed
-        Of the generator.
+        Seed of the generator.
     altitudes_m, interval_s
-        Heights of the three pictures and the time between them (paper, section III.C: near 2000, 1700 and 1400 m).
+        Altitudes of the three images and time between them (paper, section III.C: near 2000, 1700 and 1400 m).
     max_speed_m_s
         Horizontal velocities are uniform over the disc of this radius (paper: 30 m/s).
     max_cone_deg, max_nod_deg
-        Greatest tilt by coning (paper: 30 deg) and by nodding (60 deg/s at a period of 1.2 s: 11.5 deg); uniform up to
-        it in any direction, new in each picture. Rotation about the vertical is uniform.
+        Maximum tilt by coning (paper: 30 deg) and by nodding (60 deg/s at a period of 1.2 s: 11.5 deg). Tilts are
+        uniform up to the maximum in any direction, independent in each image. Rotation about the vertical is uniform.
     altitude_sd
-        Error of an altitude as a share of it, new in each picture (flight unit: 1 % is 3 sigma).
+        Relative error of an altitude, independent in each image (flight unit: 1 % is 3 sigma).
     common_attitude_sd_deg, attitude_sd_deg
-        Attitude error per axis common to the pictures (star reference and gyro drift through entry), and new in each.
+        Attitude error per axis: common to all images (star reference and gyro drift through entry), and independent.
     tag_sd_s, max_rate_deg_s
-        Error of a picture's time tag, and body rates up to which it turns into attitude (paper: 60 deg/s).
+        Error of an image's time tag, and maximum body rate, which turns it into an attitude error (paper: 60 deg/s).
     feature_height_sd_m
-        Height of features above or below the level that the altimeter measures: relief.
+        Height of features relative to the level that the altimeter measures (relief).
     match_sd_m_s
-        Error of a track's velocity per axis by the match itself (0.03 px with the flight camera's noise are 0.05 m/s).
+        Velocity error of a track per axis due to the match (0.03 px with the noise of the flight camera: 0.05 m/s).
     imu_sd_m_s
-        Error per axis of the IMU's change of velocity.
+        Error per axis of the velocity change of the IMU.
     kept
-        Share of descents with one right track in each pair that must pass the check.
+        Fraction of descents with one correct track in each pair that must pass the check.
     step_m_s
-        The threshold is a multiple of this.
+        Step of the threshold.
     """
 
     descents: int = 10_000
@@ -81,7 +81,7 @@ class ThresholdInputs:
     step_m_s: float = 0.1
 
 
-#: Errors of the velocities of right tracks in m/s, by pair and template, axes east and north.
+#: Velocity errors of correct tracks in m/s, by pair and template, axes east and north.
 TrackErrors = Float[np.ndarray, "descents 2 2 2"]
 
 _NOTHING = np.zeros((256, 256), dtype=np.float32)
@@ -89,7 +89,7 @@ _UNUSED = DetectorCalibration(_NOTHING, 1.0, 0.0, 0.0, 1, 0.0, 1)
 
 
 def descent_camera() -> CameraModel:
-    """The descent camera binned to 256 x 256, without distortion: it would change the errors by less than 1 %."""
+    """Descent camera binned to 256 x 256, without distortion, which would change the errors by less than 1 %."""
     return Cahv.from_focal_length(
         focal_m=14.67e-3,
         pixel_pitch_m=48e-6,
@@ -100,20 +100,20 @@ def descent_camera() -> CameraModel:
 
 
 def right_track_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> TrackErrors:
-    """Velocity errors of two right tracks in each pair of `inputs.descents` descents that have room for them."""
+    """Velocity errors of two correct tracks in each pair of `inputs.descents` descents with feasible overlap."""
     camera, options = descent_camera(), DimesOptions()
-    found: list[Float[np.ndarray, "2 2 2"]] = []
-    while len(found) < inputs.descents:
+    tracks: list[Float[np.ndarray, "2 2 2"]] = []
+    while len(tracks) < inputs.descents:
         errors = _descent_errors(inputs, camera, options, rng)
         if errors is not None:
-            found.append(errors)
-    return np.stack(found)
+            tracks.append(errors)
+    return np.stack(tracks)
 
 
 def _descent_errors(
     inputs: ThresholdInputs, camera: CameraModel, options: DimesOptions, rng: np.random.Generator
 ) -> Float[np.ndarray, "2 2 2"] | None:
-    """The errors of one descent; None where a pair has no room for two templates."""
+    """Errors of one descent; None if a pair has no feasible overlap for two templates."""
     true, measured = _views(inputs, camera, rng)
     velocity = inputs.max_speed_m_s * np.sqrt(rng.uniform()) * _direction(rng)
     sunless = np.array([0.0, 0.0, -1.0])
@@ -127,20 +127,20 @@ def _descent_errors(
             return None
         heights = inputs.feature_height_sd_m * rng.standard_normal(2)
         moved = velocity * inputs.interval_s
-        pixels = _seen_again(true[pair], true[pair + 1], places.pixels[chosen], heights, moved)
+        pixels = _project_again(true[pair], true[pair + 1], places.pixels[chosen], heights, moved)
         ground, _ = ground_from_pixels(second, pixels, options.max_off_nadir_rad)
         errors[pair] = (places.ground[chosen] - ground - moved) / inputs.interval_s
     return np.asarray(errors + inputs.match_sd_m_s * rng.standard_normal((2, 2, 2)))
 
 
-def _seen_again(
+def _project_again(
     first: View,
     second: View,
     pixels: Float[np.ndarray, "n 2"],
     heights_m: Float[np.ndarray, " n"],
     moved_m: Float[np.ndarray, "2"],
 ) -> Float[np.ndarray, "n 2"]:
-    """Where the true second camera sees the features, so many metres high, that the true first sees at `pixels`."""
+    """Project features at `pixels` of the first true camera, with these heights, into the second true camera."""
     origins, rays = first.camera.rays(pixels)
     features = origins + rays * ((heights_m - origins[:, 2]) / rays[:, 2])[:, None]
     features[:, :2] -= moved_m
@@ -148,7 +148,7 @@ def _seen_again(
 
 
 def _views(inputs: ThresholdInputs, camera: CameraModel, rng: np.random.Generator) -> tuple[list[View], list[View]]:
-    """The three true views of a descent and the three as measured."""
+    """Three true and three measured views of a descent."""
     common = np.radians(inputs.common_attitude_sd_deg) * rng.standard_normal(3)
     true, measured = [], []
     for number, altitude in enumerate(inputs.altitudes_m):
@@ -174,7 +174,7 @@ def _attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotation:
 
 def _view(camera: CameraModel, attitude: Rotation, altitude_m: float, time_s: float) -> View:
     centre = np.array([0.0, 0.0, altitude_m])
-    return View(_NOTHING, _NOTHING, camera.moved(rigid(attitude, centre)), centre, time_s, _UNUSED, 1)
+    return View(_NOTHING, _NOTHING, camera.transform(rigid(attitude, centre)), centre, time_s, _UNUSED, 1)
 
 
 def _direction(rng: np.random.Generator) -> Float[np.ndarray, "2"]:
@@ -184,14 +184,14 @@ def _direction(rng: np.random.Generator) -> Float[np.ndarray, "2"]:
 
 @dataclass(frozen=True)
 class Discrepancies:
-    """How far right combinations stray from the IMU, m/s.
+    """Discrepancies of correct combinations of tracks from the IMU, m/s.
 
     Attributes
     ----------
     single
-        With one right track in each pair, shape (descents,).
+        One correct track in each pair, shape (descents,).
     best
-        The best of the four combinations of two right tracks in each pair, shape (descents,).
+        Minimum of the four combinations of two correct tracks in each pair, shape (descents,).
     """
 
     single: Float[np.ndarray, " descents"]
@@ -199,29 +199,29 @@ class Discrepancies:
 
 
 def discrepancies(errors: TrackErrors, imu_sd_m_s: float, rng: np.random.Generator) -> Discrepancies:
-    """What DIMES' check would find on right tracks with these errors."""
+    """Compute the discrepancies in DIMES' check for correct tracks with these errors."""
     imu = imu_sd_m_s * rng.standard_normal((len(errors), 1, 1, 2))
     all_four = np.linalg.norm(errors[:, 1, None, :, :] - errors[:, 0, :, None, :] - imu, axis=-1)
     return Discrepancies(single=all_four[:, 0, 0], best=all_four.min(axis=(1, 2)))
 
 
 def threshold_m_s(single: Float[np.ndarray, " descents"], kept: float, step_m_s: float) -> float:
-    """The smallest multiple of the step below which the stated share of discrepancies lies."""
+    """Smallest multiple of the step that exceeds the stated fraction of discrepancies."""
     return round(step_m_s * float(np.ceil(np.quantile(single, kept) / step_m_s)), 9)
 
 
 @dataclass(frozen=True)
 class Harm:
-    """What the check makes of descents in which one track is wrong: shares of the descents.
+    """Outcomes of the check for descents with one wrong track, as fractions of the descents.
 
     Attributes
     ----------
     right
-        A velocity within the requirement is reported.
+        Reported velocity within the requirement.
     refused
-        None is.
+        No reported velocity.
     wrong
-        One beyond the requirement is.
+        Reported velocity beyond the requirement.
     """
 
     right: float
@@ -237,9 +237,9 @@ def harm(
     rng: np.random.Generator,
     required_m_s: float = 5.0,
 ) -> Harm:
-    """One of the tracks is wrong by between the two speeds of `wrong_by_m_s` (uniform), in any direction.
+    """Add an error to one random track, uniform between the speeds of `wrong_by_m_s`, in a random direction.
 
-    `errors` may have one template a pair: then the wrong track is all that its pair has.
+    With one template per pair in `errors`, the wrong track is the only track of its pair.
     """
     outcomes = np.zeros(3)
     for tracks in errors:

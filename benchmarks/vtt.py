@@ -22,7 +22,7 @@ from marsyard.sim.streams import Streams
 from tests.algorithms.vtt.synthetic_drive import Drive, Plane, Scene, navcam, pose, waves
 
 TARGET = np.array([10.0, 0.1, 0.2])
-#: Runs averaged into one measurement: a single one is near the clock's resolution on a busy machine.
+#: Runs averaged into one measurement, because one run is near the resolution of the clock.
 BATCH = 20
 
 
@@ -97,7 +97,7 @@ def searches(repeats: int) -> list[Figure]:
 
 
 def runs(repeats: int) -> list[Figure]:
-    """A closed loop from 10 m to 2 m in steps of 10 %: 17 stereo pairs of rendered subframes among rocks."""
+    """Closed loop from 10 m to 2 m in steps of 10 %, with 17 stereo pairs of rendered subframes among rocks."""
     of_run = {
         "camera": {"preset": "research-navcam"},
         "target": {"diameter_m": 0.9, "shape": 2, "yaw_deg": 74.0, "across": 0.1},
@@ -105,10 +105,10 @@ def runs(repeats: int) -> list[Figure]:
         "legs": [{"motion": "approach", "step_fraction": 0.1, "goal_m": 2.0}],
     }
     parameters = RoverScenarioParameters.model_validate(of_run)
-    taken = core_seconds(lambda: run_case(parameters, Streams(1, "benchmark", 0)), repeats)
-    return [Figure("a rover's run from 10 m to 2 m, rendered", taken, bar=1.5)]
+    elapsed_s = core_seconds(lambda: run_case(parameters, Streams(1, "benchmark", 0)), repeats)
+    return [Figure("a rover's run from 10 m to 2 m, rendered", elapsed_s, bar=1.5)]
 
 
 def figures(repeats: int) -> list[Figure]:
-    """All of target tracking."""
+    """All figures of target tracking."""
     return [*updates(repeats), *searches(repeats), *runs(min(repeats, 3))]

@@ -1,9 +1,9 @@
-"""Errors that a user can fix: each is printed as one message, without a traceback, and ends with status 2."""
+"""Outcomes of cases, and errors that a user can fix: one message without a traceback, exit status 2."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ class StoreError(CampaignError):
 
 
 @contextmanager
-def writing(what: object) -> Iterator[None]:
+def report_write_errors(what: object) -> Iterator[None]:
     """Raise StoreError that names `what` where the system refuses to write it inside the context."""
     try:
         yield
@@ -53,8 +53,44 @@ def near_match(word: str, allowed: Iterable[str]) -> str:
     return f" (did you mean '{matches[0]}'?)" if matches else ""
 
 
-def not_allowed(what: str, word: str, allowed: Iterable[str], listed_only: Iterable[str] | None = None) -> str:
+def unknown_name_message(what: str, word: str, allowed: Iterable[str], listed_only: Iterable[str] | None = None) -> str:
     """Message that a word is unknown, with a similar word and the allowed ones, or those of `listed_only`."""
     known = sorted(allowed)
     listed = ", ".join(known if listed_only is None else sorted(listed_only)) or "none"
     return f"unknown {what} '{word}'{near_match(word, known)}; allowed: {listed}"
+
+
+#: The case raised an exception, or its worker process died.
+CRASHED = "CRASHED"
+#: The case exceeded its time limit.
+TIMED_OUT = "TIMED_OUT"
+#: The case needed more memory than available, or than its limit.
+OUT_OF_MEMORY = "OUT_OF_MEMORY"
+#: The case exceeded its limit of standard output and error.
+TOO_MUCH_OUTPUT = "TOO_MUCH_OUTPUT"
+#: The algorithm's answer violated its interface.
+BAD_ANSWER = "BAD_ANSWER"
+#: All of them, by the names on the command line.
+_OUTCOMES = (CRASHED, TIMED_OUT, OUT_OF_MEMORY, TOO_MUCH_OUTPUT, BAD_ANSWER)
+RETRYABLE: Mapping[str, str] = {outcome.lower().replace("_", "-"): outcome for outcome in _OUTCOMES}
+#: Cases with these outcomes fail requirements on all cases, and cause exit status 1.
+UNFINISHED = frozenset(RETRYABLE.values())
+
+
+class CaseEndedError(Exception):
+    """A task that ended together with its process.
+
+    outcome: one of this module's.
+    reason: the same text each time that the task ends in this way.
+    trace: where the process stood in Python, and its last output, as far as known.
+    note: text that the task left through `worker_process.leave_note`.
+    """
+
+    def __init__(self, outcome: str, reason: str, trace: str, note: str = "") -> None:
+        super().__init__(reason)
+        self.outcome = outcome
+        self.trace = trace
+        self.note = note
+
+    def __reduce__(self) -> tuple[type[CaseEndedError], tuple[str, str, str, str]]:
+        return type(self), (self.outcome, str(self), self.trace, self.note)

@@ -16,11 +16,7 @@ project = "Marsyard"
 author = "the Marsyard developers"
 release = metadata.version("marsyard")
 
-extensions = [
-    "myst_parser",
-    "sphinx.ext.autodoc",
-    "sphinx.ext.napoleon",
-]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 exclude_patterns = ["examples", "images"]
 # attributes of one name in several classes, named in the text by that name alone
 suppress_warnings = ["ref.python"]

@@ -16,7 +16,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from marsyard.campaigns.definition.catalogue import catalogue
+from marsyard.campaigns.definition.loading import catalogue
 from marsyard.scenarios.measured.layout import COLUMNS, IngestFile
 from marsyard.scenarios.systems import scenario, scenario_names
 

@@ -17,8 +17,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from marsyard.campaigns.definition import catalogue as shipped
 from marsyard.campaigns.definition import loading
+from marsyard.campaigns.definition import loading as shipped
 from marsyard.campaigns.definition.campaign import Campaign as Campaign
 from marsyard.scenarios.interface import CaseResult as CaseResult
 from marsyard.sim.camera import CameraModel as CameraModel
@@ -114,10 +114,10 @@ def results(directory: str | Path) -> pd.DataFrame:
 def verdicts(directory: str | Path) -> Sequence[Verdict]:
     """Evaluate the requirements of a finished campaign."""
     from marsyard.campaigns.store.table import refresh_table
-    from marsyard.reports.evaluation import judged
+    from marsyard.reports.evaluation import evaluate_run
 
     refresh_table(Path(directory))
-    return judged(Path(directory)).verdicts
+    return evaluate_run(Path(directory)).verdicts
 
 
 def score(campaign: Campaign, rows: Sequence[CaseResult], metric: str) -> pd.Series[Any]:
@@ -141,7 +141,6 @@ def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True,
 
 
 def _toml(value: Any) -> str:
-    """Format a value in TOML's notation."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{json.dumps(str(key))} = {_toml(inner)}" for key, inner in value.items()) + " }"
     if isinstance(value, list | tuple):

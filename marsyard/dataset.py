@@ -43,11 +43,10 @@ def write_dataset(campaign: Campaign, folder: Path, cases_per_shard: int, jobs: 
     total = campaign.configuration.total_cases
     starts = range(0, total, cases_per_shard)
     paths = [folder / f"shard-{number:06d}.tar" for number in range(len(starts))]
-    missing = [
-        (path, range(start, min(start + cases_per_shard, total)))
-        for path, start in zip(paths, starts, strict=True)
-        if not path.exists()
-    ]
+    shards = {
+        path: range(start, min(start + cases_per_shard, total)) for path, start in zip(paths, starts, strict=True)
+    }
+    missing = [(path, cases) for path, cases in shards.items() if not path.exists()]
     if missing:
         from joblib import Parallel, delayed
 
@@ -87,7 +86,6 @@ def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int) -> N
 
 
 def _write_shard(campaign: Campaign, path: Path, cases: range) -> None:
-    """Write one shard under a temporary name, and rename it when it is complete."""
     part = path.with_suffix(".part")
     with tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as shard:
         for case in cases:
@@ -99,7 +97,6 @@ def _write_shard(campaign: Campaign, path: Path, cases: range) -> None:
 
 
 def _files(campaign: Campaign, case: int) -> Iterator[tuple[str, bytes]]:
-    """Yield names and contents of a case's files."""
     scenario = campaign.scenario
     assert isinstance(scenario, ProvidesSamples)  # noqa: S101  (checked by `write_dataset`)
     drawn = campaign.draws(case)
@@ -119,7 +116,6 @@ def _files(campaign: Campaign, case: int) -> Iterator[tuple[str, bytes]]:
 
 
 def _encode(values: np.ndarray[Any, Any]) -> bytes:
-    """Encode whole numbers as PNG, other numbers as NPY."""
     if not np.issubdtype(values.dtype, np.integer):
         buffer = io.BytesIO()
         np.save(buffer, values, allow_pickle=False)

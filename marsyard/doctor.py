@@ -201,7 +201,6 @@ for name in sys.argv[1:]:
 
 
 def _requirements() -> list[Requirement]:
-    """Return the requirements of the installed distribution without extras."""
     requirements = [Requirement(text) for text in importlib.metadata.requires("marsyard") or []]
     return [r for r in requirements if r.marker is None or r.marker.evaluate({"extra": ""})]
 
@@ -361,7 +360,6 @@ def _is_writable(folder: Path) -> bool:
 
 
 def _run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run this Python with arguments; a process that hangs is stopped and counts as failed."""
     command = [sys.executable, *arguments]
     try:
         return subprocess.run(command, capture_output=True, text=True, timeout=PROBE_LIMIT_S, check=False)  # noqa: S603
@@ -371,6 +369,5 @@ def _run_python(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def _failure_reason(ended: subprocess.CompletedProcess[str]) -> str:
-    """Return the last line that a failed process wrote, or its exit status."""
     lines = [line.strip() for line in ended.stderr.splitlines() if line.strip()]
     return lines[-1] if lines else f"the process ended with status {ended.returncode}"

@@ -15,19 +15,17 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from marsyard.reports import common_sections, sections
-from marsyard.reports.cases import shown_cases
-from marsyard.reports.columns import label, numbers, primary_metric
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
-from marsyard.reports.evaluation import Judged, OverallVerdict, judged
-from marsyard.reports.presentation import presentations
-from marsyard.reports.sampling_design import sampled
+from marsyard.reports.evaluation import Judged, OverallVerdict, evaluate_run
+from marsyard.reports.presentation import presentations, shown_cases
+from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
-from marsyard.reports.traceability import algorithms_of, evidence_of, junit_xml, verification_csv
+from marsyard.reports.traceability import judged_algorithms, junit_xml, requirement_evidence, verification_csv
 from marsyard.reports.verdicts import Verdict
-from marsyard.reports.wording import count, number
+from marsyard.reports.wording import count, label, number, numbers, primary_metric
 
 #: Sections of every campaign, in the page's order; `conditions_section` ends the page.
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (
@@ -56,22 +54,22 @@ def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     requirements: in place of the campaign's own
     Raises StoreError if the folder holds no rows, OSError if the report cannot be written.
     """
-    return write_evaluation(judged(directory, requirements))
+    return write_evaluation(evaluate_run(directory, requirements))
 
 
-def write_evaluation(found: Judged) -> Path:
+def write_evaluation(evaluation: Judged) -> Path:
     """Write the report of an evaluated campaign into its folder."""
-    run, how, verdicts, whole = found.run, found.how, found.verdicts, found.whole
+    run, how, verdicts, whole = evaluation.run, evaluation.how, evaluation.verdicts, evaluation.whole
     directory = run.directory
-    drawn = replace(run, frame=how.drawn(run.frame), whole=how.drawn(run.whole))
+    drawn = replace(run, frame=how.draw(run.frame), whole=how.draw(run.whole))
     metric = primary_metric(drawn.frame, run.requirements)
     bound = next((v.bound for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
     subject = Subject(drawn, metric, bound)
     further = [section for make in section_makers() if (section := make(subject)) is not None]
-    twin = summary(found, subject, further)
-    algorithms = algorithms_of(run.record)
+    twin = summary(evaluation, subject, further)
+    algorithms = judged_algorithms(run.record)
     write_whole(directory / TWIN_FILE, json.dumps(twin, indent=2, allow_nan=False) + "\n")
-    write_whole(directory / VERIFICATION_FILE, verification_csv(evidence_of(run.name, verdicts, algorithms)))
+    write_whole(directory / VERIFICATION_FILE, verification_csv(requirement_evidence(run.name, verdicts, algorithms)))
     write_whole(directory / JUNIT_FILE, junit_xml(run.name, verdicts, whole, algorithms))
     page = directory / PAGE_FILE
     context = page_context(run, subject, verdicts, whole, further)
@@ -111,7 +109,7 @@ def page_context(
         "provenance": sections.provenance(run),
         "versions": sections.versions(run),
         "configuration": json.dumps(run.configuration or run.record, indent=2, ensure_ascii=False, default=str),
-        "algorithms": algorithms_of(run.record),
+        "algorithms": judged_algorithms(run.record),
         "rerun": sections.rerun_commands(run),
         "rerun_is_stored": run.command is not None,
         "replay": sections.replay_command(run, "CASE"),
@@ -126,7 +124,7 @@ def page_context(
     if np.isfinite(numbers(drawn.frame, metric)).any():
         data, script = sections.explorer_data(drawn, metric, bound, pictured), sections.script()
         hashed = sections.script_hash(script)
-        context["explorer"] = {"data": data, "json": sections.embedded(data), "script": script, "hash": hashed}
+        context["explorer"] = {"data": data, "json": sections.embed_json(data), "script": script, "hash": hashed}
     return context | {
         "error_plates": sections.error_plates(drawn.frame, drawn.whole, metric, bound),
         "driver_plates": sections.driver_plates(drawn.frame, metric, bound),
@@ -138,7 +136,7 @@ def page_context(
 
 def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
     """Warnings about the sampling: designs without probabilities, very many cases, a nominal case."""
-    how = sampled(run.configuration)
+    how = read_sampling_design(run.configuration)
     texts = []
     if not how.independent:
         texts.append(
@@ -171,7 +169,7 @@ def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict
         "crashed": whole.crashed,
         "sites": _kinds(run.frame, "site"),
         "algorithms": _kinds(run.frame, "algorithm"),
-        "algorithm_details": [asdict(one) for one in algorithms_of(run.record)],
+        "algorithm_details": [asdict(one) for one in judged_algorithms(run.record)],
         "sampling": {**asdict(how), "independent": how.independent, "text": how.text},
         "verdict": whole.word,
         "sentence": whole.sentence,
@@ -188,7 +186,6 @@ def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict
 
 
 def _kinds(frame: pd.DataFrame, column: str) -> list[str]:
-    """Distinct values of a column, at most `_MAX_KINDS`."""
     if column not in frame:
         return []
     return [str(value) for value in frame[column].dropna().unique()[:_MAX_KINDS]]
@@ -206,7 +203,6 @@ def page_environment() -> Environment:
 
 
 def _plain(value: Any) -> Any:
-    """A value as JSON, NaN and infinities as null."""
     if isinstance(value, Mapping):
         return {str(name): _plain(inner) for name, inner in value.items()}
     if isinstance(value, list | tuple):

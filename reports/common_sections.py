@@ -15,20 +15,44 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from scipy import stats
 
 from marsyard.reports import rates
-from marsyard.reports.columns import axis_columns, driver_columns, label, magnitude_label, numbers, split_unit
 from marsyard.reports.comparison import compared_names, select_algorithm
 from marsyard.reports.figures import ELLIPSE
 from marsyard.reports.kinds import OutcomesBySize, Rows, SectionDeclaration
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.sampling_design import sampled
-from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
+from marsyard.reports.sampling_design import read_sampling_design
+from marsyard.reports.section import (
+    REQUIREMENT,
+    SERIES,
+    Block,
+    Grid,
+    Section,
+    Subject,
+    build_grid,
+    in_page_style,
+    new_axes,
+    plate,
+)
 from marsyard.reports.statistics.changes import holm
 from marsyard.reports.statistics.drivers import Driver, driver
 from marsyard.reports.statistics.proportions import proportion_interval
 from marsyard.reports.statistics.samples import circular_error, error_ellipse, mean_interval, quantile_bounds
-from marsyard.reports.svg import REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.verdicts import judge_campaign
-from marsyard.reports.wording import NOTHING, coefficient, interval, note_text, number, p_text, percent, stated
+from marsyard.reports.wording import (
+    NOTHING,
+    axis_columns,
+    coefficient,
+    driver_columns,
+    format_fraction,
+    interval,
+    label,
+    magnitude_label,
+    note_text,
+    number,
+    numbers,
+    p_text,
+    percent,
+    split_unit,
+)
 
 #: Column of true and false: whether the geometry leaves a feasible overlap for the algorithm.
 ROOM = "feasible_overlap"
@@ -39,13 +63,13 @@ def answers_section(subject: Subject) -> Section | None:
     shares = answer_shares(subject)
     if not shares:
         return None
-    grid = grid_of(
+    grid = build_grid(
         shares.items(),
         {
             "": lambda pair: pair[0],
             "Cases": lambda pair: f"{pair[1].hits:,} of {pair[1].n:,}",
             "Share": lambda pair: percent(pair[1].share),
-            f"{stated(CONFIDENCE)} interval": lambda pair: rates.range_text(pair[1].lower, pair[1].upper),
+            f"{format_fraction(CONFIDENCE)} interval": lambda pair: rates.range_text(pair[1].lower, pair[1].upper),
             "Allowing for shared terrains": lambda pair: (
                 NOTHING if pair[1].shared_lower is None else rates.interval_text(pair[1], shared=True)
             ),
@@ -62,15 +86,15 @@ def answer_shares(subject: Subject) -> Mapping[str, rates.Share]:
     if not rates.is_flag(frame, "answered") or frame.empty:
         return {}
     answered = rates.members(frame, "valid")
-    shares = {"answered, of all cases": rates.share_of(answered, frame)}
+    shares = {"answered, of all cases": rates.fraction_of(answered, frame)}
     if rates.is_flag(frame, ROOM):
         room, completed = rates.members(frame, ROOM), rates.members(frame, "completed")
-        shares["answered, of cases with feasible overlap"] = rates.share_of(answered[room], frame[room])
-        shares["no feasible overlap, of completed cases"] = rates.share_of(~room[completed], frame[completed])
+        shares["answered, of cases with feasible overlap"] = rates.fraction_of(answered[room], frame[room])
+        shares["no feasible overlap, of completed cases"] = rates.fraction_of(~room[completed], frame[completed])
     if subject.metric is not None and subject.bound is not None:
-        wrong = ~rates.succeeded(frame[answered], subject.metric, subject.bound)
+        wrong = ~rates.success_mask(frame[answered], subject.metric, subject.bound)
         name = f"wrong by more than {subject.bound:g} {split_unit(subject.metric)[1]}, of answers"
-        shares[name] = rates.share_of(wrong, frame[answered])
+        shares[name] = rates.fraction_of(wrong, frame[answered])
     return shares
 
 
@@ -95,12 +119,13 @@ def scatter_section(subject: Subject) -> Section | None:
     unit = split_unit(metric)[1]
     x, y = (number(value) for value in ellipse.centre)
     text = (
-        f"{stated(ELLIPSE)} ellipse, for normal errors: centre {x}, {y} {unit}, half axes {number(ellipse.semi_major)} "
-        f"and {number(ellipse.semi_minor)} {unit}, major axis at {number(ellipse.angle_deg)} deg from "
-        f"{label(parts[0])} towards {label(parts[1])}. {percent(ellipse.inside)} of these errors lie inside."
+        f"{format_fraction(ELLIPSE)} ellipse, for normal errors: centre {x}, {y} {unit}, half axes "
+        f"{number(ellipse.semi_major)} and {number(ellipse.semi_minor)} {unit}, major axis at "
+        f"{number(ellipse.angle_deg)} deg from {label(parts[0])} towards {label(parts[1])}. "
+        f"{percent(ellipse.inside)} of these errors lie inside."
     )
-    rows = [[stated(one.probability), number(one.estimate), interval(one.lower, one.upper)] for one in circles]
-    grid = Grid(["Fraction of errors", f"Radius ({unit})", f"Bounds, {stated(CONFIDENCE)} each"], rows)
+    rows = [[format_fraction(one.probability), number(one.estimate), interval(one.lower, one.upper)] for one in circles]
+    grid = Grid(["Fraction of errors", f"Radius ({unit})", f"Bounds, {format_fraction(CONFIDENCE)} each"], rows)
     note = note_text("common.scatter")
     data = {"ellipse": asdict(ellipse), "circles": [asdict(one) for one in circles]}
     return Section("scatter", "Scatter", "Scatter of the errors", [Block(text=text, grid=grid, note=note)], data)
@@ -118,24 +143,24 @@ def drivers_section(subject: Subject) -> Section | None:
     frame = subject.frame.head(MAX_CASES)
     responses = {"the size of errors": np.abs(numbers(frame, metric))}
     if subject.bound is not None:
-        responses["failures"] = (~rates.succeeded(frame, metric, subject.bound)).astype(np.float64)
+        responses["failures"] = (~rates.success_mask(frame, metric, subject.bound)).astype(np.float64)
     ranked = {name: ranked_drivers(frame, metric, response) for name, response in responses.items()}
-    known = {name: found for name, found in ranked.items() if found}
+    known = {name: strongest for name, strongest in ranked.items() if strongest}
     if not known:
         return None
-    note = note_text("common.drivers", confidence=stated(CONFIDENCE))
+    note = note_text("common.drivers", confidence=format_fraction(CONFIDENCE))
     head = ["Condition", "Cases", "Rank correlation", "Interval", "Share", "Interval", "p"]
     blocks = []
-    for name, found in known.items():
+    for name, strongest in known.items():
         rows = []
-        for column, one, p in found:
+        for column, one, p in strongest:
             ranks = [coefficient(one.correlation), f"{coefficient(one.lower)} to {coefficient(one.upper)}"]
             share = [percent(one.share), rates.range_text(one.share_lower, one.share_upper)]
             rows.append([label(column), f"{one.n:,}", *ranks, *share, p_text(p)])
         blocks.append(Block(heading=f"Drivers of {name}", grid=Grid(head, rows)))
     data = {
-        name: [{"condition": column, **asdict(one), "corrected_p": p} for column, one, p in found]
-        for name, found in known.items()
+        name: [{"condition": column, **asdict(one), "corrected_p": p} for column, one, p in strongest]
+        for name, strongest in known.items()
     }
     return Section("explained", "Explained", "Drivers of errors and failures", [*blocks, Block(note=note)], data)
 
@@ -146,14 +171,14 @@ Ranked = Sequence[tuple[str, Driver, float]]
 def ranked_drivers(frame: pd.DataFrame, metric: str, response: Float[np.ndarray, " n"]) -> Ranked:
     """Conditions with the explained variance of a response and corrected p, in falling order."""
     groups = rates.terrain_groups(frame)
-    found: Mapping[str, Driver] = {
+    drivers: Mapping[str, Driver] = {
         column: one
         for column in driver_columns(frame, metric, MAX_CONDITIONS)
         if (one := driver(numbers(frame, column), response, groups, CONFIDENCE)) is not None
     }
-    p_values = dict(zip(found, holm([one.p_value for one in found.values()]), strict=True))
-    order = sorted(found, key=lambda column: (-found[column].share, column))
-    return [(column, found[column], p_values[column]) for column in order]
+    p_values = dict(zip(drivers, holm([one.p_value for one in drivers.values()]), strict=True))
+    order = sorted(drivers, key=lambda column: (-drivers[column].share, column))
+    return [(column, drivers[column], p_values[column]) for column in order]
 
 
 #: Up to this ratio of the axis' ends it has ticks within its decades.
@@ -201,7 +226,7 @@ def sizes(cases: int) -> list[int]:
 
 def requirement_curves(subject: Subject) -> list[tuple[str, float, list[Point]]]:
     """Name, rate asked and success rates of the first cases of each requirement that can be judged."""
-    how = sampled(subject.run.configuration)
+    how = read_sampling_design(subject.run.configuration)
     frame, requirements = subject.whole, subject.run.requirements
     judged = [(size, judge_campaign(frame.head(size), requirements, how)) for size in sizes(len(frame))]
     curves = []
@@ -243,11 +268,11 @@ def curve_figure(points: Sequence[Point], name: str, asked: float | None) -> Fig
     """An estimate and its bounds against the number of cases."""
     figure, axes = new_axes(4.2, 2.8)
     cases, estimates, lower, upper = np.array([(one.cases, one.estimate, one.lower, one.upper) for one in points]).T
-    known = np.concatenate([estimates, lower, upper, [math.nan if asked is None else asked]])
-    known = known[np.isfinite(known)]
-    if known.size:
-        margin = 0.06 * float(np.ptp(known)) or 0.06
-        bottom, top = float(known.min()) - margin, float(known.max()) + margin
+    finite = np.concatenate([estimates, lower, upper, [math.nan if asked is None else asked]])
+    finite = finite[np.isfinite(finite)]
+    if finite.size:
+        margin = 0.06 * float(np.ptp(finite)) or 0.06
+        bottom, top = float(finite.min()) - margin, float(finite.max()) + margin
         axes.set_ylim(bottom, top)
         axes.fill_between(
             cases, np.where(np.isfinite(lower), lower, bottom), np.where(np.isfinite(upper), upper, top),
@@ -291,28 +316,28 @@ def consistencies(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
     judged = str(frame["algorithm"].iloc[0]) if "algorithm" in frame and len(frame) else "judged"
     frames = {judged: frame, **{name: select_algorithm(frame, name) for name in compared_names(frame)}}
     by_name = {name: numbers(own, NEES) for name, own in frames.items() if NEES in own}
-    known = {name: nees[np.isfinite(nees)] for name, nees in by_name.items()}
-    return {name: consistency(nees) for name, nees in known.items() if nees.size}
+    finite = {name: nees[np.isfinite(nees)] for name, nees in by_name.items()}
+    return {name: consistency(nees) for name, nees in finite.items() if nees.size}
 
 
 def consistency_section(subject: Subject) -> Section | None:
     """Consistency of stated covariances with errors; None if no algorithm states any."""
-    found = consistencies(subject.frame)
-    if not found:
+    results = consistencies(subject.frame)
+    if not results:
         return None
     rows = []
-    for name, one in found.items():
+    for name, one in results.items():
         inside = f"{percent(one['inside'])} ({rates.range_text(one['inside_lower'], one['inside_upper'])})"
         band = f"{number(one['lower'])} to {number(one['upper'])}"
         rows.append([name, f"{one['n']:,}", number(one["mean"]), band, inside, one["word"]])
     head = ["Algorithm", "Estimates", "Mean NEES", "95 % band", "Within 95 % ellipse", "Covariances are"]
     blocks = [Block(grid=Grid(head, rows), note=note_text("common.consistency", parts=PARTS))]
-    return Section("consistency", "Consistency", "Stated covariances against errors", blocks, found)
+    return Section("consistency", "Consistency", "Stated covariances against errors", blocks, results)
 
 
 def _fault_outcomes(rows: Rows, subject: Subject) -> dict[str, Bool[np.ndarray, " n"]]:
     answered = rates.members(rows, "valid")
-    within = rates.succeeded(rows, str(subject.metric), math.nan if subject.bound is None else subject.bound)
+    within = rates.success_mask(rows, str(subject.metric), math.nan if subject.bound is None else subject.bound)
     return {"valid": answered & within, "invalid": ~answered, "wrong": answered & ~within}
 
 
@@ -340,6 +365,9 @@ def faults_section(subject: Subject) -> Section | None:
     if subject.metric is None or subject.bound is None or not rates.is_flag(subject.frame, "answered"):
         return None
     note = note_text(
-        "common.faults", bound=f"{subject.bound:g}", unit=split_unit(subject.metric)[1], confidence=stated(CONFIDENCE)
+        "common.faults",
+        bound=f"{subject.bound:g}",
+        unit=split_unit(subject.metric)[1],
+        confidence=format_fraction(CONFIDENCE),
     )
     return SectionDeclaration("faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), note=note)(subject)

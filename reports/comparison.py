@@ -19,13 +19,23 @@ import pandas as pd
 from jaxtyping import Float
 
 from marsyard.reports import rates
-from marsyard.reports.columns import label, numbers, primary_metric, split_unit
-from marsyard.reports.rates import CONFIDENCE, succeeded
-from marsyard.reports.sampling_design import sampled
-from marsyard.reports.section import Block, Grid, Section, Subject, grid_of
+from marsyard.reports.rates import CONFIDENCE, success_mask
+from marsyard.reports.sampling_design import read_sampling_design
+from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
 from marsyard.reports.statistics.changes import Sample, compare_errors, compare_successes, difference_p, holm
 from marsyard.reports.stored import StoredRun, table
-from marsyard.reports.wording import NOTHING, note_text, number, p_text, percent, stated
+from marsyard.reports.wording import (
+    NOTHING,
+    format_fraction,
+    label,
+    note_text,
+    number,
+    numbers,
+    p_text,
+    percent,
+    primary_metric,
+    split_unit,
+)
 
 
 @dataclass(frozen=True)
@@ -78,25 +88,25 @@ def select_algorithm(frame: pd.DataFrame, name: str) -> pd.DataFrame:
     """The rows with a compared algorithm in place of the judged one."""
     prefix = f"{name}."
     own = {str(column): str(column).removeprefix(prefix) for column in frame.columns if str(column).startswith(prefix)}
-    kept = frame.drop(columns=[column for column in own.values() if column in frame])
-    return kept.rename(columns=own)
+    renamed = frame.drop(columns=[column for column in own.values() if column in frame])
+    return renamed.rename(columns=own)
 
 
 def contender(frame: pd.DataFrame, name: str, metric: str | None, bound: float | None) -> Contender:
     """Results of the judged algorithm in the rows."""
     magnitude = np.abs(numbers(frame, metric)) if metric is not None else np.full(len(frame), np.nan)
-    known = magnitude[np.isfinite(magnitude)]
+    finite = magnitude[np.isfinite(magnitude)]
     within = None
     if metric is not None and bound is not None:
-        within = int(succeeded(frame, metric, bound).sum()) if metric in frame else 0
+        within = int(success_mask(frame, metric, bound).sum()) if metric in frame else 0
     return Contender(
         name=name,
         cases=len(frame),
         answered=int(frame["answered"].eq(True).sum()),
         failed=int(frame["outcome"].isin(rates.ENGINE_FAILURES).sum()),
         succeeded=within,
-        median=float(np.median(known)) if known.size else math.nan,
-        p95=float(np.quantile(known, 0.95)) if known.size else math.nan,
+        median=float(np.median(finite)) if finite.size else math.nan,
+        p95=float(np.quantile(finite, 0.95)) if finite.size else math.nan,
     )
 
 
@@ -127,11 +137,11 @@ def comparison(
     contenders += [contender(own, name, metric, bound) for name, own in others.items()]
     if metric is None:
         return contenders, []
-    found = [difference(frame, own, name, metric, bound) for name, own in others.items() if metric in own]
-    of_success, of_errors = (holm([getattr(one, key) for one in found]) for key in ("success_p", "error_p"))
+    differences = [difference(frame, own, name, metric, bound) for name, own in others.items() if metric in own]
+    of_success, of_errors = (holm([getattr(one, key) for one in differences]) for key in ("success_p", "error_p"))
     return contenders, [
         replace(one, success_p=success, error_p=error)
-        for one, success, error in zip(found, of_success, of_errors, strict=True)
+        for one, success, error in zip(differences, of_success, of_errors, strict=True)
     ]
 
 
@@ -142,7 +152,7 @@ def comparison_section(subject: Subject) -> Section | None:
         return None
     grids = comparison_grids(contenders, differences, subject.metric)
     judged = contenders[0].name
-    note = note_text("common.comparison", judged=judged, confidence=stated(CONFIDENCE))
+    note = note_text("common.comparison", judged=judged, confidence=format_fraction(CONFIDENCE))
     blocks = [Block(grid=grids[0])]
     if differences:
         blocks.append(Block(heading=f"Against {judged}", grid=grids[1], note=note))
@@ -159,7 +169,7 @@ def comparison_grids(
 ) -> tuple[Grid, Grid]:
     """Tables of results and of differences."""
     unit = f" ({split_unit(metric)[1]})" if metric is not None and split_unit(metric)[1] else ""
-    first = grid_of(
+    first = build_grid(
         contenders,
         {
             "Algorithm": lambda one: one.name,
@@ -200,12 +210,12 @@ class Figure:
     @property
     def text(self) -> str:
         """The rate with its cases, or median and 95 % quantile."""
-        known = self.known
-        if known.size == 0:
+        values = self.known
+        if values.size == 0:
             return NOTHING
         if self.larger_is_better:
-            return f"{percent(self.level)} of {known.size:,}"
-        return f"{number(self.level)}, 95 % {number(float(np.quantile(known, 0.95)))}"
+            return f"{percent(self.level)} of {values.size:,}"
+        return f"{number(self.level)}, 95 % {number(float(np.quantile(values, 0.95)))}"
 
     @property
     def known(self) -> Float[np.ndarray, " known"]:
@@ -215,10 +225,10 @@ class Figure:
     @property
     def level(self) -> float:
         """The rate, or the median; NaN for no cases."""
-        known = self.known
-        if known.size == 0:
+        values = self.known
+        if values.size == 0:
             return math.nan
-        return float(known.mean() if self.larger_is_better else np.median(known))
+        return float(values.mean() if self.larger_is_better else np.median(values))
 
 
 @dataclass(frozen=True)
@@ -231,10 +241,10 @@ class Contrast:
     p_value: float
 
 
-def figures_of(run: StoredRun) -> tuple[pd.DataFrame, list[Figure]]:
+def list_figures(run: StoredRun) -> tuple[pd.DataFrame, list[Figure]]:
     """The drawn cases of a campaign, and its figures: success by requirement, answers, completion, and magnitudes."""
-    frame = sampled(run.configuration).drawn(run.frame)
-    found: dict[str, Figure] = {}
+    frame = read_sampling_design(run.configuration).draw(run.frame)
+    figures: dict[str, Figure] = {}
     metrics = dict.fromkeys([primary_metric(frame, run.requirements)])
     for asked in run.requirements:
         name, metric, bound = str(asked.get("id", "?")), str(asked.get("metric", "")), asked.get("bound")
@@ -246,22 +256,22 @@ def figures_of(run: StoredRun) -> tuple[pd.DataFrame, list[Figure]]:
         except ValueError:
             continue
         limit, scale = (float(x) if isinstance(x, int | float) else math.nan for x in (bound, asked.get("scale", 1)))
-        success = succeeded(frame, metric, limit, scale)
-        found[name] = Figure(name, True, np.where(chosen, success.astype(np.float64), np.nan))
+        success = success_mask(frame, metric, limit, scale)
+        figures[name] = Figure(name, True, np.where(chosen, success.astype(np.float64), np.nan))
         if is_bounded:
             metrics[metric] = None
     for measured in filter(None, metrics):
         magnitude = np.abs(numbers(frame, measured))
-        found[measured] = Figure(label(measured), False, np.where(np.isfinite(magnitude), magnitude, np.nan))
+        figures[measured] = Figure(label(measured), False, np.where(np.isfinite(magnitude), magnitude, np.nan))
     if rates.is_flag(frame, "answered"):
-        found["answered"] = Figure("answered", True, rates.members(frame, "valid").astype(np.float64))
-    found["came to an end"] = Figure("came to an end", True, rates.members(frame, "completed").astype(np.float64))
-    return frame, list(found.values())
+        figures["answered"] = Figure("answered", True, rates.members(frame, "valid").astype(np.float64))
+    figures["came to an end"] = Figure("came to an end", True, rates.members(frame, "completed").astype(np.float64))
+    return frame, list(figures.values())
 
 
 def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[Contrast]]:
     """Whether the campaigns' cases are pairs, and the contrasts of the figures that both have."""
-    frames, of_each = zip(*(figures_of(run) for run in (first, second)), strict=True)
+    frames, of_each = zip(*(list_figures(run) for run in (first, second)), strict=True)
     paired = same_draws(first, second)
     theirs = {figure.name: figure for figure in of_each[1]}
     both = [(figure, theirs[figure.name]) for figure in of_each[0] if figure.name in theirs]
@@ -310,7 +320,7 @@ def campaign_diff_data(found: Sequence[Contrast]) -> list[dict[str, Any]]:
     ]
 
 
-def sample_of(frame: pd.DataFrame, figure: Figure) -> Sample:
+def build_sample(frame: pd.DataFrame, figure: Figure) -> Sample:
     """A figure with the stored terrain number of each case, which is comparable between campaigns."""
     groups = rates.terrain_groups(frame)
     if groups is None:
@@ -322,7 +332,7 @@ def sample_of(frame: pd.DataFrame, figure: Figure) -> Sample:
 
 
 def _unpaired_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Figure, *, common: bool) -> float:
-    here, there = sample_of(first, mine), sample_of(second, other)
+    here, there = build_sample(first, mine), build_sample(second, other)
     if not common:  # equal numbers are other terrains, so renumber them
         if not here.terrains.size or not there.terrains.size:
             return math.nan

@@ -13,11 +13,20 @@ from jaxtyping import Bool
 from scipy import stats
 
 from marsyard.reports import rates
-from marsyard.reports.columns import axis_columns, label, numbers, split_unit
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.wording import note_text, number, percent, plain_value, stated
+from marsyard.reports.wording import (
+    axis_columns,
+    format_fraction,
+    label,
+    note_text,
+    number,
+    numbers,
+    percent,
+    plain_value,
+    split_unit,
+)
 
 #: Prefixes of the condition columns in the order of the page; the first column of each prefix counts.
 CONDITIONS = (
@@ -49,7 +58,7 @@ def conditions_section(subject: Subject) -> Section | None:
             texts = [label(one["part"]), f"{one['terrains']:,}", *deviations, percent(one["share"])]
             rows.append([*texts, number(one["p_value"])])
         blocks.append(Block(heading="By terrain", grid=Grid(head, rows), note=_SPREAD_NOTE))
-    note = note_text("common.conditions", confidence=stated(CONFIDENCE), quantile=stated(QUANTILE))
+    note = note_text("common.conditions", confidence=format_fraction(CONFIDENCE), quantile=format_fraction(QUANTILE))
     data: dict[str, Any] = {
         column: [one | {"answered": asdict(one["answered"])} for one in bins] for column, bins in tables.items()
     }
@@ -70,9 +79,9 @@ def cuts(frame: pd.DataFrame) -> Iterator[tuple[str, list[tuple[str, Bool[np.nda
                 yield column, list(zip(map(plain_value, values), chosen, strict=True))
             elif kinds > 2 and pd.api.types.is_numeric_dtype(frame[column].dtype):
                 measured = numbers(frame, column)
-                known = measured[np.isfinite(measured)]
-                bins = int(np.clip(known.size // CASES_PER_BIN, 2, MAX_BINS))
-                edges = np.unique(np.quantile(known, np.linspace(0.0, 1.0, bins + 1)))
+                finite = measured[np.isfinite(measured)]
+                bins = int(np.clip(finite.size // CASES_PER_BIN, 2, MAX_BINS))
+                edges = np.unique(np.quantile(finite, np.linspace(0.0, 1.0, bins + 1)))
                 positions = np.where(np.isfinite(measured), np.digitize(measured, edges[1:-1]), -1)
                 names = [f"{number(low)} to {number(high)}" for low, high in pairwise(edges.tolist())]
                 yield column, [(name, positions == k) for k, name in enumerate(names)]
@@ -89,11 +98,11 @@ def terrain_spread(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
     """
     groups = rates.terrain_groups(frame)
     values = numbers(frame, part)
-    known = np.isfinite(values) & rates.members(frame, "valid")
-    if groups is None or not known.any():
+    finite = np.isfinite(values) & rates.members(frame, "valid")
+    if groups is None or not finite.any():
         return None
-    _, index = np.unique(groups[known], return_inverse=True)
-    errors, sizes = values[known], np.bincount(index).astype(np.float64)
+    _, index = np.unique(groups[finite], return_inverse=True)
+    errors, sizes = values[finite], np.bincount(index).astype(np.float64)
     n, k = errors.size, sizes.size
     if k < 2 or n == k:
         return None
@@ -123,7 +132,7 @@ def _bin(chosen: pd.DataFrame, metric: str, name: str) -> dict[str, Any]:
     parts = [part[np.isfinite(part)] for part in parts]
     return {
         "name": name,
-        "answered": rates.share_of(answered, chosen),
+        "answered": rates.fraction_of(answered, chosen),
         "means": [float(part.mean()) if part.size else float("nan") for part in parts],
         "sds": [float(part.std(ddof=1)) if part.size > 1 else float("nan") for part in parts],
         "quantile_bound": quantile_bounds(magnitude, QUANTILE, CONFIDENCE, shared)[1],
@@ -137,7 +146,7 @@ def _grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]]) -
     unit = split_unit(metric)[1]
     head = ["", "Cases", "Answered", "Interval"]
     head += [f"{what}{axis} ({unit})" for axis in axes for what in ("Mean", "SD")]
-    head += [f"{stated(QUANTILE)} bound", "Largest"]
+    head += [f"{format_fraction(QUANTILE)} bound", "Largest"]
     rows = []
     for one in bins:
         of_parts = [number(value) for pair in zip(one["means"], one["sds"], strict=True) for value in pair]

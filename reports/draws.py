@@ -17,9 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from marsyard.reports.columns import rank_correlation, split_unit
-from marsyard.reports.svg import GRID, INK, LARGEST_VECTOR_SAMPLE, MUTED, RASTER_DPI, SERIES, in_page_style
-from marsyard.reports.wording import count
+from marsyard.reports.section import GRID, INK, LARGEST_VECTOR_SAMPLE, MUTED, RASTER_DPI, SERIES, in_page_style
+from marsyard.reports.wording import count, rank_correlation, split_unit
 
 #: Size of a marginal, height of a heading, margin of the figure, inches; minimum number of marginals in a row.
 _WIDTH, _HEIGHT, _HEAD, _MARGIN, _MIN_IN_ROW = 3.0, 1.9, 0.45, 0.15, 4
@@ -85,22 +84,21 @@ def draws_figure(title: str, drawn: Sequence[Drawn]) -> Figure:
     for place, one in enumerate(drawn):
         row, column = divmod(place, in_row)
         box = (_MARGIN + column * width / in_row + 0.3, lower + (rows - 1 - row) * _HEIGHT + 0.45)
-        _marginal(_placed(figure, box, (width / in_row - 0.55, _HEIGHT - 0.85)), one)
+        _marginal(_add_axes(figure, box, (width / in_row - 0.55, _HEIGHT - 0.85)), one)
     if side:
         _heading(figure, lower, "Pairs: below, one against the other; above, Spearman's rank correlation")
         left = _MARGIN + 0.5 * (width - side)
-        _pairs(_placed(figure, (left, 0.5 * _MARGIN), (side, side)), varying)
+        _pairs(_add_axes(figure, (left, 0.5 * _MARGIN), (side, side)), varying)
     return figure
 
 
-def _placed(figure: Figure, corner: tuple[float, float], size: tuple[float, float]) -> Axes:
+def _add_axes(figure: Figure, corner: tuple[float, float], size: tuple[float, float]) -> Axes:
     """Axes at a position in inches, which is much faster than a layout engine for many panels."""
     width, height = figure.get_size_inches()
     return figure.add_axes((corner[0] / width, corner[1] / height, size[0] / width, size[1] / height))
 
 
 def _heading(figure: Figure, top: float, text: str) -> None:
-    """Write a heading with its upper edge at a height in inches."""
     width, height = figure.get_size_inches()
     figure.text(_MARGIN / width, (top - 0.1) / height, text, fontsize=12, fontweight="bold", color=INK, va="top")
 
@@ -111,7 +109,6 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 
 def _marginal(axes: Axes, drawn: Drawn) -> None:
-    """Draw the frequencies of values with their expectation."""
     kinds, values = drawn.kinds, drawn.numbers(drawn.values)
     expected = None if drawn.expected is None else drawn.numbers(drawn.expected)
     known = values if expected is None else np.concatenate([values, expected])
@@ -152,12 +149,12 @@ def _pairs(axes: Axes, drawn: Sequence[Drawn]) -> None:
     for place, one in enumerate(drawn):
         axes.text(place + 0.5, place + 0.5, one.short_name.replace("_", "\n"), fontsize=8, **_CENTRED)
     for row, column in below:
-        found = rank_correlation(numbers[row], numbers[column])
-        if math.isnan(found):
+        correlation = rank_correlation(numbers[row], numbers[column])
+        if math.isnan(correlation):
             continue
         # bold: beyond 3.3 / sqrt(n - 1), which is unlikely by chance
-        beyond = abs(found) > 3.3 / math.sqrt(max(numbers[0].size - 1, 1))
-        text = f"{found + 0.0:+.2f}".replace("-", "−") if abs(found) >= 0.005 else "0.00"
+        beyond = abs(correlation) > 3.3 / math.sqrt(max(numbers[0].size - 1, 1))
+        text = f"{correlation + 0.0:+.2f}".replace("-", "−") if abs(correlation) >= 0.005 else "0.00"
         style = _CENTRED | {"fontweight": "bold" if beyond else "normal", "color": SERIES[1] if beyond else MUTED}
         axes.text(row + 0.5, column + 0.5, text, fontsize=8, **style)
     axes.set(xlim=(0, size), ylim=(size, 0))

@@ -10,10 +10,14 @@ from typing import Any
 import pandas as pd
 
 from marsyard.reports.rates import engine_failed
-from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, sampled
-from marsyard.reports.statistics.clusters import ClusterMethod
-from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
-from marsyard.reports.statistics.sequential import confidence_at, planned_looks
+from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design
+from marsyard.reports.statistics.proportions import (
+    ClusterMethod,
+    confidence_at,
+    planned_looks,
+    proportion_lower,
+    proportion_upper,
+)
 from marsyard.reports.stored import StoredRun, read_run
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict, judge_campaign
 from marsyard.reports.wording import count
@@ -97,10 +101,10 @@ class Judged:
         return exit_code(self.verdicts, bool(self.whole.crashed))
 
 
-def judged(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Judged:
+def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Judged:
     """Judge a campaign by its own or the given requirements; raises StoreError if the folder holds no rows."""
     run = read_run(directory, requirements)
-    how = sampled(run.configuration)
+    how = read_sampling_design(run.configuration)
     verdicts = judge_campaign(run.whole, run.requirements, how)
     return Judged(run, how, verdicts, overall(verdicts, run.whole, how))
 

@@ -1,10 +1,10 @@
-"""Figures of a campaign's rows: scatter and distribution of errors, errors against conditions, outcomes."""
+"""Figures of a campaign's rows: scatter and distribution of errors, errors and rates against conditions, outcomes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,25 +13,24 @@ from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogFormatter, MaxNLocator, PercentFormatter
 
-from marsyard.reports.columns import axis_columns, category_column, label, magnitude_label, numbers, split_unit
-from marsyard.reports.rates import ENGINE_FAILURES
+from marsyard.reports import section
+from marsyard.reports.rates import ENGINE_FAILURES, PooledRate, Share
+from marsyard.reports.section import BARS, INK, MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.statistics.samples import error_ellipse
-from marsyard.reports.svg import (
-    BARS,
-    INK,
-    LARGEST_VECTOR_SAMPLE,
-    MARKERS,
-    MUTED,
-    REQUIREMENT,
-    SERIES,
-    in_page_style,
-    new_axes,
-)
 from marsyard.reports.tables import answered_outcomes, outcome_counts
+from marsyard.reports.wording import (
+    axis_columns,
+    category_column,
+    format_fraction,
+    label,
+    magnitude_label,
+    numbers,
+    plain_value,
+    split_unit,
+)
 from marsyard.reports.wording import count as counted
-from marsyard.reports.wording import plain_value, stated
 
 #: Probability of the ellipse about the errors.
 ELLIPSE = 0.95
@@ -80,37 +79,37 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
     if len(parts) < 2:
         return None
     points = np.column_stack([numbers(frame, part) for part in parts])
-    known = np.isfinite(points).all(axis=1)
-    if not known.any():
+    finite = np.isfinite(points).all(axis=1)
+    if not finite.any():
         return None
     ellipse = error_ellipse(points, ELLIPSE)
-    reach = 1.08 * float(np.abs(points[known]).max()) or 1.0
+    limit = 1.08 * float(np.abs(points[finite]).max()) or 1.0
     if not close and bound is not None and bound > 0.0:
-        near = 1.05 * axis_edge(np.abs(points[known]).max(axis=1), bound)
-        reach = min(reach, near) if reach > 1.15 * bound else 1.15 * bound
+        inner_limit = 1.05 * axis_edge(np.abs(points[finite]).max(axis=1), bound)
+        limit = min(limit, inner_limit) if limit > 1.15 * bound else 1.15 * bound
     if close and ellipse is not None:
-        reach = max(reach, ellipse.reach)
+        limit = max(limit, ellipse.reach)
     figure, axes = new_axes(5.0, 4.9)
-    inside = (np.abs(points) <= reach).all(axis=1)
+    inside = (np.abs(points) <= limit).all(axis=1)
     for kind in categories(frame, metric, bound):
-        x, y = points[kind.chosen & known & inside].T
+        x, y = points[kind.chosen & finite & inside].T
         _draw_points(axes, x, y, kind)
-        x, y = np.clip(points[kind.chosen & known & ~inside], -reach, reach).T
+        x, y = np.clip(points[kind.chosen & finite & ~inside], -limit, limit).T
         _draw_points(axes, x, y, kind, hollow=True)
-    if (known & ~inside).any():
-        axes.plot([], [], "o", markerfacecolor="none", color=INK, label=f"{(known & ~inside).sum():,} beyond the axes")
+    if (finite & ~inside).any():
+        axes.plot([], [], "o", markerfacecolor="none", color=INK, label=f"{(finite & ~inside).sum():,} beyond the axes")
     if bound is not None:
         axes.add_patch(Circle((0, 0), bound, fill=False, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3))
-        if bound <= reach * math.sqrt(2.0):  # else the circle lies outside the axes
+        if bound <= limit * math.sqrt(2.0):  # else the circle lies outside the axes
             axes.plot([], [], "--", color=REQUIREMENT, label=f"requirement {bound:g} {split_unit(metric)[1]}")
     if ellipse is not None:
         outline: dict[str, Any] = {"fill": False, "color": INK, "linewidth": 1.4, "linestyle": ":", "zorder": 3}
         size = (2.0 * ellipse.semi_major, 2.0 * ellipse.semi_minor)
         axes.add_patch(Ellipse(ellipse.centre, *size, angle=ellipse.angle_deg, **outline))
-        axes.plot([], [], ":", color=INK, label=f"{stated(ELLIPSE)} ellipse")
+        axes.plot([], [], ":", color=INK, label=f"{format_fraction(ELLIPSE)} ellipse")
     axes.axhline(0.0, color=MUTED, linewidth=0.8, zorder=1)
     axes.axvline(0.0, color=MUTED, linewidth=0.8, zorder=1)
-    axes.set(xlim=(-reach * 1.04, reach * 1.04), ylim=(-reach * 1.04, reach * 1.04), aspect="equal")
+    axes.set(xlim=(-limit * 1.04, limit * 1.04), ylim=(-limit * 1.04, limit * 1.04), aspect="equal")
     axes.set(xlabel=label(parts[0]), ylabel=label(parts[1]))
     axes.legend(bbox_to_anchor=(0.5, -0.14), **_BELOW)
     return figure
@@ -134,8 +133,8 @@ def axis_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float
 def needs_enlarged_figure(frame: pd.DataFrame, metric: str, bound: float | None) -> bool:
     """Whether all errors are so small against the bound that a figure of their own extent is needed."""
     magnitude = np.abs(numbers(frame, metric))
-    known = magnitude[np.isfinite(magnitude)]
-    return bound is not None and known.size > 0 and 0.0 < float(known.max()) < 0.6 * bound
+    finite = magnitude[np.isfinite(magnitude)]
+    return bound is not None and finite.size > 0 and 0.0 < float(finite.max()) < 0.6 * bound
 
 
 @in_page_style
@@ -198,24 +197,24 @@ def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: 
     Cases without an error are ticks on the upper edge, errors beyond the axis hollow marks below it.
     """
     x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
-    known = np.isfinite(x) & np.isfinite(magnitude)
+    finite = np.isfinite(x) & np.isfinite(magnitude)
     silent = np.isfinite(x) & ~np.isfinite(magnitude)
-    if not (known | silent).any():
+    if not (finite | silent).any():
         return None
     figure, axes = new_axes(4.2, 3.2)
-    edge = _scatter_edge(magnitude[known], bound)
+    edge = _scatter_edge(magnitude[finite], bound)
     top = 1.12 * edge
     kinds = categories(frame, metric, bound)
     for kind in kinds:
-        inside, beyond = (kind.chosen & known & which for which in (magnitude <= edge, magnitude > edge))
+        inside, beyond = (kind.chosen & finite & which for which in (magnitude <= edge, magnitude > edge))
         _draw_points(axes, x[inside], magnitude[inside], kind)
         _draw_points(axes, x[beyond], np.full(beyond.sum(), 1.06 * edge), kind, hollow=True)
     if len(kinds) > 1 and not axis_columns(metric, [str(name) for name in frame.columns]):
         # otherwise the scatter figure has the legend
         axes.legend(bbox_to_anchor=(0.5, -0.18), **_BELOW)
-    bins = min(int(known.sum()) // _CASES_PER_POINT, _MAX_POINTS)
+    bins = min(int(finite.sum()) // _CASES_PER_POINT, _MAX_POINTS)
     if bins >= _MIN_POINTS:  # median (solid) and 95 % quantile (dotted) of bins of equally many cases
-        of_x, limited = x[known], np.minimum(magnitude[known], 1.06 * edge)
+        of_x, limited = x[finite], np.minimum(magnitude[finite], 1.06 * edge)
         parts = np.array_split(np.argsort(of_x, kind="stable"), bins)
         middles = [float(np.median(of_x[part])) for part in parts]
         for quantile, line in ((0.5, "-"), (0.95, ":")):
@@ -223,7 +222,7 @@ def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: 
             axes.plot(middles, values, line, color=INK, zorder=4)
     if bound is not None and bound <= top:
         axes.axhline(bound, color=REQUIREMENT, linewidth=1.4, linestyle="--", zorder=3)
-    raster = bool(silent.sum() > LARGEST_VECTOR_SAMPLE)
+    raster = bool(silent.sum() > section.LARGEST_VECTOR_SAMPLE)
     axes.plot(x[silent], np.full(silent.sum(), top), "|", color=INK, markersize=9, clip_on=False, rasterized=raster)
     axes.set(xlabel=label(driver), ylabel=magnitude_label(metric), ylim=(0.0, top))
     axes.xaxis.set_major_locator(MaxNLocator(5))
@@ -241,8 +240,8 @@ def _scatter_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> f
 def count_beyond_axis(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> int:
     """Number of hollow marks of `error_scatter_against`."""
     x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
-    known = magnitude[np.isfinite(x) & np.isfinite(magnitude)]
-    return int((known > _scatter_edge(known, bound)).sum())
+    finite = magnitude[np.isfinite(x) & np.isfinite(magnitude)]
+    return int((finite > _scatter_edge(finite, bound)).sum())
 
 
 @in_page_style
@@ -271,17 +270,15 @@ def _annotate(axes: Axes, text: str, at: tuple[Any, Any], shift: tuple[int, int]
 
 
 def _magnitudes(frame: pd.DataFrame, metric: str, bound: float | None) -> tuple[Float[np.ndarray, " known"], float]:
-    """Known magnitudes of the errors, and the end of their axis."""
     magnitude = np.abs(numbers(frame, metric))
-    known = magnitude[np.isfinite(magnitude)]
-    return known, axis_edge(known, bound)
+    finite = magnitude[np.isfinite(magnitude)]
+    return finite, axis_edge(finite, bound)
 
 
 def _draw_points(
     axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], kind: Category, *, hollow: bool = False
 ) -> None:
-    """Draw points of a kind, hollow at the edge of the axes."""
-    many = x.size > LARGEST_VECTOR_SAMPLE
+    many = x.size > section.LARGEST_VECTOR_SAMPLE
     axes.plot(
         x, y, linestyle="", marker=kind.marker, markersize=3.0 if many else 5.5, alpha=0.55 if many else 0.85,
         markeredgewidth=1.0 if hollow else 0.0, markerfacecolor="none" if hollow else kind.colour, color=kind.colour,
@@ -299,3 +296,131 @@ def _bound_line(axes: Axes, metric: str, bound: float | None, height: float) -> 
     text, side = f"requirement {bound:g} {split_unit(metric)[1]}", "right" if left else "left"
     shift = (-5 if left else 5, 0)
     _annotate(axes, text, (bound, height), shift, xycoords=("data", "axes fraction"), ha=side, va="top")
+
+
+Values = Float[np.ndarray, " n"]
+_LINES = ("-", "--", ":", "-.")
+_BELOW_AXES: Mapping[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.17), "ncols": 2}
+
+
+@in_page_style
+def cumulative_figure(
+    curves: Mapping[str, Values],
+    labels: tuple[str, str],
+    *,
+    falling: bool = False,
+    bound: float | None = None,
+    limits: Mapping[str, Sequence[float]] | None = None,
+) -> Figure:
+    """Fraction of cases up to each value, or beyond it if `falling`; curves without values are left out.
+
+    labels: of the x and the y axis
+    bound: a requirement; the x axis ends near it, and values beyond are counted
+    limits: further vertical lines by name
+    """
+    figure, axes = new_axes(6.4, 3.4)
+    every = np.concatenate([*curves.values()])
+    edge = None if bound is None else max(1.25 * bound, axis_edge(every, bound))
+    for (name, values), colour, line in zip(curves.items(), SERIES, _LINES * 2, strict=False):
+        if values.size:
+            x, share = np.concatenate([[0.0], np.sort(values)]), np.arange(values.size + 1) / values.size
+            if edge is not None:
+                x, share = np.append(x, max(edge, x[-1])), np.append(share, 1.0)
+            y = 1.0 - share if falling else share
+            axes.plot(x, y, drawstyle="steps-post", color=colour, linestyle=line, label=name)
+    for name, places in (limits or {}).items():
+        for number, place in enumerate(places):
+            label = name if number == 0 else None
+            axes.axvline(place, color=REQUIREMENT, linewidth=0.9, linestyle="-.", label=label)
+    axes.set(xlabel=labels[0], ylabel=labels[1], ylim=(0.0, 1.03))
+    axes.set_xlim(left=0.0)
+    if bound is None or edge is None:
+        axes.legend(loc="upper right" if falling else "lower right")
+        return figure
+    axes.axvline(bound, color=REQUIREMENT, linewidth=1.5, linestyle="--")
+    axes.set_xlim(0.0, 1.02 * edge)
+    note_beyond(axes, int((every > edge).sum()))
+    axes.legend(**_BELOW_AXES)
+    return figure
+
+
+@dataclass(frozen=True)
+class RateLine:
+    """Rates at values of a condition, and a paper's rates by value."""
+
+    name: str
+    x: Sequence[float]
+    rates: Sequence[Share | PooledRate]
+    paper: Mapping[float, float] = field(default_factory=dict)
+
+
+def draw_rates(axes: Axes, lines: Sequence[RateLine], linestyle: str = "-") -> None:
+    """Draw rates with their intervals; rates of a paper are open marks."""
+    for place, line in enumerate(lines):
+        style: dict[str, Any] = {"color": SERIES[place % len(SERIES)], "marker": MARKERS[place % len(MARKERS)]}
+        shares = np.array([one.share for one in line.rates])
+        bounds = np.array([[one.lower, one.upper] for one in line.rates]).reshape(-1, 2)
+        spread = np.abs(np.nan_to_num(bounds - shares[:, None])).T
+        bars: dict[str, Any] = {"capsize": 2.5, "elinewidth": 0.9, "markersize": 5.0, "linestyle": linestyle}
+        axes.errorbar(line.x, shares, spread, label=line.name or None, **bars, **style)
+        if line.paper:
+            name = f"{line.name}, paper" if len(lines) > 1 else "paper"
+            hollow: dict[str, Any] = {"markersize": 10, "markerfacecolor": "none", "markeredgewidth": 1.5}
+            axes.plot([*line.paper], [*line.paper.values()], label=name, linestyle="", **hollow, **style)
+    axes.set_ylim(-0.03, 1.05)
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+
+
+@in_page_style
+def rate_figure(lines: Sequence[RateLine], labels: tuple[str, str], limit: tuple[str, float] | None = None) -> Figure:
+    """Rates against a condition; `limit` is the name and position of a vertical line."""
+    figure, axes = new_axes(6.4, 3.7)
+    draw_rates(axes, lines)
+    if limit is not None:
+        axes.axvline(limit[1], color=REQUIREMENT, linestyle="--", linewidth=1.2, label=limit[0])
+    axes.set(xlabel=labels[0], ylabel=labels[1])
+    axes.legend(**_BELOW_AXES)
+    return figure
+
+
+@in_page_style
+def stacked_bars(names: Sequence[str], shares: Mapping[str, tuple[str, Sequence[float]]], xlabel: str) -> Figure:
+    """A bar of percentages for each name; `shares` has a style of `BARS` and the percentages by outcome."""
+    figure, axes = new_axes(7.4, 1.0 + 0.27 * len(names))
+    places, left = np.arange(len(names)), np.zeros(len(names))
+    for name, (style, values) in shares.items():
+        axes.barh(places, values, left=left, height=0.7, label=name, **BARS[style])
+        left = left + np.asarray(values)
+    axes.set_yticks(places, list(names))
+    axes.set(xlabel=xlabel, xlim=(0.0, 100.0))
+    axes.invert_yaxis()
+    axes.grid(visible=False, axis="y")
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(shares))
+    return figure
+
+
+#: The x and y of points, or of the medians of their bins.
+Points = tuple[Sequence[float] | Values, Sequence[float] | Values]
+
+
+@in_page_style
+def scatter_panels(panels: Mapping[tuple[str, str], tuple[Points, Points]], *, logarithmic: bool = False) -> Figure:
+    """Panels of cases and of medians of their bins by x and y labels: a row for each y, a column for each x."""
+    columns, rows = (list(dict.fromkeys(pair[k] for pair in panels)) for k in (0, 1))
+    size = (5.0, 3.4) if len(panels) == 1 else (11.0, 0.4 + 2.0 * len(rows))
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(len(rows), len(columns), squeeze=False, sharex="col", sharey="row")
+    for (x, y), (points, medians) in panels.items():
+        axes = grid[rows.index(y), columns.index(x)]
+        axes.plot(*points, ".", color=SERIES[5], markersize=3, rasterized=True)
+        axes.plot(*medians, "o-", color=SERIES[0], markersize=4.5)
+        if logarithmic:
+            axes.set_yscale("log")
+            # the page's style does not typeset powers of ten
+            axes.yaxis.set_major_formatter(LogFormatter())
+            axes.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
+        if y == rows[-1]:
+            axes.set_xlabel(x, fontsize=8)
+        if x == columns[0]:
+            axes.set_ylabel(y, fontsize=8)
+    return figure

@@ -16,7 +16,7 @@ import numpy as np
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.reports.statistics.changes import Sample, difference_p, holm
-from marsyard.reports.wording import count, number, percent, stated
+from marsyard.reports.wording import count, format_fraction, number, percent
 
 #: Version of the tables, as `PRAGMA user_version`.
 SCHEMA = 1
@@ -145,7 +145,7 @@ class History:
             (night, campaign),
         )
         return [
-            NightFigure(name, bool(rate), float("nan") if level is None else level, _unpacked(values, terrains))
+            NightFigure(name, bool(rate), float("nan") if level is None else level, _unpack(values, terrains))
             for name, rate, level, values, terrains in rows
         ]
 
@@ -163,7 +163,7 @@ class History:
             """,
             (night, campaign.name, figure, campaign.definition, FINISHED, night, WINDOW),
         )
-        return [_unpacked(*row) for row in rows]
+        return [_unpack(*row) for row in rows]
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
@@ -185,7 +185,7 @@ def utc_now() -> str:
     return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-def _unpacked(values: bytes, terrains: bytes) -> Sample:
+def _unpack(values: bytes, terrains: bytes) -> Sample:
     return Sample(np.frombuffer(values, "<f4").astype(np.float64), np.frombuffer(terrains, "<i8").astype(np.int64))
 
 
@@ -248,8 +248,8 @@ def changes(comparisons: Sequence[Comparison]) -> list[Change]:
             campaign=one.campaign,
             figure=one.figure.figure,
             rate=one.figure.rate,
-            before=level_of(before, one.figure.rate),
-            now=level_of(one.figure.sample, one.figure.rate),
+            before=quality_level(before, one.figure.rate),
+            now=quality_level(one.figure.sample, one.figure.rate),
             p_value=p,
             nights=len(one.before),
         )
@@ -267,7 +267,7 @@ def compare_night(history: History, night: int) -> list[Comparison]:
     ]
 
 
-def level_of(sample: Sample, rate: bool) -> float:
+def quality_level(sample: Sample, rate: bool) -> float:
     """The rate or the median; NaN for no cases."""
     known = sample.known().values
     if known.size == 0:
@@ -307,13 +307,12 @@ def night_text(
             lines.append(f"- **{_cell(one.campaign)}: {_cell(one.figure)}**: {figures} (p = {one.p_value:.1g})")
     text = (
         f"{count(compared, 'figure')} compared with the nights before; the chance of any false alarm is at most "
-        f"{stated(FALSE_ALARMS)}.{'' if found else ' None has changed.'}"
+        f"{format_fraction(FALSE_ALARMS)}.{'' if found else ' None has changed.'}"
     )
     lines += ["", text if compared else "No figure has a history to be compared with yet.", ""]
     return "\n".join(lines)
 
 
 def _cell(text: str) -> str:
-    """A text escaped for a table of Markdown."""
     marks = {letter: f"&#{ord(letter)};" for letter in "&<>|"} | {letter: f"\\{letter}" for letter in "\\`*_[]#"}
     return "".join(marks.get(letter, letter) for letter in " ".join(text.split()))

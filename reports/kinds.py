@@ -15,27 +15,13 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
-from marsyard.reports.charts import RateLine, cumulative_figure, rate_figure, scatter_panels, stacked_bars
-from marsyard.reports.columns import label, numbers
-from marsyard.reports.rates import (
-    CONFIDENCE,
-    PooledRate,
-    Share,
-    by_size,
-    flag,
-    interval_text,
-    known,
-    pooled_rate,
-    rate_text,
-    share_of,
-    share_text,
-    terrain_groups,
-    varies,
-)
+from marsyard.reports import rates
+from marsyard.reports.figures import RateLine, cumulative_figure, rate_figure, scatter_panels, stacked_bars
+from marsyard.reports.rates import CONFIDENCE, PooledRate, Share, known, varies
 from marsyard.reports.section import Block, Grid, Section, Subject, plate
 from marsyard.reports.statistics.drivers import MIN_CASES, driver
 from marsyard.reports.tables import error_summaries, statistics_grid
-from marsyard.reports.wording import NOTHING, coefficient, number, percent, stated
+from marsyard.reports.wording import NOTHING, coefficient, format_fraction, label, number, numbers, percent
 
 Rows = pd.DataFrame
 Drawn = tuple[Sequence[Block], Mapping[str, Any]]
@@ -117,20 +103,20 @@ class Quantity:
         return np.asarray(self.scale * numbers(frame, self.column))
 
 
-def flagged(name: str, *among: str, wanted: bool = True) -> RateOf:
+def flag_rate(name: str, *among: str, wanted: bool = True) -> RateOf:
     """Fraction of rows whose flag is as wanted, among the rows with all of the other flags."""
 
     def rate(frame: Rows) -> Share:
         every = np.ones(len(frame), dtype=np.bool_)
-        chosen = frame[np.logical_and.reduce([every, *(flag(frame, one) for one in among)])]
-        return share_of(flag(chosen, name) == wanted, chosen)
+        chosen = frame[np.logical_and.reduce([every, *(rates.flag(frame, one) for one in among)])]
+        return rates.fraction_of(rates.flag(chosen, name) == wanted, chosen)
 
     return rate
 
 
-def pooled(hits: str, of: str) -> RateOf:
+def pooled_fraction(hits: str, of: str) -> RateOf:
     """Fraction of one column of counts in another, pooled over the rows."""
-    return lambda frame: pooled_rate(frame, hits, of)
+    return lambda frame: rates.pooled_rate(frame, hits, of)
 
 
 @dataclass(frozen=True)
@@ -160,15 +146,15 @@ class RateTable:
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
         """The rates that have cases."""
-        rates = self.rates(frame) if callable(self.rates) else {one.name: one.of(frame) for one in self.rates}
+        rates_by_name = self.rates(frame) if callable(self.rates) else {one.name: one.of(frame) for one in self.rates}
         rows = [
-            [name, share_text(one), interval_text(one, shared=self.shared)]
-            for name, one in rates.items()
+            [name, rates.fraction_text(one), rates.interval_text(one, shared=self.shared)]
+            for name, one in rates_by_name.items()
             if isinstance(one, Share) and one.n
         ]
-        grid = Grid(["", self.cases, f"{stated(CONFIDENCE)} interval"], rows)
+        grid = Grid(["", self.cases, f"{format_fraction(CONFIDENCE)} interval"], rows)
         blocks = [Block(heading=self.heading, grid=grid, note=self.note)] if rows else []
-        return blocks, {self.data: {name: asdict(one) for name, one in rates.items()}}
+        return blocks, {self.data: {name: asdict(one) for name, one in rates_by_name.items()}}
 
 
 @dataclass(frozen=True)
@@ -198,20 +184,22 @@ class RateByCondition:
         values = self.by.values(frame)
         records = []
         for chosen in condition_bins(values, _MAX_VALUES):
-            rates = {one.key: one.of(frame[chosen]) for one in self.rates}
-            records.append((float(np.median(values[chosen])), int(chosen.sum()), rates))
+            of_bin = {one.key: one.of(frame[chosen]) for one in self.rates}
+            records.append((float(np.median(values[chosen])), int(chosen.sum()), of_bin))
         limit = None if self.limit is None else (self.limit[0], self.limit[1](subject))
         x = [value for value, _, _ in records]
         lines = [RateLine(one.name.lower(), x, [r[one.key] for _, _, r in records]) for one in self.rates if one.drawn]
         figure = rate_figure(lines, (self.by.title, self.ylabel), limit)
         rows = []
-        for value, n, rates in records:
-            texts = [share_text(one) if isinstance(one, Share) else rate_text(one) for one in rates.values()]
+        for value, n, of_bin in records:
+            texts = [
+                rates.fraction_text(one) if isinstance(one, Share) else rates.rate_text(one) for one in of_bin.values()
+            ]
             rows.append([f"{value:.4g}", f"{n:,}", *texts])
         grid = Grid([self.by.title, self.cases, *(one.name for one in self.rates)], rows)
         data: dict[str, Any] = {
             self.data: [
-                {self.by.column: x, "n": n, **{k: asdict(r) for k, r in rates.items()}} for x, n, rates in records
+                {self.by.column: x, "n": n, **{k: asdict(r) for k, r in of_bin.items()}} for x, n, of_bin in records
             ]
         }
         if limit is not None:
@@ -237,7 +225,7 @@ class OutcomesBySize:
     """Outcomes of cases by a kind and its size (a fault and its severity): a table and stacked bars.
 
     outcomes: masks of the rows by key of `report.json`, in the order of the bars; the last has an interval
-    styles: name for readers and style of `marsyard.reports.svg.BARS` by outcome
+    styles: name for readers and style of `marsyard.reports.section.BARS` by outcome
     cases: heading of the rows
     wording: kind and size in words; no size is empty
     further: further columns: heading, key of `report.json`, value of the rows, and its text
@@ -257,9 +245,9 @@ class OutcomesBySize:
     def records(self, frame: Rows, subject: Subject) -> list[dict[str, Any]]:
         """Counts of each kind and size, cases without a fault first."""
         records = []
-        for kind, size, chosen in by_size(frame, self.kind, self.size, self.none):
+        for kind, size, chosen in rates.by_size(frame, self.kind, self.size, self.none):
             ended = self.outcomes(chosen, subject)
-            worst = share_of(ended[[*self.styles][-1]], chosen)
+            worst = rates.fraction_of(ended[[*self.styles][-1]], chosen)
             counts = {name: int(mask.sum()) for name, mask in ended.items()}
             values = {name: value(chosen) for _, name, value, _ in self.further}
             key = f"{[*self.styles][-1]}_share"
@@ -281,7 +269,7 @@ class OutcomesBySize:
             [
                 *(name, size or NOTHING, f"{one['n']:,}"),
                 *(f"{one[kind]:,} ({percent(one[kind] / one['n'])})" for kind in self.styles),
-                interval_text(one[f"{worst}_share"]),
+                rates.interval_text(one[f"{worst}_share"]),
                 *(text(one[name]) for _, name, _, text in self.further),
             ]
             for one, (name, size) in zip(records, words, strict=True)
@@ -300,7 +288,7 @@ class OutcomesBySize:
 
 @dataclass(frozen=True)
 class Distribution:
-    """Cumulative curves of quantities, or of values by name; see `marsyard.reports.charts.cumulative_figure`."""
+    """Cumulative curves of quantities, or of values by name; see `marsyard.reports.figures.cumulative_figure`."""
 
     curves: Sequence[Quantity] | Callable[[Rows], Mapping[str, Float[np.ndarray, " n"]]]
     labels: tuple[str, str]
@@ -359,19 +347,6 @@ class Quantiles:
 
 
 @dataclass(frozen=True)
-class Effect:
-    """Effect of a condition on a response: Spearman's correlation with its interval, and medians in bins."""
-
-    driver: str
-    error: str
-    rank_correlation: float
-    lower: float
-    upper: float
-    centres: Sequence[float]
-    medians: Sequence[float]
-
-
-@dataclass(frozen=True)
 class Scatter:
     """Responses against conditions that vary: points, medians of bins, and rank correlations."""
 
@@ -381,17 +356,22 @@ class Scatter:
     heading: str = ""
     logarithmic: bool = False
 
-    def effects(self, frame: Rows) -> list[Effect]:
-        """Effects of every condition that varies on every response."""
-        effects, groups = [], terrain_groups(frame)
+    def effects(self, frame: Rows) -> list[dict[str, Any]]:
+        """Effects of every condition that varies on every response.
+
+        Keys: `driver`, `error`, Spearman's `rank_correlation` with its interval, `centres` and `medians` of the bins.
+        """
+        effects, groups = [], rates.terrain_groups(frame)
         for one in (one for one in self.x if varies(frame, one.column)):
             for response in self.y:
                 x, y = one.values(frame), response.values(frame)
                 bins = condition_bins(np.where(np.isfinite(y), x, np.nan))
-                medians = [[float(np.median(values[chosen])) for chosen in bins] for values in (x, y)]
+                centres, medians = ([float(np.median(values[chosen])) for chosen in bins] for values in (x, y))
                 ranks = driver(x, y, groups, CONFIDENCE)
                 of_ranks = (math.nan,) * 3 if ranks is None else (ranks.correlation, ranks.lower, ranks.upper)
-                effects.append(Effect(one.title, response.title, *of_ranks, *medians))
+                effect: dict[str, Any] = {"driver": one.title, "error": response.title}
+                effect |= zip(("rank_correlation", "lower", "upper"), of_ranks, strict=True)
+                effects.append(effect | {"centres": centres, "medians": medians})
         return effects
 
     def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
@@ -401,23 +381,26 @@ class Scatter:
             return [], {}
         columns = {one.title: one.values(frame) for one in (*self.x, *self.y)}
         panels = {
-            (one.driver, one.error): ((columns[one.driver], columns[one.error]), (one.centres, one.medians))
+            (one["driver"], one["error"]): (
+                (columns[one["driver"]], columns[one["error"]]),
+                (one["centres"], one["medians"]),
+            )
             for one in effects
         }
         texts: dict[str, list[str]] = {}
         for one in effects:
-            texts.setdefault(one.driver, []).append(correlation_text(one))
+            texts.setdefault(one["driver"], []).append(correlation_text(one))
         head = ["Rank correlation", *(one.title for one in self.y)]
         grid = Grid(head, [[name, *cells] for name, cells in texts.items()])
         figure = scatter_panels(panels, logarithmic=self.logarithmic)
-        note = f"Intervals at {stated(CONFIDENCE)} confidence; a dash for fewer than {MIN_CASES} cases or constants."
+        note = (
+            f"Intervals at {format_fraction(CONFIDENCE)} confidence; a dash below {MIN_CASES} cases or for constants."
+        )
         plates = [plate(figure, key, self.caption, wide=len(effects) > 1)]
-        data = {"effects": [asdict(one) for one in effects]}
-        return [Block(heading=self.heading, plates=plates, grid=grid, note=note)], data
+        return [Block(heading=self.heading, plates=plates, grid=grid, note=note)], {"effects": effects}
 
 
-def correlation_text(effect: Effect) -> str:
+def correlation_text(effect: Mapping[str, Any]) -> str:
     """A rank correlation with its interval; a dash for NaN."""
-    if math.isnan(effect.rank_correlation):
-        return NOTHING
-    return f"{coefficient(effect.rank_correlation)} ({coefficient(effect.lower)} to {coefficient(effect.upper)})"
+    value, lower, upper = (coefficient(effect[key]) for key in ("rank_correlation", "lower", "upper"))
+    return NOTHING if math.isnan(effect["rank_correlation"]) else f"{value} ({lower} to {upper})"

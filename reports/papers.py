@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from marsyard.reports.kinds import Part, Rows
-from marsyard.reports.rates import all_flags, flag_share, known, share_text, spread_text
+from marsyard.reports.rates import all_flags, flag_fraction, fraction_text, known, spread_text
 from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.wording import NOTHING
 
@@ -63,6 +63,6 @@ def format_own_value(frame: Rows, row: Mapping[str, Any]) -> str:
     """Our value of a paper's quantity."""
     chosen, column = frame[all_flags(frame, *row.get("among", ()))], row["column"]
     if row.get("statistic") == "rate":
-        return share_text(flag_share(chosen, column)) if column in chosen else NOTHING
+        return fraction_text(flag_fraction(chosen, column)) if column in chosen else NOTHING
     values = known(chosen, column, row.get("scale", 1.0))
     return spread_text(np.abs(values) if row.get("magnitude") else values, row.get("digits"))

@@ -10,17 +10,15 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 
-from marsyard.campaigns.outcomes import UNFINISHED
-from marsyard.reports.columns import numbers
-from marsyard.reports.statistics.clusters import clustered_evidence
-from marsyard.reports.statistics.proportions import Interval, proportion_interval
-from marsyard.reports.wording import NOTHING, number, percent
+from marsyard.campaigns.errors import UNFINISHED
+from marsyard.reports.statistics.proportions import Interval, clustered_evidence, proportion_interval
+from marsyard.reports.wording import NOTHING, number, numbers, percent
 
 #: Outcomes of cases that the engine could not finish.
 ENGINE_FAILURES = UNFINISHED
 
 
-def succeeded(frame: pd.DataFrame, metric: str, bound: float, scale: float = 1.0) -> Bool[np.ndarray, " n"]:
+def success_mask(frame: pd.DataFrame, metric: str, bound: float, scale: float = 1.0) -> Bool[np.ndarray, " n"]:
     """Mask of the cases with |scale * metric| <= bound, or with a true metric if the bound is NaN.
 
     False for missing values and unfinished cases. A metric may be a sum of columns, joined by " + ".
@@ -82,10 +80,10 @@ def terrain_groups(chosen: pd.DataFrame) -> Int[np.ndarray, " n"] | None:
     """Terrain index of each case from 0; None if unknown for all. A case of unknown terrain has its own index."""
     if "terrain" not in chosen or bool(chosen["terrain"].isna().all()):
         return None
-    codes, known = pd.factorize(chosen["terrain"])
+    codes, terrain_names = pd.factorize(chosen["terrain"])
     groups = np.array(codes, dtype=np.int64)
     alone = groups < 0
-    groups[alone] = len(known) + np.arange(int(alone.sum()))
+    groups[alone] = len(terrain_names) + np.arange(int(alone.sum()))
     return groups
 
 
@@ -120,7 +118,7 @@ class Share:
         return self.shared_lower, self.shared_upper
 
 
-def share_of(hit: Bool[np.ndarray, " n"], frame: pd.DataFrame) -> Share:
+def fraction_of(hit: Bool[np.ndarray, " n"], frame: pd.DataFrame) -> Share:
     """The fraction of the cases of `frame` that `hit` marks."""
     n, hits = hit.size, int(hit.sum())
     if n == 0:
@@ -132,9 +130,9 @@ def share_of(hit: Bool[np.ndarray, " n"], frame: pd.DataFrame) -> Share:
     return Share(n, hits, hits / n, *proportion_interval(hits, n, CONFIDENCE), *(shared or (None, None)))
 
 
-def flag_share(frame: pd.DataFrame, name: str, *, wanted: bool = True) -> Share:
+def flag_fraction(frame: pd.DataFrame, name: str, *, wanted: bool = True) -> Share:
     """The fraction of rows whose flag is as wanted."""
-    return share_of(frame[name].eq(wanted).fillna(False).to_numpy(dtype=np.bool_), frame)
+    return fraction_of(frame[name].eq(wanted).fillna(False).to_numpy(dtype=np.bool_), frame)
 
 
 @dataclass(frozen=True)
@@ -231,7 +229,7 @@ def by_size(frame: pd.DataFrame, column: str, size: str, first: str) -> Iterator
             yield str(kind), float(value), frame[of_kind & same]
 
 
-def share_text(share: Share) -> str:
+def fraction_text(share: Share) -> str:
     """Hits, cases and share: ``19 of 20: 95.00 %``."""
     return f"{share.hits:,} of {share.n:,}: {percent(share.share)}" if share.n else NOTHING
 

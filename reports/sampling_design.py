@@ -12,9 +12,9 @@ import pandas as pd
 from jaxtyping import Bool
 
 from marsyard.campaigns.sampling.design import describe_design
-from marsyard.reports.statistics.sequential import planned_looks, spent_fraction
+from marsyard.reports.statistics.proportions import planned_looks, spent_fraction
 from marsyard.reports.stored import table
-from marsyard.reports.wording import count, stated
+from marsyard.reports.wording import count, format_fraction
 
 #: The design of cases that are drawn independently.
 RANDOM = "random"
@@ -34,8 +34,9 @@ class TerrainSupply:
 
     def advice(self, fewest: int, probability: float, confidence: float) -> str:
         """Why further cases cannot help, and the change that does; `fewest` terrains are needed."""
-        asked = f"{stated(probability)} at {stated(confidence)} confidence takes at least {count(fewest, 'terrain')}"
-        has = f"The campaign draws from {count(self.terrains, 'terrain')} ({self.key} = {self.terrains}); {asked}"
+        level = f"{format_fraction(probability)} at {format_fraction(confidence)} confidence"
+        has = f"The campaign draws from {count(self.terrains, 'terrain')} ({self.key} = {self.terrains}); {level}"
+        has = f"{has} takes at least {count(fewest, 'terrain')}"
         if not self.key.endswith(".bank"):
             return f"{has}: widen the range of {self.key}, and the bank, and run the campaign again."
         # random draws from ten times as many terrains rarely repeat: 1.1 cases per terrain suffice
@@ -96,7 +97,7 @@ class SamplingDesign:
             return None
         return np.asarray(chosen["case"] < self.first_look, dtype=np.bool_)
 
-    def drawn(self, frame: pd.DataFrame) -> pd.DataFrame:
+    def draw(self, frame: pd.DataFrame) -> pd.DataFrame:
         """The rows without the nominal case."""
         if not self.nominal or "case" not in frame:
             return frame
@@ -107,7 +108,7 @@ class SamplingDesign:
 INDEPENDENT = SamplingDesign()
 
 
-def sampled(configuration: Mapping[str, Any]) -> SamplingDesign:
+def read_sampling_design(configuration: Mapping[str, Any]) -> SamplingDesign:
     """Read the sampling design from a configuration; invalid values count as missing."""
     design = table(configuration.get("design"))
     dispersions = table(configuration.get("dispersions"))

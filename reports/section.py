@@ -1,17 +1,145 @@
-"""Building blocks of report sections: tables, figures with captions, blocks, and the subject of a report."""
+"""Building blocks of report sections: tables, figures with captions, blocks, and SVG in the style of the page."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import functools
+import io
+import re
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from html import escape
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
 
+import matplotlib as mpl
+import matplotlib.style
+import numpy as np
 import pandas as pd
+from jaxtyping import Float
 from markupsafe import Markup
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from marsyard.reports.stored import StoredRun
-from marsyard.reports.svg import svg_markup
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+#: Colours that figures are drawn with, and the page's colours that replace them.
+INK, MUTED, GRID = "#10161d", "#5a6672", "#d3d9e0"
+_THEME = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--line)"}
+
+#: Colours and markers of categories, after Okabe & Ito's palette for colour-blind readers, in tones with a contrast of
+#: 3:1 on the light and on the dark page; colour is never the only distinction.
+SERIES = ("#2f83d6", "#cf6a14", "#1c9a76", "#b262b2", "#9c7f12", "#78838f")
+MARKERS = ("o", "^", "s", "D", "v", "P")
+REQUIREMENT = "#d0392f"
+
+#: Styles of bars of outcomes; colour is never the only distinction.
+BARS: Mapping[str, Mapping[str, Any]] = {
+    "full": {"color": SERIES[0]},
+    "hatched": {"color": "none", "edgecolor": SERIES[1], "hatch": "////"},
+    "dotted": {"color": "none", "edgecolor": SERIES[5], "hatch": "...."},
+    "crossed": {"color": "none", "edgecolor": REQUIREMENT, "hatch": "xxxx"},
+}
+
+#: More points than this are drawn as pixels instead of vectors, to keep pages small.
+LARGEST_VECTOR_SAMPLE = 800
+#: Dots per inch of parts drawn as pixels: twice the size on a screen.
+RASTER_DPI = 160
+
+_STYLE_FILE = Path(__file__).parent / "templates" / "page.mplstyle"
+_STYLE: Any = mpl.rc_params_from_file(_STYLE_FILE, use_default_template=False)
+
+
+def in_page_style(draw: Callable[P, R]) -> Callable[P, R]:
+    """Decorate a drawing function to use the page's style instead of the user's matplotlib settings."""
+
+    @functools.wraps(draw)
+    def apply_style(*args: P.args, **kwargs: P.kwargs) -> R:
+        with _page_style():
+            return draw(*args, **kwargs)
+
+    return apply_style
+
+
+@contextmanager
+def _page_style(**further: str) -> Iterator[None]:
+    """The page's style; warnings about letters that the font lacks are ignored."""
+    with mpl.style.context(["default", _STYLE, further]), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def new_axes(width: float, height: float) -> tuple[Figure, Axes]:
+    """A figure with one pair of axes, size in inches; call it in the page's style."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.add_subplot()
+
+
+def svg_markup(figure: Figure, key: str, description: str) -> str:
+    """The figure as an SVG element of a page; its texts must have been set through matplotlib, which escapes them.
+
+    key: letters and digits, unique on the page, as prefix of the identifiers inside
+    description: text for readers who cannot see the figure
+    """
+    buffer = io.StringIO()
+    metadata = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    with _page_style(**{"svg.hashsalt": key, "svg.fonttype": "none"}):
+        figure.savefig(buffer, format="svg", dpi=RASTER_DPI, metadata=metadata)
+    markup = buffer.getvalue()
+    body = markup[markup.index("<svg") :]
+    view_box = re.search(r'viewBox="[^"]*"', body)
+    inner = re.sub(r' id="([^"]*)"', rf' id="{key}-\1"', body[body.index(">") + 1 :])
+    inner = re.sub(r'(href="|url\()#', rf"\1#{key}-", inner)
+    for stand_in, colour in _THEME.items():
+        inner = inner.replace(stand_in, colour)
+    head = (
+        f'<svg role="img" aria-label="{escape(description, quote=True)}" {view_box[0] if view_box else ""} '
+        'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">'
+    )
+    return head + inner.strip()
+
+
+def show_picture(axes: Axes, picture: Float[np.ndarray, "_ _"]) -> None:
+    """Draw a picture in grey, its contrast stretched between the 1 % and the 99 % quantile."""
+    finite = picture[np.isfinite(picture)]
+    low, high = np.quantile(finite, (0.01, 0.99)) if finite.size else (0.0, 1.0)
+    axes.imshow(picture, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), interpolation="antialiased")
+    axes.set_facecolor(INK)
+    axes.autoscale(enable=False)
+    _hide_frame(axes)
+
+
+def show_subframe(axes: Axes, picture: Float[np.ndarray, "_ _"], quantiles: tuple[float, float] = (0.01, 0.99)) -> None:
+    """Draw a picture in grey pixel by pixel, its contrast stretched between two quantiles."""
+    finite = picture[np.isfinite(picture)]
+    low, high = np.quantile(finite, quantiles) if finite.size else (0.0, 1.0)
+    levels = np.clip((np.nan_to_num(picture, nan=low) - low) / max(float(high - low), 1e-9), 0.0, 1.0)
+    grey = np.round(255.0 * levels).astype(np.uint8)
+    axes.imshow(np.repeat(grey[..., None], 3, axis=2), interpolation="none", aspect="equal")
+    _hide_frame(axes)
+
+
+def _hide_frame(axes: Axes) -> None:
+    axes.set(xticks=[], yticks=[])
+    axes.grid(visible=False)
+    axes.spines[:].set_visible(False)
+
+
+@in_page_style
+def draw_pictures(pictures: Sequence[Float[np.ndarray, "_ _"]]) -> Figure:
+    """Numbered pictures in a row, as delivered: for a case whose algorithm left no details to draw."""
+    rows, columns = pictures[0].shape
+    height = 12.0 / len(pictures) * rows / columns + 0.35
+    figure = Figure(figsize=(12.0, height), layout="constrained")
+    for number, (axes, picture) in enumerate(zip(figure.subplots(1, len(pictures)), pictures, strict=True), start=1):
+        show_picture(axes, picture)
+        axes.set_title(f"Picture {number}", fontsize=9)
+    return figure
+
 
 T = TypeVar("T")
 
@@ -25,7 +153,7 @@ class Grid:
     left_out: int = 0
 
 
-def grid_of(records: Iterable[T], columns: Mapping[str, Callable[[T], str]]) -> Grid:
+def build_grid(records: Iterable[T], columns: Mapping[str, Callable[[T], str]]) -> Grid:
     """A table of records; `columns` maps headings to functions that make the texts."""
     return Grid([*columns], [[text(record) for text in columns.values()] for record in records])
 

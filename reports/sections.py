@@ -18,25 +18,28 @@ from jaxtyping import Int
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from marsyard.reports.columns import axis_columns, driver_columns, label, numbers
-from marsyard.reports.figures import (
-    count_beyond_axis,
-    error_distribution,
-    error_histogram,
-    error_scatter,
-    error_scatter_against,
-    needs_enlarged_figure,
-    outcome_bars,
-)
+from marsyard.reports import figures
 from marsyard.reports.rates import CONFIDENCE, engine_failed, members, terrain_groups
-from marsyard.reports.sampling_design import sampled
+from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Grid, SvgFigure, plate
 from marsyard.reports.statistics.drivers import Driver, driver
 from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.tables import outcome_counts
-from marsyard.reports.traceability import algorithms_of
+from marsyard.reports.traceability import judged_algorithms
 from marsyard.reports.verdicts import Verdict
-from marsyard.reports.wording import NOTHING, asked_text, coefficient, count, number, percent, stated
+from marsyard.reports.wording import (
+    NOTHING,
+    axis_columns,
+    coefficient,
+    count,
+    driver_columns,
+    format_fraction,
+    label,
+    number,
+    numbers,
+    percent,
+    requirement_text,
+)
 
 #: Maximum number of rows of the tables of single cases.
 _MAX_CASES = 10
@@ -50,8 +53,8 @@ class CaseRow:
     pictured: bool
     values: Sequence[str]
     command: str
-    message: str = ""
-    trace: str = ""
+    message: str
+    trace: str
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,7 @@ def verdict_row(verdict: Verdict) -> dict[str, Any]:
         strip = {"left": f"{100.0 * left:.3g} %"} | {name: scale * (rate - left) for name, rate in rates.items()}
     return {
         "verdict": verdict,
-        "asked": asked_text(verdict, label(verdict.metric)),
+        "asked": requirement_text(verdict, label(verdict.metric)),
         "evidence": [count(verdict.n, "case"), f"{verdict.failures:,} failed"],
         "bounds": bounds,
         "risk": "" if math.isnan(verdict.consumer_risk) else f"consumer's risk {percent(verdict.consumer_risk)}",
@@ -95,33 +98,39 @@ def outcome_grid(frame: pd.DataFrame) -> Grid:
 def worst_cases(run: StoredRun, metric: str, pictured: Collection[str] = ()) -> CaseTable:
     """The cases with the largest errors; `pictured` are the cases with pictures on the page."""
     magnitude = np.abs(numbers(run.whole, metric))
-    known = np.flatnonzero(np.isfinite(magnitude))
-    order = known[np.argsort(-magnitude[known], kind="stable")][:_MAX_CASES]
+    finite = np.flatnonzero(np.isfinite(magnitude))
+    order = finite[np.argsort(-magnitude[finite], kind="stable")]
     columns = [metric, *axis_columns(metric, [str(name) for name in run.whole.columns])]
-    return _case_table(run, order.tolist(), columns, metric, known.size - order.size, pictured)
+    return _case_table(run, order, [*columns, *_conditions(run, metric)], pictured)
 
 
 def unanswered_cases(run: StoredRun, metric: str, pictured: Collection[str] = ()) -> CaseTable:
     """Completed cases without an error."""
     order = np.flatnonzero(~np.isfinite(numbers(run.whole, metric)) & members(run.whole, "completed"))
-    return _case_table(run, order[:_MAX_CASES].tolist(), [], metric, max(0, order.size - _MAX_CASES), pictured)
+    return _case_table(run, order, _conditions(run, metric), pictured)
 
 
 def crashed_rows(run: StoredRun) -> CaseTable:
     """Cases that the engine could not finish, with their error messages."""
-    order = np.flatnonzero(~members(run.whole, "completed"))
-    rows = [
-        CaseRow(
-            case=_case(run.whole, index),
-            pictured=False,
-            values=[_text(run.whole, "outcome", index)],
-            command=replay_command(run, _case(run.whole, index)),
-            message=_text(run.whole, "error", index),
-            trace=_text(run.whole, "traceback", index),
-        )
-        for index in order[:_MAX_CASES].tolist()
-    ]
-    return CaseTable(["Case", "Outcome"], rows, max(0, order.size - _MAX_CASES))
+    return _case_table(run, np.flatnonzero(~members(run.whole, "completed")), ())
+
+
+def _conditions(run: StoredRun, metric: str) -> list[str]:
+    return ["terrain", *driver_columns(run.frame, metric, max_columns=3)]
+
+
+def _case_table(
+    run: StoredRun, order: Int[np.ndarray, " n"], columns: Sequence[str], pictured: Collection[str] = ()
+) -> CaseTable:
+    frame = run.whole
+    shown = [name for name in columns if name in frame]
+    rows = []
+    for index in order[:_MAX_CASES].tolist():
+        case = str(frame["case"].iloc[index]) if "case" in frame else str(index)
+        texts = [_text(frame, name, index) for name in ("outcome", *shown)]
+        error = _text(frame, "error", index), _text(frame, "traceback", index)
+        rows.append(CaseRow(case, case in pictured, texts, replay_command(run, case), *error))
+    return CaseTable(["Case", "Outcome", *(label(name) for name in shown)], rows, max(0, order.size - _MAX_CASES))
 
 
 #: Keys of a dispersion that are not parameters of its distribution.
@@ -153,7 +162,7 @@ def provenance(run: StoredRun) -> list[tuple[str, str]]:
     environment, times = table(run.recorded("environment")), numbers(run.frame, "cpu_time_s")
     times = times[np.isfinite(times)]
     algorithms: list[tuple[str, Any]] = []
-    for one in algorithms_of(run.record):
+    for one in judged_algorithms(run.record):
         head = "Algorithm judged" if one.judged else "Algorithm compared"
         algorithms += [(head, one.name), (f"{head}: class or file", one.path), (f"{head}: version", one.version)]
         algorithms += [(f"{head}: sources", one.source_hash), (f"{head}: options", one.options_text)]
@@ -163,7 +172,7 @@ def provenance(run: StoredRun) -> list[tuple[str, str]]:
         *algorithms,
         ("State", run.recorded("state")),
         ("Root seed", run.recorded("seed")),
-        ("Sampling", sampled(run.configuration).text),
+        ("Sampling", read_sampling_design(run.configuration).text),
         ("Cases asked", run.recorded("cases")),
         ("Cases stored", len(run.whole)),
         ("Started", run.recorded("started_utc")),
@@ -211,28 +220,6 @@ def rerun_commands(run: StoredRun) -> list[str]:
     return [*([shlex.join(["cd", folder])] if folder else []), shlex.join(words), *appends]
 
 
-def _case_table(
-    run: StoredRun, order: list[int], columns: list[str], metric: str, left_out: int, pictured: Collection[str]
-) -> CaseTable:
-    shown = [
-        name for name in [*columns, "terrain", *driver_columns(run.frame, metric, max_columns=3)] if name in run.whole
-    ]
-    rows = [
-        CaseRow(
-            case=_case(run.whole, index),
-            pictured=_case(run.whole, index) in pictured,
-            values=[_text(run.whole, "outcome", index), *(_text(run.whole, name, index) for name in shown)],
-            command=replay_command(run, _case(run.whole, index)),
-        )
-        for index in order
-    ]
-    return CaseTable(["Case", "Outcome", *(label(name) for name in shown)], rows, left_out)
-
-
-def _case(frame: pd.DataFrame, index: int) -> str:
-    return str(frame["case"].iloc[index]) if "case" in frame else str(index)
-
-
 def _text(frame: pd.DataFrame, column: str, index: int) -> str:
     if column not in frame:
         return NOTHING
@@ -258,38 +245,38 @@ def error_plates(frame: pd.DataFrame, whole: pd.DataFrame, metric: str, bound: f
     """Scatter of a metric over some rows, its histogram and distribution over all."""
     scatter = "Errors of single cases; the dashed circle is the requirement. Hollow: beyond the axes, at their edge."
     histogram = "How often each magnitude of error occurred; hatched: beyond the axis."
-    figures: list[tuple[str, Figure | None, str]] = [("scatter", error_scatter(frame, metric, bound), scatter)]
-    if needs_enlarged_figure(frame, metric, bound):
-        figures.append(("close", error_scatter(frame, metric, bound, close=True), "The same errors, enlarged."))
-    figures.append(("histogram", error_histogram(whole, metric, bound), histogram))
+    drawn: list[tuple[str, Figure | None, str]] = [("scatter", figures.error_scatter(frame, metric, bound), scatter)]
+    if figures.needs_enlarged_figure(frame, metric, bound):
+        drawn.append(("close", figures.error_scatter(frame, metric, bound, close=True), "The same errors, enlarged."))
+    drawn.append(("histogram", figures.error_histogram(whole, metric, bound), histogram))
     caption = "Fraction of cases up to each magnitude."
-    figures.append(("distribution", error_distribution(whole, metric, bound), caption))
-    return _plates(figures)
+    drawn.append(("distribution", figures.error_distribution(whole, metric, bound), caption))
+    return _plates(drawn)
 
 
 def driver_plates(frame: pd.DataFrame, metric: str, bound: float | None) -> list[SvgFigure]:
     """A metric against the conditions that may drive it, with rank correlations."""
-    figures, magnitude, groups = [], np.abs(numbers(frame, metric)), terrain_groups(frame)
+    drawn, magnitude, groups = [], np.abs(numbers(frame, metric)), terrain_groups(frame)
     for k, column in enumerate(driver_columns(frame, metric)):
-        found = driver(numbers(frame, column), magnitude, groups, CONFIDENCE)
-        text = f"{label(column)}." if found is None else f"{label(column)}: rank correlation {rank_text(found)}."
-        beyond = count_beyond_axis(frame, metric, column, bound)
+        result = driver(numbers(frame, column), magnitude, groups, CONFIDENCE)
+        text = f"{label(column)}." if result is None else f"{label(column)}: rank correlation {rank_text(result)}."
+        beyond = figures.count_beyond_axis(frame, metric, column, bound)
         if beyond:
             text = f"{text} {count(beyond, 'error')} beyond the axis: hollow, at its upper edge."
-        figures.append((f"driver{k}", error_scatter_against(frame, metric, column, bound), text))
-    return _plates(figures)
+        drawn.append((f"driver{k}", figures.error_scatter_against(frame, metric, column, bound), text))
+    return _plates(drawn)
 
 
 def rank_text(found: Driver) -> str:
     """A rank correlation with its interval: ``0.310 (0.120 to 0.480 at 90 % confidence)``."""
     lower, upper = coefficient(found.lower), coefficient(found.upper)
-    return f"{coefficient(found.correlation)} ({lower} to {upper} at {stated(CONFIDENCE)} confidence)"
+    return f"{coefficient(found.correlation)} ({lower} to {upper} at {format_fraction(CONFIDENCE)} confidence)"
 
 
 def outcome_plates(frame: pd.DataFrame) -> list[SvgFigure]:
     """Number of cases by outcome."""
     caption = "Plain: an answer was given. Hatched: the algorithm gave no answer. Crossed: the case crashed."
-    return _plates([("outcomes", outcome_bars(frame), caption)])
+    return _plates([("outcomes", figures.outcome_bars(frame), caption)])
 
 
 def _plates(wanted: Sequence[tuple[str, Figure | None, str]]) -> list[SvgFigure]:
@@ -333,10 +320,10 @@ def choose_points(frame: pd.DataFrame, metric: str) -> Int[np.ndarray, " n"]:
     if len(frame) <= MAX_POINTS:
         return np.arange(len(frame))
     magnitude = np.abs(numbers(frame, metric))
-    known = np.isfinite(magnitude)
+    finite = np.isfinite(magnitude)
     crashed = engine_failed(frame)
-    worst = np.argsort(-np.where(known, magnitude, -1.0), kind="stable")
-    notable = [part[:MAX_NOTABLE] for part in (worst, np.flatnonzero(~known & ~crashed), np.flatnonzero(crashed))]
+    worst = np.argsort(-np.where(finite, magnitude, -1.0), kind="stable")
+    notable = [part[:MAX_NOTABLE] for part in (worst, np.flatnonzero(~finite & ~crashed), np.flatnonzero(crashed))]
     return np.sort(pd.unique(np.concatenate([*notable, np.arange(len(frame))]))[:MAX_POINTS])
 
 
@@ -350,7 +337,7 @@ def script_hash(text: str) -> str:
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
 
 
-def embedded(data: Any) -> Markup:
+def embed_json(data: Any) -> Markup:
     """Data as JSON, escaped for a script element."""
     text = json.dumps(data, allow_nan=False, separators=(",", ":"))
     for letter in "<>&\u2028\u2029":

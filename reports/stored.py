@@ -10,10 +10,10 @@ from typing import Any
 
 import pandas as pd
 
-from marsyard.campaigns.definition.former_names import stored_columns_now, stored_configuration_now
+from marsyard.campaigns.definition.configuration import stored_columns_now, stored_configuration_now
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products
-from marsyard.reports.columns import axis_columns, driver_columns, primary_metric
+from marsyard.reports.wording import axis_columns, driver_columns, primary_metric
 
 #: Maximum number of cases of which all columns are read; of more cases, all columns of the first ones are read.
 LARGEST_WHOLE, FIRST_CASES = 50_000, 20_000
@@ -56,8 +56,12 @@ class StoredRun:
     @property
     def requirements(self) -> list[Mapping[str, Any]]:
         """The requirements of the campaign."""
-        asked = self.recorded("requirements")
-        return [item for item in asked if isinstance(item, Mapping)] if isinstance(asked, list | tuple) else []
+        stored_requirements = self.recorded("requirements")
+        return (
+            [item for item in stored_requirements if isinstance(item, Mapping)]
+            if isinstance(stored_requirements, list | tuple)
+            else []
+        )
 
     @property
     def command(self) -> tuple[str, tuple[str, ...]] | None:
@@ -70,8 +74,8 @@ class StoredRun:
 
     def recorded(self, key: str) -> Any:
         """Value of a key in the record or in its configuration; None if missing."""
-        found = self.record.get(key)
-        return found if found is not None else self.configuration.get(key)
+        value = self.record.get(key)
+        return value if value is not None else self.configuration.get(key)
 
     def parameter(self, *path: str) -> Any:
         """A parameter of the campaign's file; None if missing."""
@@ -103,7 +107,7 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
     if requirements is not None:
         record["requirements"] = list(requirements)
     try:
-        frame, whole = _frames(path, record)
+        frame, total = _frames(path, record)
     except (OSError, ValueError) as error:
         raise StoreError(f"{path} cannot be read: {error}") from error
     try:
@@ -112,7 +116,7 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
         names = []
     kept = sorted(int(name) for name in names if name.isascii() and name.isdigit())
     kept.sort(key=lambda case: case != record.get("showcase"))
-    return StoredRun(directory, frame, whole, record, tuple(kept))
+    return StoredRun(directory, frame, total, record, tuple(kept))
 
 
 def _frames(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -123,7 +127,7 @@ def _frames(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.Dat
     stored = file.schema_arrow.names
     renamed = stored_columns_now(stored, str(table(record.get("configuration")).get("scenario")))
     if file.metadata.num_rows <= LARGEST_WHOLE:
-        frame = _ordered(pd.read_parquet(path).rename(columns=renamed))
+        frame = _sort_columns(pd.read_parquet(path).rename(columns=renamed))
         return frame, frame
     first = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas().rename(columns=renamed)
     asked, names = record.get("requirements"), [renamed.get(name, name) for name in stored]
@@ -135,10 +139,10 @@ def _frames(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.Dat
     if metric is not None:
         wanted.update([metric, *axis_columns(metric, names), *driver_columns(first, metric, max_columns=3)])
     whole = pd.read_parquet(path, columns=[name for name in stored if renamed.get(name, name) in wanted])
-    return _ordered(first), _ordered(whole.rename(columns=renamed))
+    return _sort_columns(first), _sort_columns(whole.rename(columns=renamed))
 
 
-def _ordered(frame: pd.DataFrame) -> pd.DataFrame:
+def _sort_columns(frame: pd.DataFrame) -> pd.DataFrame:
     if "case" not in frame or frame["case"].is_monotonic_increasing:
         return frame
     return frame.sort_values("case", kind="stable").reset_index(drop=True)

@@ -10,12 +10,21 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from marsyard.reports.columns import axis_columns, label, numbers
 from marsyard.reports.rates import ENGINE_FAILURES, is_flag, members, terrain_groups
 from marsyard.reports.section import Grid
 from marsyard.reports.statistics.samples import ErrorSummary, summarize
 from marsyard.reports.verdicts import Status, Verdict
-from marsyard.reports.wording import NOTHING, asked_text, interval, number, percent, stated
+from marsyard.reports.wording import (
+    NOTHING,
+    axis_columns,
+    format_fraction,
+    interval,
+    label,
+    number,
+    numbers,
+    percent,
+    requirement_text,
+)
 
 _STYLES = {
     Status.PASS: "bold green",
@@ -34,7 +43,7 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
         table.add_column(heading, justify="right", no_wrap=True)
     for verdict in verdicts:
         requirement = Text(verdict.requirement_id, style="bold")
-        requirement.append(f"\n{asked_text(verdict, verdict.metric)}", style="dim")
+        requirement.append(f"\n{requirement_text(verdict, verdict.metric)}", style="dim")
         table.add_row(
             requirement,
             Text(str(verdict.status), style=_STYLES[verdict.status]),
@@ -90,7 +99,7 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
     """Rows of a table of statistics: name, then the value of each summary."""
     if not summaries:
         return []
-    confidence = stated(summaries[0].confidence)
+    confidence = format_fraction(summaries[0].confidence)
     rows = [
         ["cases", *(str(s.n) for s in summaries)],
         ["mean", *(number(s.mean) for s in summaries)],
@@ -101,7 +110,7 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
         ["root mean square", *(number(s.rms) for s in summaries)],
     ]
     for index, quantile in enumerate(summaries[0].quantiles):
-        name = "median" if quantile.probability == 0.5 else f"{stated(quantile.probability)} quantile"
+        name = "median" if quantile.probability == 0.5 else f"{format_fraction(quantile.probability)} quantile"
         of_each = [summary.quantiles[index] for summary in summaries]
         rows.append([name, *(number(q.estimate) for q in of_each)])
         rows.append([f"{name}, {confidence} bounds", *(interval(q.lower, q.upper) for q in of_each)])

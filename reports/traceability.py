@@ -46,11 +46,11 @@ class Algorithm:
         return json.dumps(self.options, ensure_ascii=False) if self.options else ""
 
 
-def algorithms_of(record: Mapping[str, Any]) -> list[Algorithm]:
+def judged_algorithms(record: Mapping[str, Any]) -> list[Algorithm]:
     """Read the algorithms from a campaign's record, the judged one first; old records give names alone."""
     stored = record.get("algorithms")
     entries = [table(one) for one in stored] if isinstance(stored, list) else []
-    found = [
+    items = [
         Algorithm(
             name=str(entry["spec"]),
             judged=entry.get("role") != "compared",
@@ -62,9 +62,9 @@ def algorithms_of(record: Mapping[str, Any]) -> list[Algorithm]:
         for entry in entries
         if entry.get("spec")
     ]
-    if not found:
-        found = _named_algorithms(table(table(record.get("configuration")).get("parameters")))
-    return sorted(found, key=lambda one: not one.judged)
+    if not items:
+        items = _named_algorithms(table(table(record.get("configuration")).get("parameters")))
+    return sorted(items, key=lambda one: not one.judged)
 
 
 def format_judged_algorithms(algorithms: Sequence[Algorithm]) -> str:
@@ -112,7 +112,7 @@ _EVIDENCE = {
 COLUMNS = (*_REQUIREMENT, "campaign", *algorithm_cells(()), *_EVIDENCE)
 
 
-def evidence_of(
+def requirement_evidence(
     campaign: str, verdicts: Iterable[Verdict], algorithms: Sequence[Algorithm] = ()
 ) -> list[dict[str, Any]]:
     """Rows of the traceability matrix: the evidence of a campaign for each requirement."""

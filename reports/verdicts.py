@@ -3,10 +3,9 @@
 A requirement asks that `|metric| <= bound`, or a true column, holds for a fraction of a population at a confidence. Its
 status follows from one-sided Clopper-Pearson bounds of the success rate. MET BY RATE: decided by the estimate, whose
 rate reaches the fraction, but not at the confidence. Cases on shared terrains get bounds that allow for correlation
-(`marsyard.reports.statistics.clusters`). Looks at appended cases keep their joint risk
-(`marsyard.reports.statistics.sequential.LaterLook`); each planned look spends a fraction of the risk. Cases that are no
-independent random draws (Latin hypercube, Sobol, grids) have neither bounds nor confidence: their rate decides only
-requirements that are decided by the estimate.
+(`marsyard.reports.statistics.proportions`). Looks at appended cases keep their joint risk (`LaterLook` there); each
+planned look spends a fraction of the risk. Cases that are no independent random draws (Latin hypercube, Sobol, grids)
+have neither bounds nor confidence: their rate decides only requirements that are decided by the estimate.
 """
 
 from __future__ import annotations
@@ -23,16 +22,15 @@ from jaxtyping import Bool, Int
 
 from marsyard.reports import rates
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
-from marsyard.reports.statistics.clusters import ClusteredEvidence, ClusterMethod, clustered_evidence
+from marsyard.reports.statistics import proportions
 from marsyard.reports.statistics.proportions import (
-    consumer_risk,
-    further_cases_needed,
-    minimum_sample_size,
-    proportion_lower,
-    proportion_upper,
+    ClusteredEvidence,
+    ClusterMethod,
+    LaterLook,
+    clustered_evidence,
+    confidence_at,
 )
-from marsyard.reports.statistics.sequential import LaterLook, confidence_at
-from marsyard.reports.wording import count, percent, stated
+from marsyard.reports.wording import count, format_fraction, percent
 
 #: Value of a requirement's `decide_by` that has the rate seen compared with the probability.
 ESTIMATE = "estimate"
@@ -113,8 +111,8 @@ class Verdict:
             return math.nan
         shared = self.clustered
         if shared is None:
-            return consumer_risk(self.n - self.failures, self.n, self.probability)
-        return consumer_risk(shared.effective_successes, shared.effective_n, self.probability)
+            return proportions.consumer_risk(self.n - self.failures, self.n, self.probability)
+        return proportions.consumer_risk(shared.effective_successes, shared.effective_n, self.probability)
 
     @property
     def design_effect(self) -> float:
@@ -137,7 +135,7 @@ class Verdict:
     def _basis(self) -> str:
         if self.decide_by != ESTIMATE or self.n == 0:
             return ""
-        at = f"at {stated(self.confidence)} confidence"
+        at = f"at {format_fraction(self.confidence)} confidence"
         if self.status is Status.PASS:
             return f"Decided by the rate; met {at} as well."
         if self.status is Status.INSUFFICIENT:
@@ -166,12 +164,12 @@ class Verdict:
         if math.isnan(self.bounds_confidence) or self.bounds_confidence == self.upper_confidence == self.confidence:
             return ""
         lower, upper = (f"{100.0 * level:.4g} %" for level in (self.bounds_confidence, self.upper_confidence))
-        kept = f"so that all looks together keep {stated(self.confidence)}"
+        joint_note = f"so that all looks together keep {format_fraction(self.confidence)}"
         if lower == upper:
-            return f"The campaign is judged more than once: its bounds are at {lower} confidence, {kept}."
+            return f"The campaign is judged more than once: its bounds are at {lower} confidence, {joint_note}."
         return (
             f"The campaign is judged more than once: its lower bound is at {lower} confidence and its upper bound at "
-            f"{upper}, {kept}."
+            f"{upper}, {joint_note}."
         )
 
 
@@ -191,44 +189,27 @@ class Looks:
     share: float = 1.0
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """One-sided bounds of a success rate.
+def add_bounds(verdict: Verdict, success: Success, groups: Groups | None, looks: Looks) -> tuple[Verdict, int]:
+    """Bounds of the success rate of at least one case, and the cases that pass the requirement if none fails.
 
-    lower, upper: the bounds that decide, each at its own confidence
-    plain_lower, plain_upper: bounds for independent cases
-    clustered: evidence of shared terrains; None where no terrain is shared
-    further_cases: cases, or whole terrains where these are counted, that pass the requirement if none fails
+    groups: terrains numbered from 0; None if unknown. Where terrains are counted, the further cases are whole terrains.
     """
-
-    lower: float
-    upper: float
-    lower_confidence: float
-    upper_confidence: float
-    plain_lower: float
-    plain_upper: float
-    clustered: ClusteredEvidence | None
-    further_cases: int
-
-
-def compute_bounds(
-    success: Success, groups: Groups | None, probability: float, confidence: float, looks: Looks
-) -> Bounds:
-    """Bounds of the success rate of at least one case; `groups` numbers the terrains from 0, None if unknown."""
-    n, failures = success.size, int((~success).sum())
+    n, failures, probability, confidence = success.size, verdict.failures, verdict.probability, verdict.confidence
     first = n if looks.before is None else int(looks.before.sum())
     levels = _confidences(first, n, probability, confidence, looks)
-    plain = proportion_lower(n - failures, n, levels[0]), proportion_upper(n - failures, n, levels[1])
+    lower = proportions.proportion_lower(n - failures, n, levels[0])
+    upper = proportions.proportion_upper(n - failures, n, levels[1])
+    verdict = replace(verdict, lower=lower, upper=upper, plain_lower=lower, plain_upper=upper)
     if groups is None or int(groups.max()) + 1 == n:
         needed = _cases_needed(first, n, failures, probability, confidence, looks)
-        return Bounds(*plain, *levels, *plain, None, needed - n)
+        return replace(verdict, bounds_confidence=levels[0], upper_confidence=levels[1]), needed - n
     shared = clustered_evidence(success, groups, confidence)
     before = np.ones(n, dtype=np.bool_) if looks.before is None else looks.before
     if np.unique(groups[before]).size != first:  # independent cases that the first look was worth
         first = math.floor(clustered_evidence(success[before], groups[before], confidence).effective_n)
     levels = _confidences(first, shared.effective_n, probability, confidence, looks)
-    lower, upper = (clustered_evidence(success, groups, level) for level in levels)
-    shared = replace(lower, upper=upper.upper)
+    by_level = [clustered_evidence(success, groups, level) for level in levels]
+    shared = replace(by_level[0], upper=by_level[1].upper)
     if shared.method is ClusterMethod.TERRAIN_COUNT:
         # the tolerance keeps whole numbers whole
         size, weight, failed = shared.terrains, 1.0, math.ceil(shared.terrains - shared.effective_successes - 1e-9)
@@ -236,7 +217,9 @@ def compute_bounds(
         weight = shared.effective_n / n
         size, failed = math.floor(shared.effective_n), math.ceil(failures * weight)
     needed = _cases_needed(first, size, failed, probability, confidence, looks)
-    return Bounds(shared.lower, shared.upper, *levels, *plain, shared, math.ceil((needed - size) / weight))
+    verdict = replace(verdict, lower=shared.lower, upper=shared.upper, clustered=shared)
+    further = math.ceil((needed - size) / weight)
+    return replace(verdict, bounds_confidence=levels[0], upper_confidence=levels[1]), further
 
 
 def _confidences(
@@ -253,7 +236,7 @@ def _confidences(
 def _cases_needed(first: int, n: int, failures: int, probability: float, confidence: float, looks: Looks) -> int:
     """Total of cases that pass the requirement without a further failure."""
     if looks.share < 1.0:
-        return n + further_cases_needed(n, failures, probability, confidence_at(confidence, looks.share))
+        return n + proportions.further_cases_needed(n, failures, probability, confidence_at(confidence, looks.share))
     return LaterLook(1.0 - probability, 1.0 - confidence, first).cases_needed(n, failures)
 
 
@@ -264,11 +247,11 @@ def judge_campaign(
 
     how: the sampling design; without independent random draws, verdicts have no bounds
     """
-    return [_judge(how.drawn(frame), requirement, how) for requirement in requirements]
+    return [_judge(how.draw(frame), requirement, how) for requirement in requirements]
 
 
 def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: SamplingDesign) -> Verdict:
-    verdict = _unjudged(requirement)
+    verdict = _empty_verdict(requirement)
     fault = _requirement_fault(frame, verdict)
     if fault:
         return replace(verdict, reason=fault)
@@ -303,7 +286,7 @@ def _withhold(verdict: Verdict, suspected: Verdict) -> Verdict:
 def _decide(verdict: Verdict, chosen: pd.DataFrame, how: SamplingDesign, frame: pd.DataFrame) -> Verdict:
     """The verdict by the members of its population, at least one, among all cases."""
     _, unknown = rates.members_and_unknown(chosen, verdict.population.split(" and "))
-    success = np.asarray(rates.succeeded(chosen, verdict.metric, verdict.bound, verdict.scale) & ~unknown)
+    success = np.asarray(rates.success_mask(chosen, verdict.metric, verdict.bound, verdict.scale) & ~unknown)
     n, failures, groups = success.size, int((~success).sum()), rates.terrain_groups(chosen)
     rate, by_rate = (n - failures) / n, verdict.decide_by == ESTIMATE
     terrains = None if groups is None else int(chosen["terrain"].nunique())
@@ -313,26 +296,22 @@ def _decide(verdict: Verdict, chosen: pd.DataFrame, how: SamplingDesign, frame: 
         status = _status_by_rate(rate, n, verdict.probability) if by_rate else verdict.status
         return replace(counted, status=status, reason=reason)
     looks = Looks(how.mask_first_look(frame, chosen), how.risk_share(len(frame)))
-    bounds = compute_bounds(success, groups, verdict.probability, verdict.confidence, looks)
-    status = compare_bounds(bounds.lower, bounds.upper, verdict.probability)
+    judged, further = add_bounds(counted, success, groups, looks)
+    status = judged.confident_status
     by_rate = by_rate and status is not Status.PASS
     if by_rate:
         status = _status_by_rate(rate, n, verdict.probability)
-    judged = replace(
-        counted, status=status, lower=bounds.lower, upper=bounds.upper, clustered=bounds.clustered,
-        plain_lower=bounds.plain_lower, plain_upper=bounds.plain_upper,
-        bounds_confidence=bounds.lower_confidence, upper_confidence=bounds.upper_confidence,
-    )  # fmt: skip
+    judged = replace(judged, status=status)
     if status is not Status.INSUFFICIENT:
         return judged
     if by_rate:
         return replace(judged, further_cases=min_cases_for_rate(verdict.probability) - n)
     # further cases, or the advice why these cannot help
-    shared, supply, further = bounds.clustered, how.terrains, bounds.further_cases
+    shared, supply = judged.clustered, how.terrains
     are_counted = shared is not None and shared.method is ClusterMethod.TERRAIN_COUNT
     if not are_counted or supply is None or (terrains or 0) + further <= supply.terrains:
         return replace(judged, further_cases=further)
-    fewest = minimum_sample_size(verdict.probability, verdict.confidence)
+    fewest = proportions.minimum_sample_size(verdict.probability, verdict.confidence)
     return replace(judged, advice=supply.advice(fewest, verdict.probability, verdict.confidence))
 
 
@@ -369,7 +348,7 @@ def _requirement_fault(frame: pd.DataFrame, verdict: Verdict) -> str:
     return ""
 
 
-def _unjudged(requirement: Mapping[str, Any]) -> Verdict:
+def _empty_verdict(requirement: Mapping[str, Any]) -> Verdict:
     """The requirement without evidence; a decision by rate is added to its statement."""
     decide_by, statement = str(requirement.get("decide_by", "confidence")), str(requirement.get("statement", ""))
     if decide_by == ESTIMATE:

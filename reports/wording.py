@@ -1,15 +1,18 @@
-"""Numbers, fractions and requirements as text: significant digits, and rates never rounded up to certainty."""
+"""Texts of reports: numbers, fractions, requirements, and names of columns with units."""
 
 from __future__ import annotations
 
 import math
+import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
+from jaxtyping import Float
 
 #: Text of a missing value.
 NOTHING = "–"
@@ -21,22 +24,22 @@ _ROUNDING = 1e-9
 _POPULATIONS = {"all": "all cases", "completed": "completed cases", "valid": "valid answers"}
 
 
-def asked_text(asked: Any, metric: str) -> str:
+def requirement_text(asked: Any, metric: str) -> str:
     """A requirement (of a campaign, or repeated by a verdict) in words, with the metric's name for readers."""
     unbounded = asked.bound is None or math.isnan(asked.bound)
     scaled = "" if asked.scale == 1.0 else f"{asked.scale:g} × "
     what = metric if unbounded else f"{scaled}|{metric}| ≤ {asked.bound:g}"
-    confidence = f"{stated(asked.confidence)} confidence"
+    confidence = f"{format_fraction(asked.confidence)} confidence"
     how = f"decided by rate, bounds at {confidence}" if asked.decide_by == "estimate" else f"at {confidence}"
-    return f"{what} in at least {stated(asked.probability)} of {population_text(asked.population)}, {how}"
+    return f"{what} in at least {format_fraction(asked.probability)} of {population_text(asked.population)}, {how}"
 
 
 def population_text(population: str) -> str:
     """A population in words: ``valid answers``, ``cases with room``, ``valid answers with room``."""
     parts = population.split(" and ")
-    whole = next((_POPULATIONS[part] for part in parts if part in _POPULATIONS), "cases")
+    base = next((_POPULATIONS[part] for part in parts if part in _POPULATIONS), "cases")
     flags = [part.removeprefix("with_").replace("_", " ") for part in parts if part not in _POPULATIONS]
-    return f"{whole} with {' and '.join(flags)}" if flags else whole
+    return f"{base} with {' and '.join(flags)}" if flags else base
 
 
 def number(value: float) -> str:
@@ -98,7 +101,7 @@ def percent(fraction: float) -> str:
     return "< 0.0000001 %" if fraction < 0.5 else "> 99.9999999 %"
 
 
-def stated(fraction: float) -> str:
+def format_fraction(fraction: float) -> str:
     """A given fraction in per cent, with all its digits."""
     return NOTHING if math.isnan(fraction) else f"{100.0 * fraction:.10g} %"
 
@@ -123,3 +126,120 @@ def note_text(key: str, **values: object) -> str:
     """A text of `templates/notes.toml` by ``table.key``, with its values."""
     table, name = key.split(".")
     return _notes()[table][name].format(**values)
+
+
+#: Suffixes of column names and their units, longest first.
+_UNITS = {
+    "_deg_h_k": "deg/h/K", "_m_s2": "m/s²", "_deg_s": "deg/s", "_rad_s": "rad/s", "_m_s": "m/s", "_deg": "deg",
+    "_rad": "rad", "_km": "km", "_mm": "mm", "_cm": "cm", "_px": "px", "_dn": "DN", "_ms": "ms", "_m": "m", "_s": "s",
+    "_k": "K",
+}  # fmt: skip
+_AXES = ("x", "y", "z")
+#: Columns that describe the run rather than the case.
+_BOOKKEEPING = re.compile(
+    r"time|hash|^case$|^outcome$|^answered$|^error$|^traceback$|^gl_|^processor|version|host|^place_|estimated|_true_"
+    r"|^firing_|^touchdown_|^room|^fault_size$|^update_\d|^(range|cross|worst)_error|^drift|^false_|^lost_"
+    r"|\.|^algorithm$|^stderr$|^velocity_(?:nees|normalised|sd|correlation)"
+)
+#: Prefixes of the conditions that come first.
+_FIRST_DRIVERS = (
+    "off_nadir_max", "attitude_rate_max", "altitude_1", "wind_speed", "horizontal_speed", "sun_elevation", "slip_mean",
+    "pose_error_fraction", "rock_diameter", "disparity_error_goal",
+)  # fmt: skip
+_LARGEST_CATEGORY = 6
+
+
+def split_unit(column: str) -> tuple[str, str]:
+    """Split a column name into name and unit; the unit may be empty.
+
+    >>> split_unit("attitude_rate_max_deg_s")
+    ('attitude_rate_max', 'deg/s')
+    """
+    for ending, unit in _UNITS.items():
+        if column.endswith(ending) and len(column) > len(ending):
+            return column.removesuffix(ending), unit
+    return column, ""
+
+
+def label(column: str) -> str:
+    """The column in words, with its unit: ``velocity error (m/s)``."""
+    name, unit = split_unit(column)
+    return f"{_words(name)} ({unit})" if unit else _words(name)
+
+
+def magnitude_label(column: str) -> str:
+    """The magnitude of a column in words, with its unit: ``|velocity error| (m/s)``."""
+    name, unit = split_unit(column)
+    return f"|{_words(name)}| ({unit})" if unit else f"|{_words(name)}|"
+
+
+def axis_columns(metric: str, columns: Sequence[str]) -> list[str]:
+    """The signed parts of a metric among the columns: ``velocity_error_x_m_s`` for ``velocity_error_m_s``."""
+    name, _ = split_unit(metric)
+    ending = metric[len(name) :]
+    return [part for axis in _AXES if (part := f"{name}_{axis}{ending}") in columns]
+
+
+def primary_metric(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]]) -> str | None:
+    """The page's metric: that of the first requirement, else the first error column; None without one."""
+    asked = [str(requirement.get("metric", "")) for requirement in requirements]
+    errors = [str(column) for column in frame.columns if "error_" in str(column) and split_unit(str(column))[1]]
+    return next((name for name in [*asked, *errors] if name in frame and _is_number(frame, name)), None)
+
+
+def numbers(frame: pd.DataFrame, column: str) -> Float[np.ndarray, " n"]:
+    """A column as float64; NaN for missing numbers or a missing column."""
+    if column not in frame:
+        return np.full(len(frame), np.nan)
+    values = pd.to_numeric(frame[column], errors="coerce")
+    return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan), dtype=np.float64)
+
+
+def driver_columns(frame: pd.DataFrame, metric: str, max_columns: int = 6) -> list[str]:
+    """Conditions that may drive a metric: fixed ones first, then by rank correlation."""
+    names = [str(name) for name in frame.columns]
+    excluded = {metric, *axis_columns(metric, names), "terrain"}
+    candidates = [
+        name
+        for name in names
+        if name not in excluded
+        and not _BOOKKEEPING.search(name)
+        and _is_number(frame, name)
+        and frame[name].nunique() > 1
+    ]
+    first = [name for start in _FIRST_DRIVERS for name in candidates if name.startswith(start)]
+    magnitude = np.abs(numbers(frame, metric))
+    rest = sorted(
+        (name for name in candidates if name not in first),
+        key=lambda name: -abs(np.nan_to_num(rank_correlation(numbers(frame, name), magnitude))),
+    )
+    return [*first, *rest][:max_columns]
+
+
+def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> float:
+    """Spearman's rank correlation of the known pairs; NaN for fewer than four or for a constant."""
+    both = np.isfinite(x) & np.isfinite(y)
+    if both.sum() < 4:
+        return float("nan")
+    ranks_x, ranks_y = (pd.Series(values[both]).rank().to_numpy() for values in (x, y))
+    if np.ptp(ranks_x) == 0 or np.ptp(ranks_y) == 0:
+        return float("nan")
+    return float(np.corrcoef(ranks_x, ranks_y)[0, 1])
+
+
+def category_column(frame: pd.DataFrame) -> str | None:
+    """The column with a few kinds of cases (text, else terrains); None without one."""
+    kinds = {str(name): kind for name, kind in frame.dtypes.items() if not _BOOKKEEPING.search(str(name))}
+    is_text = (pd.api.types.is_string_dtype, pd.api.types.is_object_dtype)
+    names = [name for name, kind in kinds.items() if any(check(kind) for check in is_text)]
+    names += ["terrain"] if "terrain" in frame else []
+    return next((name for name in names if 2 <= frame[name].nunique() <= _LARGEST_CATEGORY), None)
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ").replace(".", " ")
+
+
+def _is_number(frame: pd.DataFrame, column: str) -> bool:
+    kind = frame[column].dtype
+    return pd.api.types.is_numeric_dtype(kind) and not pd.api.types.is_bool_dtype(kind)

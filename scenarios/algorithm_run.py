@@ -12,14 +12,15 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, Generic, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.exchange import ProgramDetails
-from marsyard.algorithms.faults import AlgorithmError, Fault, describe_error
-from marsyard.scenarios.estimators import labels
+from marsyard.algorithms.answers import AlgorithmError, Fault, describe_error
+from marsyard.algorithms.exchange import ExecutableLimits, ProgramDetails
+from marsyard.scenarios.estimators import Task, check_algorithms, labels
 from marsyard.scenarios.interface import CaseResult, Failure, Scalar, record_conditions
 
 Answer = TypeVar("Answer")
@@ -113,7 +114,7 @@ def run_algorithm(ask: Callable[[], object], check: Callable[[object], Answer]) 
     started = time.process_time()
     try:
         raw = ask()
-        taken = time.process_time() - started
+        elapsed_s = time.process_time() - started
         answer = check(raw)
     except Exception as error:
         row: dict[str, Scalar] = {"estimation_time_s": time.process_time() - started}
@@ -122,7 +123,7 @@ def run_algorithm(ask: Callable[[], object], check: Callable[[object], Answer]) 
             return AlgorithmRun(None, Failure(error.fault.name, str(error), ""), row)
         fault = Fault.OUT_OF_MEMORY if isinstance(error, MemoryError) else Fault.CRASHED
         return AlgorithmRun(None, Failure(fault.name, describe_error(error), traceback.format_exc()), row)
-    row = {"estimation_time_s": answer_time_s(answer, taken)}
+    row = {"estimation_time_s": answer_time_s(answer, elapsed_s)}
     details = getattr(answer, "details", None)
     if isinstance(details, ProgramDetails):
         row[STDERR] = details.stderr
@@ -161,3 +162,42 @@ def case_result(
         own["error"] = "" if other.failure is None else other.failure.error
         row |= {f"{name}.{column}": value for column, value in own.items()}
     return replace(first, row=row)
+
+
+class AlgorithmSelection(BaseModel):
+    """Parameters of scenarios with selectable algorithms; subclasses define the field `algorithm`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    task: ClassVar[Task[Any, Any]]
+
+    algorithm: str
+    compared: Annotated[
+        tuple[str, ...], Field(description="further algorithms, run on the same cases and compared with the first")
+    ] = ()
+    executable: Annotated[ExecutableLimits, Field(description="what an algorithm that is a program may use")] = (
+        ExecutableLimits()
+    )
+
+    @property
+    def algorithms(self) -> tuple[str, ...]:
+        """All algorithms; the first is the one under test."""
+        return (self.algorithm, *self.compared)
+
+    @field_validator("algorithm")
+    @classmethod
+    def _check_algorithm(cls, name: str) -> str:
+        cls.task.check(name)
+        return name
+
+    @field_validator("compared")
+    @classmethod
+    def _check_compared(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        check_algorithms(cls.task, names)
+        return names
+
+    @model_validator(mode="after")
+    def _check_distinct(self) -> AlgorithmSelection:
+        if self.algorithm in self.compared:
+            raise ValueError(f"the algorithm '{self.algorithm}' is named twice")
+        return self

@@ -11,6 +11,7 @@ from pydantic import BaseModel
 
 from marsyard.scenarios.algorithm_run import AlgorithmRun
 from marsyard.scenarios.interface import CaseResult, Scalar
+from marsyard.scenarios.parts.named import SCORE, Kind
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.terrain import Site, TerrainBank, TerrainParameters
 
@@ -35,7 +36,13 @@ class BaseScenario(Generic[ParametersType]):
 
 
 class TerrainScenario(BaseScenario[ParametersType], ABC):
-    """A scenario whose shared inputs are terrains; keeps the most recently used grounds in memory."""
+    """A scenario whose shared inputs are terrains; keeps the most recently used grounds in memory.
+
+    By default algorithms and scores are selected at the top level of the parameters.
+    """
+
+    algorithm_table: tuple[str, ...] = ()
+    part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
     def __init__(self, cached_grounds: int = 0) -> None:
         self.load_ground: LoadGround = lru_cache(maxsize=cached_grounds)(SiteGround.from_bank)

@@ -30,7 +30,6 @@ from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlob
 from marsyard.algorithms.interface import SiteEstimator, TargetTracker, VelocityEstimator
 from marsyard.algorithms.streams import STREAM_METHODS, StreamedEstimator
 from marsyard.algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
-from marsyard.scenarios.import_path import import_object, source_files
 from marsyard.scenarios.offline import (
     SITE_FORM,
     VELOCITY_FORM,
@@ -41,6 +40,7 @@ from marsyard.scenarios.offline import (
     read_answers,
 )
 from marsyard.scenarios.systems import systems
+from marsyard.scenarios.user_files import import_object, source_files
 
 #: Entry points of other packages' algorithms.
 GROUP = "marsyard.algorithms"
@@ -145,16 +145,18 @@ class Task(Generic[Algorithm, Options]):
                 return import_object(spec)
             except ImportError as error:
                 raise ValueError(f"no algorithm at '{spec}': {error}") from error
-        if spec not in installed():
-            allowed = [*self.shipped, *installed()]
+        if spec not in list_installed():
+            allowed = [*self.shipped, *list_installed()]
             near = difflib.get_close_matches(spec, allowed, n=1)
             hint = f" (did you mean '{near[0]}'?)" if near else ""
             own = "your own as 'module:Class' or 'exec:./program'"
             raise ValueError(f"unknown algorithm '{spec}'{hint}; allowed: {', '.join(allowed)}, or {own}")
         try:
-            return installed()[spec].load()
+            return list_installed()[spec].load()
         except (ImportError, AttributeError) as error:
-            raise ValueError(f"algorithm '{spec}' cannot be loaded from {installed()[spec].value}: {error}") from error
+            raise ValueError(
+                f"algorithm '{spec}' cannot be loaded from {list_installed()[spec].value}: {error}"
+            ) from error
 
 
 VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
@@ -218,14 +220,14 @@ def shipped_names() -> frozenset[str]:
 
 
 @cache
-def installed() -> Mapping[str, EntryPoint]:
+def list_installed() -> Mapping[str, EntryPoint]:
     """Return the algorithms of installed packages, sorted by name."""
     return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
 
 
 def algorithm_sources(spec: str) -> list[tuple[str, Path]]:
     """Return the source files of a user's algorithm in Python by name; empty for all others."""
-    path = installed()[spec].value if spec in installed() else spec
+    path = list_installed()[spec].value if spec in list_installed() else spec
     is_external = is_offline(spec) or spec.startswith(tuple(exchange.PREFIXES))
     return list(source_files(path)) if ":" in path and not is_external and spec not in shipped_names() else []
 

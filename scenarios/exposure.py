@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
 from marsyard.sim.dynamics import State
-from marsyard.sim.parameters import Parameters, bounded
+from marsyard.sim.parameters import Parameters, bounded_field
 from marsyard.sim.render import Frame, PixelRays, Scene, process_renderer
 from marsyard.sim.render.backend import Backend
 from marsyard.sim.sensor import DetectorParameters, ImageMotion, natural_fall_off
@@ -43,10 +43,14 @@ class CalibrationParameters(Parameters):
     Assumed: those of the descent camera's calibration, in pixels and as a fraction of the focal length.
     """
 
-    focal_error: Annotated[float, bounded(0.0, 0.05, "RMS relative error of the calibrated focal length")] = 0.0002
-    centre_error_px: Annotated[float, bounded(0.0, 50.0, "RMS error of the calibrated image centre per axis, px")] = 0.5
+    focal_error: Annotated[float, bounded_field(0.0, 0.05, "RMS relative error of the calibrated focal length")] = (
+        0.0002
+    )
+    centre_error_px: Annotated[
+        float, bounded_field(0.0, 50.0, "RMS error of the calibrated image centre per axis, px")
+    ] = 0.5
     distortion_error_px: Annotated[
-        float, bounded(0.0, 50.0, "RMS error of the calibrated distortion in the picture's corners, px")
+        float, bounded_field(0.0, 50.0, "RMS error of the calibrated distortion in the picture's corners, px")
     ] = 0.3
 
 
@@ -59,7 +63,7 @@ def add_calibration_error(
     - centre_error_px: error of the image centre, (columns, rows)
     - distortion_error_px: outward displacement of the corners
     """
-    shifted = camera.magnified(1.0 + focal_error).recentred(*centre_error_px)
+    shifted = camera.magnify(1.0 + focal_error).recentre(*centre_error_px)
     if isinstance(shifted, Cahv):
         shifted = Cahvor.from_cahv(shifted, r=np.zeros(3))
     # R1 moves a point outwards by the cube of its angle
@@ -99,7 +103,7 @@ class Sample:
     about: Mapping[str, Any]
 
 
-def summed_rows(rows_summed: int) -> slice:
+def sum_rows(rows_summed: int) -> slice:
     """Select the frame's rows with the truth of a picture's rows: the middle one of each that are summed."""
     return slice(rows_summed // 2, None, rows_summed)
 
@@ -139,7 +143,7 @@ def pixel_sample(
     hazard: UInt8[np.ndarray, "rows columns"] | None = None,
 ) -> Sample:
     """Assemble a picture and the truth of its pixels; `camera` is that of the delivered picture."""
-    rows = summed_rows(detector.rows_summed)
+    rows = sum_rows(detector.rows_summed)
     return Sample(
         image=counts,
         bits=detector.bits,

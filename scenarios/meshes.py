@@ -109,16 +109,12 @@ class Mesh:
     normals: Float64[np.ndarray, "faces 3 3"]
 
 
-def standing(meshes: Sequence[MeshParameters], surface: Surface, near: tuple[float, float]) -> Objects:
-    """Location all meshes on the ground, each at its repetition nearest to a point (x, y)."""
-    return Objects.joined([one.standing(surface, near) for one in meshes]) if meshes else Objects.none()
-
-
 def add_meshes(scene: Scene, meshes: Sequence[MeshParameters], near: tuple[float, float]) -> Scene:
-    """Add meshes to a scene; see `standing`."""
+    """Add meshes to a scene, each at its repetition nearest to a point (x, y)."""
     if not meshes:
         return scene
-    return scene.with_objects(Objects.joined([scene.objects, standing(meshes, scene.surface, near)]))
+    standing = Objects.join([one.standing(scene.surface, near) for one in meshes])
+    return scene.with_objects(Objects.join([scene.objects, standing]))
 
 
 def read_mesh(path: str) -> Mesh:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
@@ -17,18 +17,10 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from marsyard.algorithms.answers import check_site, check_velocity
+from marsyard.algorithms.answers import AlgorithmError, Fault, check_site, check_velocity
 from marsyard.algorithms.exchange import write_case
-from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
-from marsyard.scenarios.user_files import (
-    cells_by_column,
-    check_together,
-    finite_number,
-    format_problems,
-    header_problems,
-    read_lines,
-)
+from marsyard.scenarios.user_files import check_together, finite_number, format_problems, parse_table
 from marsyard.sim.files import check_regular
 from marsyard.sim.measurements import LandingMeasurements
 
@@ -177,30 +169,23 @@ def read_answers(file: Path, form: OfflineForm[Answer]) -> Mapping[int, Answer]:
 
 @lru_cache(maxsize=4)
 def _read(file: Path, form: OfflineForm[Any], _time: int, _size: int) -> Mapping[int, Any]:
-    header, lines = read_lines(file, MAX_ROWS)
-    hint = f"allowed: {', '.join(form.columns)}; units are those of the names"
-    problems = list(header_problems(header, ("case", *form.required), form.columns, hint))
-    if problems:
-        raise ValueError(format_problems(file, problems))
-    answers: dict[int, Any] = {}
     first_lines: dict[int, int] = {}
-    for line, cells in lines:
-        try:
-            case, answer = _parse_line(header, cells, form)
-            if case in answers:
-                raise ValueError(f"case {case} is answered twice, before in line {first_lines[case]}")
-        except (ValueError, AlgorithmError) as error:
-            problems.append(f"line {line}: {error}")
-            continue
-        answers[case], first_lines[case] = answer, line
+
+    def parse(line: int, cells: Mapping[str, str]) -> tuple[int, Any]:
+        case, answer = _parse_answer(cells, form)
+        if case in first_lines:
+            raise ValueError(f"case {case} is answered twice, before in line {first_lines[case]}")
+        first_lines[case] = line
+        return case, answer
+
+    hint = f"allowed: {', '.join(form.columns)}; units are those of the names"
+    answers, problems = parse_table(file, MAX_ROWS, ("case", *form.required), form.columns, hint, parse)
     if problems:
         raise ValueError(format_problems(file, problems))
-    return answers
+    return dict(answers)
 
 
-def _parse_line(header: Sequence[str], cells: Sequence[str], form: OfflineForm[Any]) -> tuple[int, Any]:
-    """Parse a line's case and answer."""
-    stated = {name: cell.strip() for name, cell in cells_by_column(header, cells).items()}
+def _parse_answer(stated: Mapping[str, str], form: OfflineForm[Any]) -> tuple[int, Any]:
     if not stated["case"].isdecimal():
         raise ValueError(f"case is '{stated['case']}'; allowed: a whole number from 0")
     numbers = {}

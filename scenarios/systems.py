@@ -13,26 +13,150 @@ from __future__ import annotations
 import difflib
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import cast
 
-from marsyard.scenarios.import_path import import_object
 from marsyard.scenarios.interface import Scenario
-from marsyard.scenarios.system import System
+from marsyard.scenarios.user_files import import_object
+
+#: Folder of the files that the systems of Marsyard share.
+SCENARIOS_FOLDER = Path(__file__).resolve().parent
+
+
+@dataclass(frozen=True)
+class Ingested:
+    """Cases made of recorded data: text of the campaign file, numbers, and a note for the user."""
+
+    campaign: str
+    cases: int
+    pictures: int
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class System:
+    """A system under test; plain data, whose ``module:NAME`` objects are imported when they are needed.
+
+    A system of another package is a module-level object of this class, named by an entry point of the group
+    `marsyard.systems` (`marsyard.scenarios.systems`).
+
+    - name: short unique name; the dashboard groups campaigns by it
+    - title, summary: name for a reader, and one sentence on the tests
+    - scenarios: classes that implement `marsyard.scenarios.interface.Scenario`, by the names in campaign files
+    - tasks: each a `marsyard.scenarios.estimators.Task`: the published algorithm, the baselines, and the accepted forms
+      of a user's algorithm. Entry points of the group `marsyard.algorithms` add algorithms.
+    - catalogue: campaign files, as a folder and a pattern (``folder/altitude-*.toml``)
+    - requirements: a file of requirements that campaigns name by their ids, as `scenarios/requirements.toml`
+    - columns: a file of the columns of each scenario's rows, as `scenarios/columns.toml`. Without it requirements are
+      checked against the first finished case.
+    - compiled_by: campaigns of the catalogue, each with settings (``KEY=VALUE``) that make it small: one case of each
+      calls all numeric kernels of its scenario (`marsyard compile`)
+    - templates: each a `marsyard.scenarios.template.CampaignTemplate`, by the values of ``marsyard new --system``
+    - ingest: function that makes cases of recorded data (`marsyard ingest`). Arguments: the folder of the data, a
+      folder to write into, and the folder to which that is moved. Returns `Ingested`.
+    - report: a `marsyard.reports.presentation.Presentation`: report sections, and the pictures of a case
+    """
+
+    name: str
+    title: str
+    summary: str
+    scenarios: Mapping[str, str]
+    tasks: tuple[str, ...] = ()
+    catalogue: Path | None = None
+    requirements: Path | None = None
+    columns: Path | None = None
+    compiled_by: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    templates: Mapping[str, str] = field(default_factory=dict)
+    ingest: str = ""
+    report: str = ""
+
+    @property
+    def campaigns(self) -> Mapping[str, Path]:
+        """Files of the catalogue by campaign."""
+        if self.catalogue is None:
+            return {}
+        return {path.stem: path for path in sorted(self.catalogue.parent.glob(self.catalogue.name))}
+
 
 #: Entry points of other packages' systems.
 GROUP = "marsyard.systems"
 
+#: Files that the systems of Marsyard share.
+_CATALOGUE = SCENARIOS_FOLDER / "catalogue"
+_REQUIREMENTS, _COLUMNS = SCENARIOS_FOLDER / "requirements.toml", SCENARIOS_FOLDER / "columns.toml"
+
 #: The systems of Marsyard. Recorded pictures come first: their products are also those of others.
 BUILT_IN = (
-    "marsyard.scenarios.measured.system:MEASURED",
-    "marsyard.scenarios.descent.system:DIMES",
-    "marsyard.scenarios.fieldtest.system:FIELD_TEST",
-    "marsyard.scenarios.rover.system:VTT",
-    "marsyard.scenarios.landing.system:HDA",
+    System(
+        name="measured",
+        title="Recorded pictures",
+        summary="Algorithms on real pictures, compared with the measured poses.",
+        scenarios={
+            "measured-velocity": "marsyard.scenarios.measured.scenarios:MeasuredVelocityScenario",
+            "measured-landing": "marsyard.scenarios.measured.scenarios:MeasuredLandingScenario",
+            "measured-matching": "marsyard.scenarios.measured.scenarios:MatchingScenario",
+        },
+        tasks=("marsyard.scenarios.estimators:VELOCITY", "marsyard.scenarios.estimators:LANDING"),
+        columns=_COLUMNS,
+        ingest="marsyard.scenarios.measured.ingest:ingest_campaign",
+        report="marsyard.reports.measured.presentation:MEASURED",
+    ),
+    System(
+        name="dimes",
+        title="Descent Image Motion Estimation System (DIMES)",
+        summary="Horizontal velocity of a lander under its parachute, from three pictures.",
+        scenarios={"descent": "marsyard.scenarios.descent.scenario:DescentScenario"},
+        tasks=("marsyard.scenarios.estimators:VELOCITY",),
+        catalogue=_CATALOGUE / "dimes-*.toml",
+        requirements=_REQUIREMENTS,
+        columns=_COLUMNS,
+        compiled_by={"dimes-smoke": ("terrain.samples=512",)},
+        templates={"velocity": "marsyard.scenarios.template:VELOCITY"},
+        report="marsyard.reports.dimes.presentation:DIMES",
+    ),
+    System(
+        name="fieldtest",
+        title="Field test of DIMES on a helicopter",
+        summary="Horizontal velocity of a helicopter from triples of pictures over desert ground.",
+        scenarios={"fieldtest": "marsyard.scenarios.fieldtest.scenario:FieldTestScenario"},
+        tasks=("marsyard.scenarios.estimators:VELOCITY",),
+        catalogue=_CATALOGUE / "dimes-fieldtest.toml",
+        columns=_COLUMNS,
+        report="marsyard.reports.dimes.presentation:FIELD_TEST",
+    ),
+    System(
+        name="vtt",
+        title="Visual target tracking (VTT)",
+        summary="Position of a target that a rover drives at, tracked in the pictures of its mast.",
+        scenarios={
+            "rover": "marsyard.scenarios.rover.scenario:RoverScenario",
+            "rover-drive": "marsyard.scenarios.rover.scenario:SharedDriveScenario",
+        },
+        tasks=("marsyard.scenarios.estimators:TRACKING",),
+        catalogue=_CATALOGUE / "vtt-*.toml",
+        requirements=_REQUIREMENTS,
+        columns=_COLUMNS,
+        compiled_by={"vtt-checkout-2": ("world.samples=512", "start.distance_m=2.4", "target.diameter_m=0.5")},
+        templates={"tracking": "marsyard.scenarios.template:TRACKING"},
+        report="marsyard.reports.vtt.presentation:VTT",
+    ),
+    System(
+        name="hda",
+        title="Hazard detection and avoidance (HDA)",
+        summary="A safe landing site from two pictures of a moving camera.",
+        scenarios={"landing": "marsyard.scenarios.landing.scenario:LandingScenario"},
+        tasks=("marsyard.scenarios.estimators:LANDING",),
+        catalogue=_CATALOGUE / "hda-*.toml",
+        requirements=_REQUIREMENTS,
+        columns=_COLUMNS,
+        compiled_by={"hda-benign": ("terrain.samples=512",)},
+        templates={"landing": "marsyard.scenarios.template:LANDING"},
+        report="marsyard.reports.hda.presentation:HDA",
+    ),
 )
 
 
@@ -47,7 +171,7 @@ class Registry:
 @cache
 def registry() -> Registry:
     """Read the systems of this installation, once per process."""
-    usable: list[System] = [import_object(path) for path in BUILT_IN]
+    usable = list(BUILT_IN)
     problems: list[str] = []
     for point in sorted(entry_points(group=GROUP), key=lambda one: (one.name, one.value)):
         try:
@@ -77,7 +201,7 @@ def template_paths() -> Mapping[str, str]:
     return {name: path for system in systems() for name, path in system.templates.items()}
 
 
-def system_of(scenario: str) -> System | None:
+def find_system(scenario: str) -> System | None:
     """Return the system with a scenario of this name or ``module:Class``; None without one."""
     return next((one for one in systems() if scenario in {*one.scenarios, *one.scenarios.values()}), None)
 
@@ -89,7 +213,7 @@ def _load(point: EntryPoint, others: list[System]) -> System:
     except ImportError as error:
         raise ValueError(f"it cannot be imported: {error}") from error
     if not isinstance(system, System):
-        raise ValueError(f"it is a {type(system).__name__}; allowed: a marsyard.scenarios.system.System")
+        raise ValueError(f"it is a {type(system).__name__}; allowed: a marsyard.scenarios.systems.System")
     missing = [str(path) for path in (system.requirements, system.columns) if path is not None and not path.is_file()]
     if system.catalogue is not None and not system.campaigns:
         missing.append(str(system.catalogue))
@@ -131,7 +255,7 @@ class RowColumns:
 @cache
 def row_columns(scenario: str) -> RowColumns | None:
     """Return the columns of a scenario; None where its system does not state them. Raises ValueError for a bad file."""
-    system = system_of(scenario)
+    system = find_system(scenario)
     if system is None or system.columns is None:
         return None
     try:

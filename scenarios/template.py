@@ -11,7 +11,9 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from marsyard.scenarios.system import SCENARIOS_FOLDER
+from marsyard.scenarios.descent.parameters import binned_size_for
+from marsyard.scenarios.systems import SCENARIOS_FOLDER
+from marsyard.sim.camera import read_camera
 
 #: Number of terrains of a new campaign's bank: enough for appended cases, and the maximum of a bank.
 MIN_TERRAINS, MAX_TERRAINS = 10_000, 100_000
@@ -83,3 +85,39 @@ def toml_environment(*folders: Path) -> Environment:
     )
     environment.filters["toml"] = json.dumps
     return environment
+
+
+def _binned_size(choices: Choices) -> Mapping[str, Any]:
+    return {"binned_size": binned_size_for(*read_camera(choices.camera).size)} if choices.camera else {}
+
+
+_REFUSED_FLIGHT = "--flight: only descents fly a file's trajectory, and {} is none"
+_REFUSED_CAMERA = (
+    "--camera and --detector: tracking looks through a mast's stereo pair; see camera.preset and camera.custom"
+)
+
+VELOCITY = CampaignTemplate(
+    file=SCENARIOS_FOLDER / "descent" / "new.toml.j2",
+    scale="descent",
+    site="gusev",
+    bound=5.0,
+    bound_text="horizontal velocity within this many m/s (5 of the DIMES requirement)",
+    values=_binned_size,
+)
+LANDING = CampaignTemplate(
+    file=SCENARIOS_FOLDER / "landing" / "new.toml.j2",
+    scale="ground",
+    site="heli-hazardous",
+    bound=0.99,
+    bound_text="fraction of chosen sites that must be safe",
+    max_bound=1.0,
+    refused={"flight": _REFUSED_FLIGHT.format("landing")},
+)
+TRACKING = CampaignTemplate(
+    file=SCENARIOS_FOLDER / "rover" / "new.toml.j2",
+    scale="ground",
+    site="mars-yard",
+    bound=0.03,
+    bound_text="position of the target within this many metres at the goal",
+    refused={"camera": _REFUSED_CAMERA, "detector": _REFUSED_CAMERA, "flight": _REFUSED_FLIGHT.format("tracking")},
+)

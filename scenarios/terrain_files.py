@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import AfterValidator
 
 from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, npz_headers
-from marsyard.sim.terrain import Site, TerrainParameters, site
+from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, check_holes, choose_grid, read_rasters
 
 #: Maximum posts of a DTM and pixels of a picture along a side: limits of the largest terrain and of memory.
@@ -40,6 +40,18 @@ def _check_terrain(terrain: TerrainParameters) -> TerrainParameters:
 
 #: A terrain whose files are checked: raises TerrainFileError where they are unusable.
 CheckedTerrain = Annotated[TerrainParameters, AfterValidator(_check_terrain)]
+
+
+def check_site(user: str, scale: str) -> AfterValidator:
+    """Return a check of a site's name: a preset with a terrain at the scale; messages name the user of the site."""
+
+    def check(name: str | None) -> str | None:
+        allowed = [one.name for one in sites().values() if getattr(one, scale) is not None]
+        if name is not None and name not in allowed:
+            raise ValueError(f"no site for {user} is called '{name}'; allowed: {', '.join(allowed)}")
+        return name
+
+    return AfterValidator(check)
 
 
 def check_source(source: RealTerrain) -> None:
@@ -283,11 +295,11 @@ def site_or_file(name: str, max_hole_fraction: float = MAX_HOLE_FRACTION) -> Sit
     path = Path(name)
     source = RealTerrain(dtm=path, max_hole_fraction=max_hole_fraction)
     check_source(source)
-    return _imported(source, path.stat().st_mtime_ns)
+    return _import_site(source, path.stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=4)
-def _imported(source: RealTerrain, _changed_ns: int) -> Site:
+def _import_site(source: RealTerrain, _changed_ns: int) -> Site:
     samples, spacing_m = choose_grid(source)
     terrain = TerrainParameters(samples=samples, spacing_m=spacing_m, craters_per_km2=0.0, source=source)
     changes = {

@@ -1,19 +1,84 @@
-"""Files of a user: parameters that name a file with its hash, CSV tables, and lists of problems."""
+"""Files of a user: parameters that name a file with its hash, CSV tables, import paths, and lists of problems."""
 
 from __future__ import annotations
 
 import csv
 import difflib
+import importlib
+import importlib.util
 import math
+import sys
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal, Protocol, TypeVar, runtime_checkable
 
+import numpy as np
+from jaxtyping import Float64
 from pydantic import BaseModel, Field, model_validator
+from scipy.spatial.transform import Rotation
 
+from marsyard.algorithms.answers import AlgorithmError
 from marsyard.sim.files import check_regular
+from marsyard.sim.frames import SITE_FROM_WORLD
 from marsyard.sim.parameters import Parameters
+
+#: Packages that were imported under their own names before they became parts of `marsyard`.
+_FORMER = ("sim", "algorithms", "scenarios", "campaigns", "reports")
+
+
+def current_module(module: str) -> str:
+    """Return the current name of a module that a stored campaign or an older file names by its former one.
+
+    ``algorithms.dimes`` becomes ``marsyard.algorithms.dimes``; names of other packages are returned unchanged.
+    """
+    if module.partition(".")[0] not in _FORMER:
+        return module
+    try:
+        exists = importlib.util.find_spec(f"marsyard.{module}") is not None
+    except ImportError:
+        exists = False
+    return f"marsyard.{module}" if exists else module
+
+
+def import_object(path: str) -> Any:
+    """Import the object at ``module:name``. Raises ImportError with the reason.
+
+    The current folder is searched last: a file in it never shadows an installed package.
+    """
+    module, _, name = path.partition(":")
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)
+    try:
+        return getattr(importlib.import_module(current_module(module)), name)
+    except ImportError:
+        raise
+    except Exception as error:  # a module may raise anything
+        raise ImportError(f"{type(error).__name__}: {error}") from error
+
+
+def source_files(path: str) -> Iterator[tuple[str, Path]]:
+    """Yield names and files of the sources of the package or module that contains ``module:name``."""
+    parts = current_module(path.partition(":")[0]).split(".")
+    top = ".".join(parts[:2] if parts[0] == "marsyard" else parts[:1])
+    spec = importlib.util.find_spec(top)
+    if spec is None or spec.origin is None:
+        return
+    origin = Path(spec.origin)
+    if spec.submodule_search_locations:
+        yield from relative_to(origin.parent.parent, sorted(origin.parent.rglob("*.py")))
+    else:
+        yield origin.name, origin
+
+
+def relative_to(base: Path, paths: Iterable[Path]) -> Iterator[tuple[str, Path]]:
+    """Yield files with their names relative to a folder."""
+    for path in paths:
+        yield path.relative_to(base).as_posix(), path
+
+
+Row = TypeVar("Row")
 
 #: Maximum number of problems of a file in one message.
 _MAX_PROBLEMS = 20
@@ -81,11 +146,35 @@ def format_problems(file: Path, problems: Sequence[str]) -> str:
     return "\n  ".join([f"{file}:", *problems[:_MAX_PROBLEMS], *more])
 
 
-def read_lines(path: Path, max_rows: int) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Read the column names and the non-empty lines with their numbers.
+def parse_table(
+    path: Path,
+    max_rows: int,
+    needed: Sequence[str],
+    allowed: Sequence[str],
+    hint: str,
+    parse: Callable[[int, Mapping[str, str]], Row],
+) -> tuple[list[Row], list[str]]:
+    """Parse the rows of a table by line and cells; return them, and the problems of the others by line.
 
-    Raises ValueError where the file is unreadable, is no table with commas, or has too many rows.
+    Raises ValueError where the file is unreadable, is no table with commas, has too many rows, or lacks columns or has
+    unknown ones; `hint` states the allowed ones. `parse` raises ValueError or AlgorithmError.
     """
+    header, lines = _read_lines(path, max_rows)
+    problems = list(_header_problems(header, needed, allowed, hint))
+    if problems:
+        raise ValueError(format_problems(path, problems))
+    rows: list[Row] = []
+    for line, cells in lines:
+        try:
+            if len(cells) != len(header):
+                raise ValueError(f"it has {len(cells)} cells; the first line has {len(header)}")
+            rows.append(parse(line, dict(zip(header, cells, strict=True))))
+        except (ValueError, AlgorithmError) as error:
+            problems.append(f"line {line}: {error}")
+    return rows, problems
+
+
+def _read_lines(path: Path, max_rows: int) -> tuple[list[str], list[tuple[int, list[str]]]]:
     try:
         check_regular(path)
         with path.open(newline="", encoding="utf-8-sig") as text:
@@ -104,8 +193,7 @@ def read_lines(path: Path, max_rows: int) -> tuple[list[str], list[tuple[int, li
     return header, lines
 
 
-def header_problems(header: Sequence[str], needed: Sequence[str], allowed: Sequence[str], hint: str) -> Iterator[str]:
-    """Yield missing, unknown and repeated columns; `hint` states the allowed ones."""
+def _header_problems(header: Sequence[str], needed: Sequence[str], allowed: Sequence[str], hint: str) -> Iterator[str]:
     if not header:
         yield "it is empty"
         return
@@ -119,13 +207,6 @@ def header_problems(header: Sequence[str], needed: Sequence[str], allowed: Seque
             yield f"unknown column '{name}'{suggestion}; {hint}"
         if header.count(name) > 1:
             yield f"the column '{name}' stands there twice"
-
-
-def cells_by_column(header: Sequence[str], cells: Sequence[str]) -> dict[str, str]:
-    """Return a row's cells by column. Raises ValueError for another number of cells than columns."""
-    if len(cells) != len(header):
-        raise ValueError(f"it has {len(cells)} cells; the first line has {len(header)}")
-    return dict(zip(header, cells, strict=True))
 
 
 def finite_number(name: str, text: str, otherwise: str = "") -> float:
@@ -146,3 +227,46 @@ def check_together(groups: Iterable[Sequence[str]], given: Mapping[str, float]) 
         missing = [name for name in names if name not in given]
         if filled and missing:
             raise ValueError(f"{filled[0]} is given, but {missing[0]} is not")
+
+
+#: Rotations from a file's world axes to east, north, up.
+_WORLD = {"enu": Rotation.identity(), "ned": SITE_FROM_WORLD.inv()}
+#: OpenCV's camera axes (x right, y down, z forward) in the body's: camera along -z, columns along x.
+_CAMERA_IN_BODY = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+
+
+class RecordedAxes(Parameters):
+    """Axes of recorded poses, and mounting of the camera in the recorded vehicle."""
+
+    axes: Annotated[Literal["enu", "ned"], Field(description="world axes: east, north, up; or north, east, down")]
+    attitude_of: Annotated[
+        Literal["camera", "body"],
+        Field(description="whose axes: OpenCV's of the camera, or the body's, whose camera looks along -z"),
+    ] = "camera"
+    mounting: Annotated[
+        tuple[float, float, float, float],
+        Field(description="quaternion x, y, z, w from those axes of the camera or body to the recorded vehicle's"),
+    ] = (0.0, 0.0, 0.0, 1.0)
+    lever_m: Annotated[
+        tuple[float, float, float], Field(description="the camera in the recorded vehicle's axes, m")
+    ] = (0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _check_mounting(self) -> RecordedAxes:
+        if abs(float(np.linalg.norm(self.mounting)) - 1.0) > 1e-3:
+            raise ValueError(f"mounting {list(self.mounting)} is no quaternion of length 1")
+        return self
+
+    @property
+    def world(self) -> Rotation:
+        """Rotation from the file's world axes to east, north, up."""
+        return _WORLD[self.axes]
+
+    def bodies(self, world_from_vehicle: Rotation) -> Rotation:
+        """Convert attitudes of the recorded vehicle to those of the body, both relative to east, north, up."""
+        attitudes = world_from_vehicle * Rotation.from_quat(np.array(self.mounting))
+        return attitudes * _CAMERA_IN_BODY.inv() if self.attitude_of == "camera" else attitudes
+
+    def levers(self, world_from_vehicle: Rotation) -> Float64[np.ndarray, "*batch 3"]:
+        """Return the offsets from the recorded vehicle to the camera in east, north, up."""
+        return np.asarray(world_from_vehicle.apply(np.array(self.lever_m)))

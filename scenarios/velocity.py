@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float64, UInt16
 
+from marsyard.algorithms.answers import AlgorithmError, Fault
 from marsyard.algorithms.dimes import DimesDetails, dimes_products
-from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator
 from marsyard.algorithms.streams import StreamedEstimator, set_span
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm_on_copy

@@ -54,7 +54,7 @@ def limit_bytes(folder: Path, kept_bytes: int) -> int:
     return int(gigabytes * GIGA)
 
 
-def kept_bytes(folder: Path) -> int:
+def cached_bytes(folder: Path) -> int:
     """Return the total size of the finished files in a folder."""
     total = 0
     for path in (path for path in folder.iterdir() if path.suffix != UNFINISHED):

@@ -1,4 +1,4 @@
-"""Cache folder of compiled kernels: one folder per state of the kernels' sources.
+"""Cache folder of compiled kernels: one folder per state of the kernels' sources and per processor.
 
 numba recompiles a function when its own file changes, not when a function that it calls from another file changes. A
 stale kernel would return old results. Any change of any kernel source therefore selects a new folder.
@@ -8,12 +8,24 @@ from __future__ import annotations
 
 import hashlib
 import os
+import platform
 import sys
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 from marsyard.sim.cache import cache_directory
-from marsyard.sim.processor import processor_features
+
+
+@cache
+def processor_features() -> str:
+    """Return the machine type and a hash of the instruction set extensions that compiled code is made for."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    stated = next((line.split(":", 1)[1] for line in lines if line.startswith(("flags", "Features"))), "")
+    flags = " ".join(sorted(stated.split()))
+    return f"{platform.machine()}-{hashlib.sha256(flags.encode()).hexdigest()[:12]}"
+
 
 #: The folders that hold kernels, in the source tree and in an installation.
 _FOLDERS = ("sim", "algorithms", "scenarios")

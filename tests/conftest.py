@@ -1,4 +1,4 @@
-"""What all tests share. Everything above the fixtures happens before any of Marsyard's packages is imported."""
+"""Settings and fixtures of all tests. Statements above the fixtures run before any import of Marsyard's packages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SHARED_DATA = ROOT.parent / "shared" / "data"
 
 
-def _loads(library: str) -> bool:
+def _can_load(library: str) -> bool:
     try:
         ctypes.CDLL(library)
     except OSError:
@@ -28,17 +28,17 @@ def _loads(library: str) -> bool:
     return True
 
 
-# One GL backend a process, chosen before PyOpenGL's first import: OSMesa if MARSYARD_GL is silent and it is there.
-_BACKEND = os.environ.setdefault("MARSYARD_GL", "osmesa" if _loads("libOSMesa.so.8") else "egl")
+# One OpenGL backend per process, selected before the first import of PyOpenGL. Default: OSMesa if it is installed.
+_BACKEND = os.environ.setdefault("MARSYARD_GL", "osmesa" if _can_load("libOSMesa.so.8") else "egl")
 os.environ["PYOPENGL_PLATFORM"] = _BACKEND
 
-# One thread a process: pytest-xdist has the cores. Before NumPy is imported, or its BLAS has counted them already.
+# One thread per process, because pytest-xdist uses the cores. Set before the import of NumPy, whose BLAS counts cores.
 for _variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ[_variable] = "1"
 os.environ["MPLBACKEND"] = "Agg"
-# Programs that tests start, and their workers, import the tests' modules by name.
+# Programs started by tests, and their workers, import test modules by name.
 os.environ["PYTHONPATH"] = os.pathsep.join([*filter(None, [os.environ.get("PYTHONPATH")]), str(ROOT)])
-# Terrains that tests build outlive the run, but stay out of the user's own cache; compiled kernels are shared with it.
+# Terrains of tests have a separate persistent cache; compiled kernels are shared with the user's cache.
 if "MARSYARD_CACHE" not in os.environ:
     _CACHE = ROOT / "build" / "test-cache"
     _KERNELS = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "marsyard" / "kernels"
@@ -51,7 +51,7 @@ if "MARSYARD_CACHE" not in os.environ:
 hypothesis.settings.register_profile("marsyard", deadline=None, derandomize="CI" in os.environ)
 hypothesis.settings.load_profile("marsyard")
 
-#: Packages whose signatures (array shapes, units' types) are checked at run time while the tests run.
+#: Packages whose signatures (array shapes and types) are checked at run time by the tests.
 CHECKED_PACKAGES = [
     "marsyard.sim.camera",
     "marsyard.sim.dynamics",
@@ -62,8 +62,8 @@ CHECKED_PACKAGES = [
 ]
 
 
-class _KernelsAreLeftAlone(MetaPathFinder):
-    """Finds `kernels` (modules, packages) past the checking hook: numba cannot compile a wrapped function."""
+class _SkipKernels(MetaPathFinder):
+    """Import `kernels` modules and packages without the checking hook: numba cannot compile wrapped functions."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
@@ -77,11 +77,11 @@ _too_early = sorted(set(CHECKED_PACKAGES) & set(sys.modules))
 if _too_early:
     raise RuntimeError(f"imported before the run-time checks of shapes were switched on: {', '.join(_too_early)}")
 jaxtyping.install_import_hook(CHECKED_PACKAGES, "beartype.beartype")
-sys.meta_path.insert(0, _KernelsAreLeftAlone())
+sys.meta_path.insert(0, _SkipKernels())
 
 
 def pytest_report_header() -> list[str]:
-    """Says what the outcome depends on beside the sources."""
+    """State OpenGL backend and shared data, on which the results depend."""
     data = SHARED_DATA if SHARED_DATA.is_dir() else "absent: the tests that need it are skipped"
     return [f"GL backend: {_BACKEND}", f"shared data: {data}"]
 
@@ -95,7 +95,7 @@ def _opencv_single_threaded() -> None:
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of real camera labels and terrain beside the checkout; the test is skipped where there is none."""
+    """Folder of real camera labels and terrain next to the repository; without it, the test is skipped."""
     if not SHARED_DATA.is_dir():
         pytest.skip(f"needs the real data in {SHARED_DATA}, which is not there")
     return SHARED_DATA

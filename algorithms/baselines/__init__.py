@@ -9,12 +9,5 @@ from marsyard.algorithms.baselines.pairs import (
     PhaseCorrelationOptions,
 )
 
-__all__ = [
-    "BaselineDetails",
-    "HomographyEstimator",
-    "HomographyOptions",
-    "PairMatch",
-    "PairPatches",
-    "PhaseCorrelationEstimator",
-    "PhaseCorrelationOptions",
-]
+__all__ = ["BaselineDetails", "HomographyEstimator", "HomographyOptions", "PairMatch", "PairPatches"]
+__all__ += ["PhaseCorrelationEstimator", "PhaseCorrelationOptions"]

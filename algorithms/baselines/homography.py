@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from marsyard.algorithms.arrays import Points2, Raster, Vector2
 from marsyard.algorithms.baselines.pairs import (
     DEFAULT_COMMON_OPTIONS,
     CommonOptions,
@@ -71,20 +72,18 @@ class HomographyEstimator:
         )
         if homography is None or not inliers.any():
             return None
-        kept = inliers.ravel().astype(bool)
-        middle = points[0][kept].mean(axis=0).astype(np.float64)
+        inlier = inliers.ravel().astype(bool)
+        middle = points[0][inlier].mean(axis=0).astype(np.float64)
         moved = homography @ np.array([*middle, 1.0])
         if abs(moved[2]) < 1e-9:
             return None
-        found = moved[:2] / moved[2]
-        count = int(kept.sum())
-        valid = count >= o.min_inliers and distortion(homography, moved[2], found) <= o.max_distortion
-        return PairMatch(np.asarray(found - middle), float(count), valid)
+        point = moved[:2] / moved[2]
+        count = int(inlier.sum())
+        valid = count >= o.min_inliers and distortion(homography, moved[2], point) <= o.max_distortion
+        return PairMatch(np.asarray(point - middle), float(count), valid)
 
 
-def distortion(
-    homography: Float[np.ndarray, "3 3"], depth: float | np.floating, place: Float[np.ndarray, "2"]
-) -> float:
+def distortion(homography: Float[np.ndarray, "3 3"], depth: float | np.floating, place: Vector2) -> float:
     """Largest relative length change by the homography about the point that it maps to `place`.
 
     `depth` is the third homogeneous component of the mapped point.
@@ -93,21 +92,18 @@ def distortion(
     return float(np.abs(np.linalg.svd(jacobian, compute_uv=False) - 1.0).max())
 
 
-def stretch_to_8_bits(patch: Float[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:
+def stretch_to_8_bits(patch: Raster) -> UInt8[np.ndarray, "rows columns"]:
     """The patch stretched to 8 bits between its 0.5 % and 99.5 % quantiles."""
     low, high = np.quantile(patch, (0.005, 0.995))
     scaled = (patch - low) * (255.0 / max(float(high - low), 1e-9))
     return np.asarray(np.clip(np.rint(scaled), 0, 255).astype(np.uint8))
 
 
-def match_features(
-    patches: PairPatches, options: HomographyOptions
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]] | None:
+def match_features(patches: PairPatches, options: HomographyOptions) -> tuple[Points2, Points2] | None:
     """Positions (column, row) of matching features in both images; None if too few for a homography."""
     orb = cv2.ORB.create(nfeatures=options.features, fastThreshold=options.fast_threshold)
-    (first, first_bits), (second, second_bits) = (
-        orb.detectAndCompute(stretch_to_8_bits(patch), None) for patch in (patches.first, patches.second)
-    )
+    images = (stretch_to_8_bits(patch) for patch in (patches.first, patches.second))
+    (first, first_bits), (second, second_bits) = (orb.detectAndCompute(image, None) for image in images)
     if first_bits is None or second_bits is None or len(second) < 2:
         return None
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(first_bits, second_bits, k=2)

@@ -1,6 +1,6 @@
 """Image pairs rectified to a common camera that looks straight down, and the phase correlation of such pairs.
 
-The baselines see the same corrected images as DIMES, in the same geometry (`dimes.rectification.rectify_patch`),
+The baselines see the same corrected images as DIMES, in the same geometry (`dimes.binning.rectify_patch`),
 but the whole overlap of two images rather than templates. The IMU checks the change between their two velocities as in
 DIMES, with the same threshold. Only the measurement of the shift differs.
 """
@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.algorithms.dimes.binning import View, inside_frame, pixel_angle_rad, usable_views
+from marsyard.algorithms.arrays import Vector2
+from marsyard.algorithms.dimes import binning
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.rectification import ground_lattice, rectify_patch
 from marsyard.algorithms.dimes.validity import combinations
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
@@ -69,7 +69,7 @@ class PairMatch:
     - valid: Whether the match is accepted
     """
 
-    shift_px: Float[np.ndarray, "2"]
+    shift_px: Vector2
     score: float
     valid: bool
 
@@ -86,35 +86,37 @@ Matcher = Callable[[PairPatches], PairMatch | None]
 
 
 def find_common_square(
-    first: View, second: View, options: CommonOptions
-) -> tuple[Float[np.ndarray, "2"], int, float] | None:
+    first: binning.View, second: binning.View, options: CommonOptions
+) -> tuple[Vector2, int, float] | None:
     """The largest square of ground in both views at zero motion: middle, side in pixels, ground sample distance.
 
     Sides run east and north. None if it is smaller than `min_side_px`.
     """
-    gsd = float(second.centre[2]) * pixel_angle_rad(second)
+    gsd = float(second.centre[2]) * binning.pixel_angle_rad(second)
     reach = np.tan(options.max_off_nadir_rad) * float(min(first.centre[2], second.centre[2]))
     per_side = 2 * int(np.ceil(reach / (COARSE_STEP_PX * gsd))) + 1
-    lattice = ground_lattice(np.zeros(2), per_side, COARSE_STEP_PX * gsd)
-    seen = np.ones(lattice.shape[:2], dtype=bool)
+    lattice = binning.ground_lattice(np.zeros(2), per_side, COARSE_STEP_PX * gsd)
+    visible = np.ones(lattice.shape[:2], dtype=bool)
     for view in (first, second):
-        seen &= inside_frame(view, lattice, options.border_px, options.max_off_nadir_rad)
+        visible &= binning.inside_frame(view, lattice, options.border_px, options.max_off_nadir_rad)
     # chessboard distance to the nearest invisible point: half sides of squares
-    steps = cv2.distanceTransform(np.pad(seen, 1).astype(np.uint8), cv2.DIST_C, 3)[1:-1, 1:-1]
+    steps = cv2.distanceTransform(np.pad(visible, 1).astype(np.uint8), cv2.DIST_C, 3)[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(steps)), steps.shape)
     side = min(2 * (int(steps[row, column]) - 1) * COARSE_STEP_PX, options.max_side_px)
     return (lattice[row, column], side, gsd) if side >= options.min_side_px else None
 
 
-def rectify_pair(first: View, second: View, options: CommonOptions) -> PairPatches | None:
+def rectify_pair(first: binning.View, second: binning.View, options: CommonOptions) -> PairPatches | None:
     """Both images of a pair over their common ground; None if it is too small."""
-    found = find_common_square(first, second, options)
-    return found and PairPatches(rectify_patch(first, *found), rectify_patch(second, *found), found[2])
+    square = find_common_square(first, second, options)
+    return square and PairPatches(
+        binning.rectify_patch(first, *square), binning.rectify_patch(second, *square), square[2]
+    )
 
 
 def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, options: CommonOptions) -> VelocityEstimate:
     """The velocity over the second pair, if both pairs match and their difference agrees with the IMU."""
-    triple = usable_views(measurements, options.binned_size)
+    triple = binning.usable_views(measurements, options.binned_size)
     if triple is None:
         return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, BaselineDetails((), ()))
     views = ((triple[0], triple[1]), (triple[1], triple[2]))

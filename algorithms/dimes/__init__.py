@@ -3,17 +3,7 @@
 from marsyard.algorithms.dimes.details import DimesDetails, PairDetails, Track, dimes_products
 from marsyard.algorithms.dimes.estimator import DimesEstimator
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.validity import Combination, TrackMetrics, ValidityCheck, propagated
+from marsyard.algorithms.dimes.validity import Combination, TrackMetrics, ValidityCheck, propagate_velocity
 
-__all__ = [
-    "Combination",
-    "DimesDetails",
-    "DimesEstimator",
-    "DimesOptions",
-    "PairDetails",
-    "Track",
-    "TrackMetrics",
-    "ValidityCheck",
-    "dimes_products",
-    "propagated",
-]
+__all__ = ["Combination", "DimesDetails", "DimesEstimator", "DimesOptions", "PairDetails", "Track", "TrackMetrics"]
+__all__ += ["ValidityCheck", "dimes_products", "propagate_velocity"]

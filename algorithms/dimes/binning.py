@@ -1,4 +1,16 @@
-"""Binned images above their ground planes, and the mapping between their pixels and the ground (section II.A)."""
+"""Binned images above their ground planes, and their rectified and corrected patches (section II.A).
+
+The virtual camera looks straight down. Its pixels are squares of ground, `gsd_m` on a side, in the plane at the
+measured altitude; rows run south and columns east. Both views of a pair are rectified to the same virtual camera,
+assuming no horizontal motion: a patch is identified by the ground point in its middle, east and north of the camera's
+nadir point. The paper uses a homography; here each point passes through the full camera model, with a cubic spline
+between pixels.
+
+Dark current is not corrected, as in the paper. It is a ramp along the columns: over the 31 rows of a template 0.05
+counts at -34 deg C (flight) and 2.5 counts at 0 deg C (field test), below a pixel's noise of 6 and without effect on
+velocities even over terrain of 2 % contrast. At +23 deg C it is 36 counts: over terrain of 2 % contrast few tracks are
+valid and no velocity is reported; over terrain of 15 % contrast errors double to 0.07 m/s.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +19,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from marsyard.algorithms.arrays import Flags, Points2, Raster, Vector2, Vector3
+from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
+from marsyard.algorithms.image.kernels import cubic as kernels
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DescentMeasurements, DetectorCalibration, DetectorImage
@@ -31,10 +47,10 @@ class View:
     - rows_summed: Physical rows in one row of `signal`, on the chip and by software together
     """
 
-    signal: Float[np.ndarray, "rows columns"]
-    flat_field: Float[np.ndarray, "rows columns"]
+    signal: Raster
+    flat_field: Raster
     camera: CameraModel
-    centre: Float[np.ndarray, "3"]
+    centre: Vector3
     time_s: float
     calibration: DetectorCalibration
     rows_summed: int
@@ -52,30 +68,25 @@ def bin_factors(shape: tuple[int, int], binned_size: tuple[int, int]) -> tuple[i
     """
     rows, columns = shape
     if columns % binned_size[0] or rows % binned_size[1]:
-        raise ValueError(
-            f"a delivered picture of {columns} x {rows} pixels does not bin to {binned_size[0]} x {binned_size[1]}"
-        )
+        binned = f"{binned_size[0]} x {binned_size[1]}"
+        raise ValueError(f"a delivered picture of {columns} x {rows} pixels does not bin to {binned}")
     return columns // binned_size[0], rows // binned_size[1]
 
 
-def bin_mean(
-    image: Float[np.ndarray, "rows columns"], columns: int, rows: int
-) -> Float[np.ndarray, "binned_rows binned_columns"]:
+def bin_mean(image: Raster, columns: int, rows: int) -> Float[np.ndarray, "binned_rows binned_columns"]:
     """Averages over blocks of `columns` x `rows` pixels, which divide the image."""
     size = (image.shape[1] // columns, image.shape[0] // rows)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
-def place_camera(
-    camera: CameraModel, world_from_body: Rotation, altitude_m: float
-) -> tuple[CameraModel, Float[np.ndarray, "3"]]:
+def place_camera(camera: CameraModel, world_from_body: Rotation, altitude_m: float) -> tuple[CameraModel, Vector3]:
     """A body's camera in a view's ground frame by attitude and altitude, and its position there.
 
     The altitude is that of the body's origin; the camera's height follows from its lever arm.
     """
     lever = world_from_body.as_matrix() @ camera.c
-    placed = rigid(world_from_body, np.array([-lever[0], -lever[1], altitude_m]))
-    return camera.moved(placed), np.array([0.0, 0.0, altitude_m + lever[2]])
+    camera_pose = rigid(world_from_body, np.array([-lever[0], -lever[1], altitude_m]))
+    return camera.transform(camera_pose), np.array([0.0, 0.0, altitude_m + lever[2]])
 
 
 def build_view(
@@ -89,17 +100,17 @@ def build_view(
     is.
     """
     columns, rows = bin_factors(image.counts.shape, binned_size)
-    known = image.calibration
-    camera, centre = place_camera(image.camera.binned(columns, rows), world_from_body, altitude_m)
-    shared = before.flat_field if before is not None and before.calibration is known else None
+    detector = image.calibration
+    camera, centre = place_camera(image.camera.bin(columns, rows), world_from_body, altitude_m)
+    shared = before.flat_field if before is not None and before.calibration is detector else None
     return View(
-        signal=bin_mean(image.counts.astype(np.float32), columns, rows) - np.float32(known.offset_dn),
-        flat_field=bin_mean(known.flat_field, columns, rows) if shared is None else shared,
+        signal=bin_mean(image.counts.astype(np.float32), columns, rows) - np.float32(detector.offset_dn),
+        flat_field=bin_mean(detector.flat_field, columns, rows) if shared is None else shared,
         camera=camera,
         centre=centre,
         time_s=image.time_s,
-        calibration=known,
-        rows_summed=known.rows_summed * rows,
+        calibration=detector,
+        rows_summed=detector.rows_summed * rows,
     )
 
 
@@ -135,9 +146,7 @@ def usable_views(measurements: DescentMeasurements, binned_size: tuple[int, int]
     return (views[0], views[1], views[2]) if in_range else None
 
 
-def ground_from_pixels(
-    view: View, pixels: Float[np.ndarray, "n 2"], max_off_nadir_rad: float
-) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
+def ground_from_pixels(view: View, pixels: Points2, max_off_nadir_rad: float) -> tuple[Points2, Flags]:
     """Intersections of the rays of pixels (u, v) with the ground: (east, north) in the ground frame, metres.
 
     A ray further from the nadir than `max_off_nadir_rad` is bent down to that angle in its azimuth, which bounds the
@@ -180,14 +189,60 @@ def pixel_angle_rad(view: View) -> float:
     return float(np.linalg.norm(directions[[1, 3]] - directions[[0, 2]], axis=1).mean())
 
 
-def square(half_m: float, per_side: int) -> Float[np.ndarray, "n 2"]:
+def square(half_m: float, per_side: int) -> Points2:
     """A lattice of `per_side` x `per_side` points (east, north) over a square of half side `half_m`."""
     steps = np.linspace(-half_m, half_m, per_side)
     east, north = np.meshgrid(steps, steps)
     return np.column_stack([east.ravel(), north.ravel()])
 
 
-def square_outline(half_m: float, per_side: int) -> Float[np.ndarray, "n 2"]:
+def square_outline(half_m: float, per_side: int) -> Points2:
     """The points of `square` on its outline."""
     points = square(half_m, per_side)
     return np.asarray(points[np.abs(points).max(axis=1) == half_m])
+
+
+#: Minimum response for the division.
+MIN_RESPONSE = 0.02
+
+
+def correct_patch(view: View, rows: slice, columns: slice) -> Float[np.ndarray, "_ _"]:
+    """Part of the view without frame-transfer ramp and fall-off, counts, float64."""
+    exposed = remove_frame_transfer(view.signal[:, columns], view.calibration, view.rows_summed)
+    return np.asarray(exposed[rows] / np.maximum(view.flat_field[rows, columns], MIN_RESPONSE))
+
+
+#: Margin of pixels for the spline coefficients; pixels beyond change them by 1e-6.
+SPLINE_MARGIN = 10
+
+
+def ground_lattice(centre: Vector2, side_px: int, gsd_m: float) -> Float[np.ndarray, "side side 2"]:
+    """Ground points (east, north) of the pixels of a square patch about `centre`, metres."""
+    steps = (np.arange(side_px) - 0.5 * (side_px - 1)) * gsd_m
+    lattice = np.empty((side_px, side_px, 2))
+    lattice[..., 0] = centre[0] + steps
+    lattice[..., 1] = (centre[1] - steps)[:, np.newaxis]
+    return lattice
+
+
+def _pixel_range(smallest: float, largest: float, size: int) -> slice:
+    """Whole pixels around values from `smallest` to `largest`, with the spline's margin, within 0 .. size."""
+    low, high = max(int(smallest - SPLINE_MARGIN), 0), min(int(largest + SPLINE_MARGIN + 1), size)
+    return slice(min(low, size - 1), max(high, 1))
+
+
+def rectify_patch(view: View, centre: Vector2, side_px: int, gsd_m: float) -> Float[np.ndarray, "side side"]:
+    """The corrected patch of `side_px` pixels about the ground point `centre` (east, north), counts.
+
+    Points outside the image take its border value, invisible points that of the upper left corner; candidates exclude
+    both.
+    """
+    pixels, visible = pixels_from_ground(view, ground_lattice(centre, side_px, gsd_m))
+    columns, rows = view.size
+    left, right, top, bottom = kernels.hold(pixels, visible, columns, rows)
+    in_rows, in_columns = _pixel_range(top, bottom, rows), _pixel_range(left, right, columns)
+    patch = correct_patch(view, in_rows, in_columns)
+    coefficients = ndimage.spline_filter(patch, order=3, mode="mirror")
+    values = np.empty((side_px, side_px))
+    kernels.sample(coefficients, pixels, in_rows.start, in_columns.start, values)
+    return values

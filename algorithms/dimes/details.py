@@ -138,11 +138,11 @@ def dimes_products(details: DimesDetails) -> dict[str, Any]:
         failed = (check in track.failed for check in ValidityCheck)
         matched = (*track.template_pixel, *track.match_pixel)
         rows.append([track.pair, track.index, *matched, *metrics, track.valid, *motion, *failed])
-    found = [[c.first, c.second, c.discrepancy_m_s] for c in details.combinations]
+    table = [[c.first, c.second, c.discrepancy_m_s] for c in details.combinations]
     products: dict[str, Any] = {
         "tracks": np.array(rows, dtype=np.float64).reshape(-1, len(TRACK_COLUMNS)),
         "tracks_columns": list(TRACK_COLUMNS),
-        "combinations": np.array(found, dtype=np.float64).reshape(-1, 3),
+        "combinations": np.array(table, dtype=np.float64).reshape(-1, 3),
         "combinations_columns": ["first", "second", "discrepancy_m_s"],
         "chosen": np.array(chosen, dtype=np.float64),
     }

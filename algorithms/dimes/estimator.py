@@ -7,18 +7,11 @@ from typing import final
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.algorithms.dimes.binning import View, pixels_from_ground, usable_views
+from marsyard.algorithms.arrays import Patch, Vector2, Vector3
+from marsyard.algorithms.dimes import overlap
+from marsyard.algorithms.dimes.binning import View, pixels_from_ground, rectify_patch, usable_views
 from marsyard.algorithms.dimes.details import DimesDetails, PairDetails, Track
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.dimes.overlap import (
-    SearchGeometry,
-    overlap_polygon,
-    search_geometry,
-    select_templates,
-    template_candidates,
-    zero_phase_pixel,
-)
-from marsyard.algorithms.dimes.rectification import rectify_patch
 from marsyard.algorithms.dimes.validity import combinations, failed_checks, track_metrics
 from marsyard.algorithms.image.correlation import Peak, biquadratic_offset, highest_peak, pseudo_normalized_correlation
 from marsyard.algorithms.image.registration import refine_shift
@@ -27,22 +20,22 @@ from marsyard.sim.measurements import DescentMeasurements
 
 
 def match_corner(
-    template: Float[np.ndarray, "n n"],
+    template: Patch,
     window: Float[np.ndarray, "w w"],
     surface: Float[np.ndarray, "s s"],
     peak: Peak,
     options: DimesOptions,
-) -> Float[np.ndarray, "2"]:
+) -> Vector2:
     """Row and column in the window of the matched template's upper left pixel, refined as the options require."""
-    whole = np.array([peak.row, peak.column], dtype=np.float64)
+    integer_peak = np.array([peak.row, peak.column], dtype=np.float64)
     if not options.subpixel:
-        return whole
-    start = whole + biquadratic_offset(surface, peak)
+        return integer_peak
+    start = integer_peak + biquadratic_offset(surface, peak)
     aligned = refine_shift(template, window, start) if options.align and not peak.on_border else None
     return start if aligned is None else aligned
 
 
-def camera_displacement(corner: Float[np.ndarray, "2"], geometry: SearchGeometry) -> Float[np.ndarray, "2"]:
+def camera_displacement(corner: Vector2, geometry: overlap.SearchGeometry) -> Vector2:
     """Horizontal displacement (east, north) of the camera between the images, metres.
 
     A ground point at r1 from the first nadir point and r2 from the second means a displacement of r1 - r2. The
@@ -53,13 +46,11 @@ def camera_displacement(corner: Float[np.ndarray, "2"], geometry: SearchGeometry
     return np.asarray(geometry.gsd_m * np.array([-shift[1], shift[0]]))
 
 
-def track_pair(
-    pair: int, first: View, second: View, sun_direction: Float[np.ndarray, "3"], options: DimesOptions
-) -> PairDetails:
+def track_pair(pair: int, first: View, second: View, sun_direction: Vector3, options: DimesOptions) -> PairDetails:
     """Select and track the templates of one pair of views."""
-    geometry = search_geometry(first, second, options)
-    candidates = template_candidates(first, second, geometry, sun_direction, options)
-    chosen, contrasts = select_templates(first, candidates, options)
+    geometry = overlap.search_geometry(first, second, options)
+    candidates = overlap.template_candidates(first, second, geometry, sun_direction, options)
+    chosen, contrasts = overlap.select_templates(first, candidates, options)
     tracks = []
     for index, (candidate, contrast) in enumerate(zip(chosen, contrasts, strict=True)):
         ground = candidates.ground[candidate]
@@ -87,8 +78,8 @@ def track_pair(
         )
         tracks.append(track)
     return PairDetails(
-        overlap_polygon=overlap_polygon(first, second, options),
-        zero_phase_pixels=np.stack([zero_phase_pixel(view, sun_direction) for view in (first, second)]),
+        overlap_polygon=overlap.overlap_polygon(first, second, options),
+        zero_phase_pixels=np.stack([overlap.zero_phase_pixel(view, sun_direction) for view in (first, second)]),
         gsd_m=geometry.gsd_m,
         candidates=len(candidates.pixels),
         tracks=tuple(tracks),
@@ -129,11 +120,11 @@ def conclude(
 ) -> VelocityEstimate:
     """Combine the tracks of both pairs with the IMU."""
     first, second = ([(one.index, one.velocity_m_s) for one in pair.tracks if one.valid] for pair in pairs)
-    found = combinations(first, second, interval_velocities_m_s)
-    if found and found[0].discrepancy_m_s < imu_threshold_m_s:
-        velocity = pairs[1].tracks[found[0].second].velocity_m_s
-        return VelocityEstimate(VelocityOutcome.VALID, velocity, DimesDetails(pairs, found, found[0]))
-    outcome = VelocityOutcome.IMU_MISMATCH if found else VelocityOutcome.NO_VALID_TRACK
+    candidates = combinations(first, second, interval_velocities_m_s)
+    if candidates and candidates[0].discrepancy_m_s < imu_threshold_m_s:
+        velocity = pairs[1].tracks[candidates[0].second].velocity_m_s
+        return VelocityEstimate(VelocityOutcome.VALID, velocity, DimesDetails(pairs, candidates, candidates[0]))
+    outcome = VelocityOutcome.IMU_MISMATCH if candidates else VelocityOutcome.NO_VALID_TRACK
     if not all(pair.tracks for pair in pairs):
         outcome = VelocityOutcome.NO_TEMPLATE_AREA
-    return VelocityEstimate(outcome, None, DimesDetails(pairs, found, None))
+    return VelocityEstimate(outcome, None, DimesDetails(pairs, candidates, None))

@@ -7,15 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from marsyard.algorithms.dimes.binning import (
-    View,
-    ground_from_pixels,
-    inside_frame,
-    pixel_angle_rad,
-    pixels_from_ground,
-    square,
-    square_outline,
-)
+from marsyard.algorithms.arrays import Flags, Points2, Values, Vector2, Vector3
+from marsyard.algorithms.dimes import binning
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.image.interest import harris_interest, local_mean, structure_tensor
 
@@ -49,14 +42,14 @@ class SearchGeometry:
         return 0.5 * self.window_px * self.gsd_m
 
 
-def search_geometry(first: View, second: View, options: DimesOptions) -> SearchGeometry:
+def search_geometry(first: binning.View, second: binning.View, options: DimesOptions) -> SearchGeometry:
     """Sizes from the second view's height, pixel angle, image interval and largest speed."""
-    gsd = float(second.centre[2]) * pixel_angle_rad(second)
+    gsd = float(second.centre[2]) * binning.pixel_angle_rad(second)
     reach_m = options.max_speed_m_s * (second.time_s - first.time_s)
     return SearchGeometry(gsd, options.template_px, int(np.ceil(reach_m / gsd)) + options.search_margin_px)
 
 
-def border_pixels(size: tuple[int, int], per_side: int = 8) -> Float[np.ndarray, "n 2"]:
+def border_pixels(size: tuple[int, int], per_side: int = 8) -> Points2:
     """Pixels along the border of an image of `size` (columns, rows), in order."""
     steps, zeros, ones = np.arange(per_side) / per_side, np.zeros(per_side), np.ones(per_side)
     along = np.concatenate([steps, ones, 1.0 - steps, zeros])
@@ -64,35 +57,35 @@ def border_pixels(size: tuple[int, int], per_side: int = 8) -> Float[np.ndarray,
     return np.column_stack([along * (size[0] - 1.0), down * (size[1] - 1.0)])
 
 
-def overlap_polygon(first: View, second: View, options: DimesOptions) -> Float[np.ndarray, "n 2"]:
+def overlap_polygon(first: binning.View, second: binning.View, options: DimesOptions) -> Points2:
     """The second view's border in the first view at zero horizontal motion: pixels (u, v) in order; invisible ones
     omitted.
     """
-    ground, _ = ground_from_pixels(second, border_pixels(second.size), options.max_off_nadir_rad)
-    pixels, visible = pixels_from_ground(first, ground)
+    ground, _ = binning.ground_from_pixels(second, border_pixels(second.size), options.max_off_nadir_rad)
+    pixels, visible = binning.pixels_from_ground(first, ground)
     return np.asarray(pixels[visible])
 
 
-def grid_pixels(size: tuple[int, int], step: int) -> Float[np.ndarray, "n 2"]:
+def grid_pixels(size: tuple[int, int], step: int) -> Points2:
     """The coarse grid of candidate pixels (u, v), centred in an image of `size` (columns, rows), row by row."""
     u, v = (np.arange((n - 1) % step // 2, n, step, dtype=np.float64) for n in size)
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
-def anti_solar_direction(sun_direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+def anti_solar_direction(sun_direction: Vector3) -> Vector3:
     """Unit vector from the lander to the middle of the zero-phase spot, world axes."""
     length = float(np.linalg.norm(sun_direction))
     return -np.asarray(sun_direction, dtype=np.float64) / (length if length > 0.0 else 1.0)
 
 
-def zero_phase_pixel(view: View, sun_direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2"]:
+def zero_phase_pixel(view: binning.View, sun_direction: Vector3) -> Vector2:
     """Pixel (u, v) of the middle of the zero-phase spot, in or out of frame; NaN if the camera cannot image it."""
     pixels, visible = view.camera.project((view.centre + 1e7 * anti_solar_direction(sun_direction))[None, :])
     return np.asarray(pixels[0]) if visible[0] else np.full(2, np.nan)
 
 
 def outside_zero_phase(
-    view: View, ground: Float[np.ndarray, "*shape 2"], sun_direction: Float[np.ndarray, "3"], radius_rad: float
+    view: binning.View, ground: Float[np.ndarray, "*shape 2"], sun_direction: Vector3, radius_rad: float
 ) -> Bool[np.ndarray, "*shape"]:
     """Whether ground points (east, north) are further than `radius_rad` from the anti-solar direction."""
     spot = anti_solar_direction(sun_direction)
@@ -110,26 +103,26 @@ class Candidates:
     The whole search window of a preferred candidate is clear of it.
     """
 
-    pixels: Float[np.ndarray, "n 2"]
-    ground: Float[np.ndarray, "n 2"]
-    preferred: Bool[np.ndarray, "n"]
+    pixels: Points2
+    ground: Points2
+    preferred: Flags
 
 
 def template_candidates(
-    first: View, second: View, geometry: SearchGeometry, sun_direction: Float[np.ndarray, "3"], options: DimesOptions
+    first: binning.View, second: binning.View, geometry: SearchGeometry, sun_direction: Vector3, options: DimesOptions
 ) -> Candidates:
     """All feasible template positions on the coarse grid."""
     limit = options.max_off_nadir_rad
     pixels = grid_pixels(first.size, options.grid_step_px)
-    ground, seen = ground_from_pixels(first, pixels, limit)
-    pixels, ground = pixels[seen], ground[seen]
+    ground, visible = binning.ground_from_pixels(first, pixels, limit)
+    pixels, ground = pixels[visible], ground[visible]
     for view, half in ((second, 0.0), (first, geometry.template_half_m), (second, geometry.window_half_m)):
-        outline = square_outline(half, 3) if half > 0.0 else np.zeros((1, 2))
-        room = inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1)
+        outline = binning.square_outline(half, 3) if half > 0.0 else np.zeros((1, 2))
+        room = binning.inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1)
         pixels, ground = pixels[room], ground[room]
 
-    def dark(view: View, half_m: float, per_side: int) -> Bool[np.ndarray, "n"]:
-        points = ground[:, None] + square(half_m, per_side)
+    def dark(view: binning.View, half_m: float, per_side: int) -> Flags:
+        points = ground[:, None] + binning.square(half_m, per_side)
         outside = outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
         return np.asarray(outside.all(axis=1))
 
@@ -142,7 +135,7 @@ def template_candidates(
 DARK_FRACTION = 0.01
 
 
-def contrasts(view: View, pixels: Float[np.ndarray, "n 2"], support: int) -> Float[np.ndarray, "n"]:
+def contrasts(view: binning.View, pixels: Points2, support: int) -> Values:
     """Harris interest over squares of `support` pixels about whole pixels (u, v), divided by the mean signal there.
 
     Computed on the delivered image: the frame-transfer ramp is smooth along columns and hardly changes the interest.
@@ -153,13 +146,7 @@ def contrasts(view: View, pixels: Float[np.ndarray, "n 2"], support: int) -> Flo
     return np.asarray(harris_interest(uu, vv, uv) / np.maximum(mean, DARK_FRACTION * view.calibration.full_scale_dn))
 
 
-def best_candidates(
-    contrasts: Float[np.ndarray, "n"],
-    pixels: Float[np.ndarray, "n 2"],
-    preferred: Bool[np.ndarray, "n"],
-    count: int,
-    exclusion_px: float,
-) -> list[int]:
+def best_candidates(contrasts: Values, pixels: Points2, preferred: Flags, count: int, exclusion_px: float) -> list[int]:
     """Indices of up to `count` candidates by decreasing contrast, preferred ones first.
 
     Each choice excludes the candidates closer than `exclusion_px` in both column and row.
@@ -175,7 +162,7 @@ def best_candidates(
 
 
 def select_templates(
-    view: View, candidates: Candidates, options: DimesOptions
+    view: binning.View, candidates: Candidates, options: DimesOptions
 ) -> tuple[list[int], Float[np.ndarray, "k"]]:
     """Indices of the selected candidates, best first, and their contrasts."""
     found, pixels = contrasts(view, candidates.pixels, options.template_px), candidates.pixels

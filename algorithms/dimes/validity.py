@@ -10,6 +10,7 @@ from itertools import product
 import numpy as np
 from jaxtyping import Float
 
+from marsyard.algorithms.arrays import Raster, Vector2
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.image.correlation import Peak, peak_width, second_peak
 
@@ -42,9 +43,7 @@ class TrackMetrics:
     on_border: bool
 
 
-def track_metrics(
-    contrast: float, surface: Float[np.ndarray, "rows columns"], peak: Peak, options: DimesOptions
-) -> TrackMetrics:
+def track_metrics(contrast: float, surface: Raster, peak: Peak, options: DimesOptions) -> TrackMetrics:
     """The metrics of a correlation surface and its template's contrast."""
     second = second_peak(surface, peak, options.second_peak_exclusion_px)
     return TrackMetrics(
@@ -68,7 +67,7 @@ def failed_checks(metrics: TrackMetrics, options: DimesOptions) -> tuple[Validit
     return tuple(check for check, failed in failures.items() if failed)
 
 
-Horizontal = Float[np.ndarray, "2"]
+Horizontal = Vector2
 
 
 @dataclass(frozen=True)
@@ -90,16 +89,13 @@ def combinations(
 ) -> tuple[Combination, ...]:
     """All combinations of valid tracks (index, velocity) of both pairs, best agreement first."""
     change = (interval_velocities_m_s[1] - interval_velocities_m_s[0])[:2]
-    found = [
-        Combination(i, j, float(np.hypot(*(v_second - v_first - change))))
-        for (i, v_first), (j, v_second) in product(first, second)
-    ]
-    return tuple(sorted(found, key=lambda c: c.discrepancy_m_s))
+    candidates = [Combination(i, j, float(np.hypot(*(b - a - change)))) for (i, a), (j, b) in product(first, second)]
+    return tuple(sorted(candidates, key=lambda c: c.discrepancy_m_s))
 
 
-def propagated(
+def propagate_velocity(
     velocity_m_s: Horizontal, inertial_then_m_s: Horizontal, inertial_now_m_s: Horizontal
-) -> Float[np.ndarray, "2"]:
+) -> Vector2:
     """Propagate a velocity by the inertial unit, for example to thruster firing near 100 m (section I), m/s.
 
     `inertial_then_m_s` is the inertial mean velocity over the second pair's interval. The unknown error common to both

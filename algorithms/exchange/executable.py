@@ -8,28 +8,17 @@ from typing import Any
 
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.algorithms.answers import check_aim, check_site, check_update, check_velocity
+from marsyard.algorithms import interface
+from marsyard.algorithms.answers import bad_answer, check_aim, check_site, check_update, check_velocity
 from marsyard.algorithms.exchange.files import encode_pose, encode_target, write_frame, write_mast, write_stop
 from marsyard.algorithms.exchange.process import MAX_STDERR_CHARACTERS, Command, ExecutableLimits
 from marsyard.algorithms.exchange.serving import (
     ProgramDetails,
     Session,
     ask_case,
-    bad_answer,
     check_keys,
     read_member,
     read_numbers,
-)
-from marsyard.algorithms.interface import (
-    MastAim,
-    PixelBox,
-    SiteEstimate,
-    SiteOutcome,
-    TargetLoss,
-    TargetUpdate,
-    TrackingState,
-    VelocityEstimate,
-    VelocityOutcome,
 )
 from marsyard.sim.measurements import (
     DescentFrame,
@@ -48,7 +37,7 @@ class ExecutableVelocityEstimator:
     command: Command
     limits: ExecutableLimits
 
-    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
+    def estimate(self, measurements: DescentMeasurements) -> interface.VelocityEstimate:
         """The program's answer."""
         return ask_case(self.command, self.limits, measurements, _read_velocity)
 
@@ -70,18 +59,18 @@ class ExecutableVelocityStream:
         if self._session.ask("start", {}, self._read_answer) is not None:
             raise bad_answer("start is answered with an outcome; allowed: null, before the first picture")
 
-    def picture(self, frame: DescentFrame) -> VelocityEstimate | None:
+    def picture(self, frame: DescentFrame) -> interface.VelocityEstimate | None:
         """The program's answer to one more image."""
         return self._session.ask("picture", {}, self._read_answer, {"frame": lambda folder: write_frame(folder, frame)})
 
-    def finish(self) -> VelocityEstimate:
+    def finish(self) -> interface.VelocityEstimate:
         """The program's final answer; its details sum its output and time over the descent."""
         answer = self._session.ask("finish", {}, self._read_answer)
         if answer is None:
             raise bad_answer("finish is answered with the outcome null; allowed: one of the outcomes")
         return answer
 
-    def _read_answer(self, answer: Mapping[str, Any], details: ProgramDetails) -> VelocityEstimate | None:
+    def _read_answer(self, answer: Mapping[str, Any], details: ProgramDetails) -> interface.VelocityEstimate | None:
         self._details = ProgramDetails(
             (self._details.stderr + details.stderr)[-MAX_STDERR_CHARACTERS:], self._details.time_s + details.time_s
         )
@@ -98,7 +87,7 @@ class ExecutableSiteEstimator:
     command: Command
     limits: ExecutableLimits
 
-    def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
+    def estimate(self, measurements: LandingMeasurements) -> interface.SiteEstimate:
         """The program's answer."""
         return ask_case(self.command, self.limits, measurements, _read_site)
 
@@ -111,14 +100,14 @@ class ExecutableTargetTracker:
     """
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
-        self._state = TrackingState.NO_TARGET
+        self._state = interface.TrackingState.NO_TARGET
         self._session = Session(command, limits)
         self._mast: MastCalibration | None = None
         self._masts = 0
         self._folder = self._session.folder
 
     @property
-    def state(self) -> TrackingState:
+    def state(self) -> interface.TrackingState:
         """State of the tracker by its last answer."""
         return self._state
 
@@ -127,12 +116,12 @@ class ExecutableTargetTracker:
         values = {"target": encode_target(target), "world_from_rover": encode_pose(world_from_rover)}
         self._state = self._session.ask("designate", values, _read_state)
 
-    def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
+    def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> interface.MastAim | None:
         """The requested mast angles and image parts."""
         values = {"world_from_rover": encode_pose(world_from_rover), "mast": self._write_mast(mast)}
         return self._session.ask("aim", values, lambda answer, _: check_aim(_read_aim(answer), mast))
 
-    def update(self, measurements: RoverMeasurements) -> TargetUpdate:
+    def update(self, measurements: RoverMeasurements) -> interface.TargetUpdate:
         """The program's answer to the images of a stop."""
         values = {"mast": self._write_mast(measurements.mast)}
         files = {"stop": lambda folder: write_stop(folder, measurements)}
@@ -154,11 +143,11 @@ class ExecutableTargetTracker:
         return str(self._folder)
 
 
-def _read_velocity(answer: Mapping[str, Any], details: ProgramDetails) -> VelocityEstimate:
+def _read_velocity(answer: Mapping[str, Any], details: ProgramDetails) -> interface.VelocityEstimate:
     check_keys(answer, {"outcome", "velocity_m_s", "covariance_m2_s2", "span_s"})
     span = read_numbers(answer, "span_s", (2,))
-    estimate = VelocityEstimate(
-        outcome=read_member("outcome", answer.get("outcome"), VelocityOutcome),
+    estimate = interface.VelocityEstimate(
+        outcome=read_member("outcome", answer.get("outcome"), interface.VelocityOutcome),
         velocity_m_s=read_numbers(answer, "velocity_m_s", (2,)),
         details=details,
         covariance_m2_s2=read_numbers(answer, "covariance_m2_s2", (2, 2)),
@@ -167,18 +156,18 @@ def _read_velocity(answer: Mapping[str, Any], details: ProgramDetails) -> Veloci
     return check_velocity(estimate)
 
 
-def _read_site(answer: Mapping[str, Any], details: ProgramDetails) -> SiteEstimate:
+def _read_site(answer: Mapping[str, Any], details: ProgramDetails) -> interface.SiteEstimate:
     check_keys(answer, {"outcome", "site_world"})
-    outcome = read_member("outcome", answer.get("outcome"), SiteOutcome)
-    return check_site(SiteEstimate(outcome, read_numbers(answer, "site_world", (3,)), details))
+    outcome = read_member("outcome", answer.get("outcome"), interface.SiteOutcome)
+    return check_site(interface.SiteEstimate(outcome, read_numbers(answer, "site_world", (3,)), details))
 
 
-def _read_state(answer: Mapping[str, Any], _details: ProgramDetails) -> TrackingState:
+def _read_state(answer: Mapping[str, Any], _details: ProgramDetails) -> interface.TrackingState:
     check_keys(answer, {"state"})
-    return read_member("state", answer.get("state"), TrackingState)
+    return read_member("state", answer.get("state"), interface.TrackingState)
 
 
-def _read_aim(answer: Mapping[str, Any]) -> MastAim | None:
+def _read_aim(answer: Mapping[str, Any]) -> interface.MastAim | None:
     check_keys(answer, {"aim"})
     aim = answer.get("aim")
     if aim is None:
@@ -188,24 +177,23 @@ def _read_aim(answer: Mapping[str, Any]) -> MastAim | None:
     angles = [read_numbers(aim, name, ()) for name in ("azimuth_rad", "elevation_rad")]
     if angles[0] is None or angles[1] is None:
         raise bad_answer("aim lacks an angle; expected azimuth_rad and elevation_rad")
-    return MastAim(float(angles[0]), float(angles[1]), _read_box(aim, "left"), _read_box(aim, "right"))
+    return interface.MastAim(float(angles[0]), float(angles[1]), _read_box(aim, "left"), _read_box(aim, "right"))
 
 
-def _read_box(aim: Mapping[str, Any], name: str) -> PixelBox:
+def _read_box(aim: Mapping[str, Any], name: str) -> interface.PixelBox:
     box = aim.get(name)
     corner, size = (box.get("corner"), box.get("size")) if isinstance(box, dict) else (None, None)
     if not isinstance(corner, list) or not isinstance(size, list) or not len(corner) == len(size) == 2:
         raise bad_answer(f'{name} is {box!r}; allowed: {{"corner": [column, row], "size": [columns, rows]}}')
-    return PixelBox((corner[0], corner[1]), (size[0], size[1]))
+    return interface.PixelBox((corner[0], corner[1]), (size[0], size[1]))
 
 
-def _read_update(answer: Mapping[str, Any], details: ProgramDetails) -> TargetUpdate:
+def _read_update(answer: Mapping[str, Any], details: ProgramDetails) -> interface.TargetUpdate:
     check_keys(answer, {"state", "losses", "position_rover"})
     losses = answer.get("losses", [])
     if not isinstance(losses, list):
-        raise bad_answer(f"losses is {losses!r}; allowed: a list of {', '.join(TargetLoss.__members__)}")
+        raise bad_answer(f"losses is {losses!r}; allowed: a list of {', '.join(interface.TargetLoss.__members__)}")
     position = read_numbers(answer, "position_rover", (3,))
-    state = read_member("state", answer.get("state"), TrackingState)
-    return check_update(
-        TargetUpdate(state, tuple(read_member("a loss", one, TargetLoss) for one in losses), position, details)
-    )
+    state = read_member("state", answer.get("state"), interface.TrackingState)
+    named = tuple(read_member("a loss", one, interface.TargetLoss) for one in losses)
+    return check_update(interface.TargetUpdate(state, named, position, details))

@@ -189,16 +189,16 @@ def _write_images(folder: Path, images: Sequence[DetectorImage], pictures: Pictu
     written: list[dict[str, Any]] = []
     fields: dict[str, Float[np.ndarray, "rows columns"]] = {}
     for number, image in enumerate(images, start=1):
-        name, camera, known = f"image_{number}.{pictures}", f"camera_{number}.cahvor", image.calibration
+        name, camera, detector = f"image_{number}.{pictures}", f"camera_{number}.cahvor", image.calibration
         write_picture(folder / name, image.counts)
         write_cahvor(image.camera, folder / camera, frame=BODY_FRAME)
-        flat = next((path for path, one in fields.items() if np.array_equal(one, known.flat_field)), None)
+        flat = next((path for path, one in fields.items() if np.array_equal(one, detector.flat_field)), None)
         if flat is None:
             flat = f"flat_field_{len(fields) + 1}.f64"
-            fields[flat] = known.flat_field
-            known.flat_field.astype("<f8").tofile(folder / flat)
+            fields[flat] = detector.flat_field
+            detector.flat_field.astype("<f8").tofile(folder / flat)
         rows, columns = image.counts.shape
-        calibration = {"flat_field": flat, **{one: getattr(known, one) for one in _CALIBRATION}}
+        calibration = {"flat_field": flat, **{one: getattr(detector, one) for one in _CALIBRATION}}
         size = {"columns": columns, "rows": rows}
         written.append({"file": name, "camera": camera, "time_s": image.time_s, **size, "calibration": calibration})
     return written
@@ -256,11 +256,8 @@ def read_mast(folder: Path) -> MastCalibration:
 
 def write_stop(folder: Path, measurements: RoverMeasurements) -> None:
     """Write a stop's images and angles into an existing folder, without the mast."""
-    content: dict[str, Any] = {
-        "azimuth_rad": measurements.azimuth_rad,
-        "elevation_rad": measurements.elevation_rad,
-        "world_from_rover": encode_pose(measurements.world_from_rover),
-    }
+    content: dict[str, Any] = {name: getattr(measurements, name) for name in ("azimuth_rad", "elevation_rad")}
+    content["world_from_rover"] = encode_pose(measurements.world_from_rover)
     for name, image in (("left", measurements.left), ("right", measurements.right)):
         write_picture(folder / f"{name}.pgm", image.counts)
         rows, columns = image.counts.shape
@@ -281,10 +278,8 @@ def read_stop(folder: Path, mast: MastCalibration) -> RoverMeasurements:
 
 def encode_pose(pose: RigidTransform, body: str = "rover") -> dict[str, Any]:
     """The pose of a rover or a body: position in the world and unit quaternion, scalar last."""
-    return {
-        "position_world_m": np.asarray(pose.translation).tolist(),
-        f"world_from_{body}_xyzw": pose.rotation.as_quat().tolist(),
-    }
+    position, quaternion = np.asarray(pose.translation).tolist(), pose.rotation.as_quat().tolist()
+    return {"position_world_m": position, f"world_from_{body}_xyzw": quaternion}
 
 
 def read_pose(content: Mapping[str, Any], body: str = "rover") -> RigidTransform:

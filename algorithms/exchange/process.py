@@ -21,7 +21,7 @@ from typing import IO, Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from marsyard.algorithms.faults import AlgorithmError, Fault
+from marsyard.algorithms.answers import AlgorithmError, Fault
 from marsyard.algorithms.processes import descendants, resident_bytes
 
 #: Interval of the memory checks, seconds.
@@ -200,7 +200,6 @@ class RunningProgram:
             raise self._end_with_fault(Fault.OUT_OF_MEMORY, f"it took more than {self.limits.memory_gb:g} GB of memory")
 
     def _wait(self) -> None:
-        """Wait for the program to exit; a non-zero status is a fault."""
         while True:
             self._check()
             with suppress(subprocess.TimeoutExpired):
@@ -217,7 +216,6 @@ class RunningProgram:
         return AlgorithmError(fault, message, _decode_tail(self._stderr))
 
     def _kill(self) -> None:
-        """Kill the program and its process group."""
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()

@@ -20,9 +20,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from marsyard.algorithms.answers import AlgorithmError, Fault, bad_answer
 from marsyard.algorithms.exchange.files import ANSWER_VERSIONS, write_case
 from marsyard.algorithms.exchange.process import Command, ExecutableLimits, Output, RunningProgram, shorten
-from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements
 
 Member = TypeVar("Member", bound=Enum)
@@ -76,9 +76,8 @@ def read_numbers(answer: Mapping[str, Any], name: str, shape: tuple[int, ...]) -
     if value is None:
         return None
     if not _is_nested(value, shape):
-        raise bad_answer(
-            f"{name} is {shorten(json.dumps(value).encode())}; allowed: numbers in the shape {list(shape)}"
-        )
+        received = shorten(json.dumps(value).encode())
+        raise bad_answer(f"{name} is {received}; allowed: numbers in the shape {list(shape)}")
     return np.array(value, dtype=np.float64)
 
 
@@ -95,11 +94,6 @@ def read_answer(answer: Mapping[str, Any], output: Output, read: AnswerReader[An
         return read(answer, ProgramDetails(output.stderr, output.time_s))
     except AlgorithmError as error:
         raise AlgorithmError(error.fault, str(error), output.stderr) from error
-
-
-def bad_answer(message: str) -> AlgorithmError:
-    """The error for an answer of the wrong form."""
-    return AlgorithmError(Fault.BAD_ANSWER, message)
 
 
 @dataclass

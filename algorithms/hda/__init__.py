@@ -8,22 +8,6 @@ from marsyard.algorithms.hda.options import HdaOptions, SurfaceFrame, TrackSeed
 from marsyard.algorithms.hda.structure import Fate, Matches
 from marsyard.algorithms.hda.tracking import Tracks
 
-__all__ = [
-    "STAGES",
-    "ElevationMap",
-    "Fate",
-    "Ground",
-    "HazardMaps",
-    "HdaDetails",
-    "HdaEstimator",
-    "HdaOptions",
-    "Matches",
-    "Motion",
-    "Safety",
-    "SurfaceFrame",
-    "TrackSeed",
-    "Tracks",
-    "hazard_maps",
-    "hda_products",
-    "safe_site",
-]
+__all__ = ["STAGES", "ElevationMap", "Fate", "Ground", "HazardMaps", "HdaDetails", "HdaEstimator", "HdaOptions"]
+__all__ += ["Matches", "Motion", "Safety", "SurfaceFrame", "TrackSeed", "Tracks", "hazard_maps", "hda_products"]
+__all__ += ["safe_site"]

@@ -14,11 +14,19 @@ from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.hda.estimator import find_site, matched_structure
-from marsyard.algorithms.hda.motion import Motion, assess_motion
+from marsyard.algorithms.hda.motion import (
+    LandingScene,
+    Motion,
+    Views,
+    assess_motion,
+    build_scene,
+    points_at_depth,
+    project_points,
+    undistort,
+)
 from marsyard.algorithms.hda.options import HdaOptions
 from marsyard.algorithms.hda.structure import Fate, Matches, depth_bounds, epipolar_segments, pixel_lattice, triangulate
 from marsyard.algorithms.hda.tracking import Tracks
-from marsyard.algorithms.hda.view import LandingScene, View, build_scene, points_at_depth, project_points, undistort
 from marsyard.algorithms.interface import SiteEstimate
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
@@ -72,10 +80,8 @@ def essential_motion(scene: LandingScene, tracks: Tracks, options: HdaOptions) -
     Its scale makes the median depth equal the range.
     """
     focal = scene.views[1].focal_px
-    first, second = (
-        undistort(one.camera, pixels[tracks.accepted])
-        for one, pixels in zip(scene.views, (tracks.first, tracks.second), strict=True)
-    )
+    accepted = (tracks.first[tracks.accepted], tracks.second[tracks.accepted])
+    first, second = (undistort(one.camera, pixels) for one, pixels in zip(scene.views, accepted, strict=True))
     intrinsics = np.diag([focal, focal, 1.0])
     poses = []
     for method, inlier_px in ATTEMPTS:
@@ -93,7 +99,7 @@ def essential_motion(scene: LandingScene, tracks: Tracks, options: HdaOptions) -
     if len(ahead) == 0:
         return None
     motion = assess_motion(first, second, focal, moved, depths, True, options)
-    return motion.scaled(scene.range_m / float(np.median(ahead)))
+    return motion.scale(scene.range_m / float(np.median(ahead)))
 
 
 @dataclass(frozen=True)
@@ -115,7 +121,7 @@ class Rectification:
         return self.camera.focal_lengths[0]
 
 
-def rectify_views(views: tuple[View, View], second_from_first: RigidTransform) -> Rectification | None:
+def rectify_views(views: Views, second_from_first: RigidTransform) -> Rectification | None:
     """The rectification of a pair; None for motion along the optical axis."""
     first_from_second = second_from_first.inv()
     baseline = float(np.linalg.norm(first_from_second.translation))
@@ -150,7 +156,7 @@ def rectify_views(views: tuple[View, View], second_from_first: RigidTransform) -
 
 
 def match_disparities(
-    views: tuple[View, View], pair: Rectification, second_from_first: RigidTransform, bounds_m: tuple[float, float]
+    views: Views, pair: Rectification, second_from_first: RigidTransform, bounds_m: tuple[float, float]
 ) -> Float[np.ndarray, "rows columns"]:
     """Disparities of the first rectified image by semi-global matching, pixels; NaN without a match."""
     first_from_rectified = pair.rectified_from_first.inv()
@@ -179,8 +185,8 @@ def match_disparities(
         speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
-    found = matcher.compute(*pictures).astype(np.float64) * DISPARITY_UNIT
-    return np.where(found >= max(min_disparity, 1), found, np.nan)
+    disparities = matcher.compute(*pictures).astype(np.float64) * DISPARITY_UNIT
+    return np.where(disparities >= max(min_disparity, 1), disparities, np.nan)
 
 
 def semi_global_structure(scene: LandingScene, motion: Motion, options: HdaOptions) -> Matches:
@@ -195,10 +201,10 @@ def semi_global_structure(scene: LandingScene, motion: Motion, options: HdaOptio
     depths = np.full(len(pixels), np.nan)
     pair = rectify_views(scene.views, motion.second_from_first)
     if pair is not None:
-        found = match_disparities(scene.views, pair, motion.second_from_first, bounds)
+        disparities = match_disparities(scene.views, pair, motion.second_from_first, bounds)
         rays = pair.rectified_from_first.apply(np.column_stack([places, np.ones(len(places))]))
         column, row = np.rint(pair.camera.project(rays)[0]).astype(np.int64).T
-        depths = pair.focal_px * pair.baseline_m / found[row, column] / rays[:, 2]
+        depths = pair.focal_px * pair.baseline_m / disparities[row, column] / rays[:, 2]
     accepted = (depths > bounds[0]) & (depths < bounds[1])
     fates = np.where(accepted, Fate.ACCEPTED, Fate.OUT_OF_BOUNDS).astype(np.uint8)
     points = points_at_depth(places, depths)

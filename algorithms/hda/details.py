@@ -12,10 +12,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda.hazards import ElevationMap, HazardMaps
-from marsyard.algorithms.hda.motion import Motion
+from marsyard.algorithms.hda.motion import Motion, View, Views, points_at_depth, undistort
 from marsyard.algorithms.hda.structure import Matches
 from marsyard.algorithms.hda.tracking import Tracks
-from marsyard.algorithms.hda.view import View, points_at_depth, undistort
 
 #: The stages of Table I, in order; the scale belongs to motion, the elevation map to hazards.
 STAGES = ("tracking", "motion", "structure", "hazards")
@@ -50,14 +49,14 @@ class HdaDetails:
     - ends_s: Processor time at the start and at the end of every completed stage of `STAGES`
     """
 
-    views: tuple[View, View]
+    views: Views
     tracks: Tracks | None = None
     motion: Motion | None = None
     matches: Matches | None = None
     ground: Ground | None = None
     ends_s: tuple[float, ...] = field(default_factory=lambda: (time.process_time(),))
 
-    def ended(self, **found: Any) -> HdaDetails:
+    def end_stage(self, **found: Any) -> HdaDetails:
         """These details with the products of a stage that ends now."""
         return replace(self, **found, ends_s=(*self.ends_s, time.process_time()))
 

@@ -1,4 +1,9 @@
-"""Hazard detection and avoidance from two pictures of one moving camera (sections II and III)."""
+"""Hazard detection and avoidance from two pictures of one moving camera (sections II and III).
+
+The surface frame is level, with its origin at the first camera: z is up, x runs along the image columns as seen from
+above, y = z x x. Only its azimuth in the world comes from the on-board pose; the options choose the source of the
+vertical.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +12,24 @@ from dataclasses import replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.hda.details import HdaDetails
-from marsyard.algorithms.hda.hazards import map_resolution
-from marsyard.algorithms.hda.landing import map_ground, site_world
-from marsyard.algorithms.hda.motion import Motion, estimate_motion, plane_depths
-from marsyard.algorithms.hda.options import HdaOptions, TrackSeed
+from marsyard.algorithms.arrays import Points2, Points3, Vector3
+from marsyard.algorithms.hda import hazards
+from marsyard.algorithms.hda.details import Ground, HdaDetails
+from marsyard.algorithms.hda.motion import (
+    LandingScene,
+    Motion,
+    View,
+    build_scene,
+    estimate_motion,
+    plane_depths,
+    points_at_depth,
+    undistort,
+)
+from marsyard.algorithms.hda.options import HdaOptions, SurfaceFrame, TrackSeed
 from marsyard.algorithms.hda.structure import Matches, dense_structure, scale_factor
 from marsyard.algorithms.hda.tracking import Tracks, select_features, track_features
-from marsyard.algorithms.hda.view import LandingScene, build_scene, points_at_depth, undistort
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements
@@ -51,48 +63,46 @@ def find_site(
     """Run all stages, with the given solvers for motion and structure."""
     details = HdaDetails(scene.views)
     if not (np.isfinite(scene.range_m) and scene.range_m > 0.0):
-        return _unconverged(SiteOutcome.NO_RANGE, scene, details)
+        return _report_unconverged(SiteOutcome.NO_RANGE, scene, details)
     features = select_features(scene.views[0].counts, options)
     if len(features) < options.min_tracks:
-        return _unconverged(SiteOutcome.NO_FEATURES, scene, details)
+        return _report_unconverged(SiteOutcome.NO_FEATURES, scene, details)
     tracks = track_features(
         scene.views[0].counts, scene.views[1].counts, features, expected_pixels(scene, features, options), options
     )
-    details = details.ended(tracks=tracks)
+    details = details.end_stage(tracks=tracks)
     if np.count_nonzero(tracks.accepted) < options.min_tracks:
-        return _unconverged(SiteOutcome.NO_TRACKS, scene, details)
+        return _report_unconverged(SiteOutcome.NO_TRACKS, scene, details)
     motion = solve_motion(scene, tracks, options)
     details = replace(details, motion=motion)
     failure = motion_failure(motion, options)
     if motion is None or failure is not None:
-        return _unconverged(failure or SiteOutcome.NO_MOTION, scene, details)
+        return _report_unconverged(failure or SiteOutcome.NO_MOTION, scene, details)
     places = undistort(scene.views[0].camera, tracks.first[tracks.accepted])
     factor = scale_factor(scene.views, motion, places, scene.range_m, options)
     if not (np.isfinite(factor) and factor > 0.0):
-        return _unconverged(SiteOutcome.NO_MOTION, scene, details)
-    motion = motion.scaled(factor)
-    details = details.ended(motion=motion)
+        return _report_unconverged(SiteOutcome.NO_MOTION, scene, details)
+    motion = motion.scale(factor)
+    details = details.end_stage(motion=motion)
     matches = solve_structure(scene, motion, options)
-    details = details.ended(matches=matches)
+    details = details.end_stage(matches=matches)
     if len(matches.points) < options.min_points:
-        return _unconverged(SiteOutcome.NO_STRUCTURE, scene, details)
-    resolution = map_resolution(motion, scene.views[0].focal_px, options)
+        return _report_unconverged(SiteOutcome.NO_STRUCTURE, scene, details)
+    resolution = hazards.map_resolution(motion, scene.views[0].focal_px, options)
     ground = map_ground(scene, matches.points, resolution, options)
     if ground is None:
-        return _unconverged(SiteOutcome.NO_STRUCTURE, scene, details)
+        return _report_unconverged(SiteOutcome.NO_STRUCTURE, scene, details)
     site = site_world(scene, ground)
-    details = details.ended(ground=ground)
+    details = details.end_stage(ground=ground)
     outcome = SiteOutcome.NO_SAFE_SITE if site is None else SiteOutcome.SAFE_SITE
     return SiteEstimate(outcome, site, details)
 
 
-def _unconverged(outcome: SiteOutcome, scene: LandingScene, details: HdaDetails) -> SiteEstimate:
+def _report_unconverged(outcome: SiteOutcome, scene: LandingScene, details: HdaDetails) -> SiteEstimate:
     return SiteEstimate(outcome, scene.apriori_site_world, details)
 
 
-def expected_pixels(
-    scene: LandingScene, features: Float[np.ndarray, "n 2"], options: HdaOptions
-) -> Float[np.ndarray, "n 2"]:
+def expected_pixels(scene: LandingScene, features: Points2, options: HdaOptions) -> Points2:
     """Expected pixels of the features in the second image."""
     if options.track_seed is TrackSeed.NOTHING:
         return features
@@ -104,10 +114,8 @@ def expected_pixels(
 
 def motion_from_tracks(scene: LandingScene, tracks: Tracks, options: HdaOptions) -> Motion:
     """The motion by robust least squares: the better of the starts from the on-board poses and from rest."""
-    first, second = (
-        undistort(one.camera, pixels[tracks.accepted])
-        for one, pixels in zip(scene.views, (tracks.first, tracks.second), strict=True)
-    )
+    accepted = (tracks.first[tracks.accepted], tracks.second[tracks.accepted])
+    first, second = (undistort(one.camera, pixels) for one, pixels in zip(scene.views, accepted, strict=True))
     depths = plane_depths(first, scene.range_m, scene.up_camera)
     starts: tuple[RigidTransform, ...] = (scene.second_from_first, rigid(Rotation.identity(), np.zeros(3)))
     return estimate_motion(first, second, scene.views[1].focal_px, depths, starts, options)
@@ -130,3 +138,83 @@ def motion_failure(motion: Motion | None, options: HdaOptions) -> SiteOutcome | 
 def matched_structure(scene: LandingScene, motion: Motion, options: HdaOptions) -> Matches:
     """Structure by matches along epipolar segments."""
     return dense_structure(scene.views, motion.second_from_first, motion.depth_range_m, options)
+
+
+#: Trials of the robust plane through all points.
+PLANE_TRIALS = 200
+
+
+def up_direction(first: View, up_camera: Vector3, points: Points3, options: HdaOptions) -> Vector3:
+    """Unit vector upwards in the first camera's frame, from the source in the options.
+
+    `up_camera` is the inclinometers' measurement, `points` are in the first camera's frame.
+    """
+    if options.surface_frame is SurfaceFrame.INCLINOMETER:
+        return up_camera
+    if options.surface_frame is SurfaceFrame.STATE:
+        return np.asarray(first.world_from_camera.rotation.inv().apply(np.array([0.0, 0.0, 1.0])))
+    return plane_normal(points, options.seed)
+
+
+def plane_normal(points: Points3, seed: int) -> Vector3:
+    """Unit normal, towards the origin, of the least-median-of-squares plane through at least four points.
+
+    The best of planes through random triples, refined by least squares over the points within 2.5 standard deviations
+    (Rousseeuw & Leroy 1987).
+    """
+    rng = np.random.default_rng(seed)
+    corners = points[rng.integers(0, len(points), (PLANE_TRIALS, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    real = lengths > 1e-9 * float(np.mean(points**2))
+    normals, corners = normals[real] / lengths[real, None], corners[real]
+    if len(normals) == 0:
+        return np.array([0.0, 0.0, -1.0])
+    distances = np.abs(points @ normals.T - np.sum(normals * corners[:, 0], axis=1))
+    medians = np.median(distances, axis=0)
+    best = int(np.argmin(medians))
+    near = points[distances[:, best] <= 2.5 * 1.4826 * (1.0 + 5.0 / max(len(points) - 3, 1)) * medians[best]]
+    normal = np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][2] if len(near) >= 3 else normals[best]
+    return np.asarray(-np.sign(normal @ points.mean(axis=0)) * normal)
+
+
+def surface_from_camera(up_camera: Vector3) -> Rotation:
+    """The rotation from the camera's frame to the surface frame; up must not be parallel to the columns."""
+    x = np.array([1.0, 0.0, 0.0]) - up_camera[0] * up_camera
+    x /= np.linalg.norm(x)
+    return Rotation.from_matrix(np.stack([x, np.cross(up_camera, x), up_camera]))
+
+
+def world_from_surface(world_from_camera: Rotation, surface_from_first: Rotation) -> Rotation:
+    """The rotation about the vertical that aligns the surface frame's azimuth with the on-board pose."""
+    x = (world_from_camera * surface_from_first.inv()).apply(np.array([1.0, 0.0, 0.0]))
+    return Rotation.from_euler("z", float(np.arctan2(x[1], x[0])))
+
+
+def map_ground(
+    scene: LandingScene, points_camera: Points3, resolution: hazards.Resolution, options: HdaOptions
+) -> Ground | None:
+    """The maps of points in the first camera's frame, and the site; None if the points cover no area."""
+    first = scene.views[0]
+    to_surface = surface_from_camera(up_direction(first, scene.up_camera, points_camera, options))
+    points = to_surface.apply(points_camera)
+    elevation = hazards.elevation_map(points)
+    if elevation is None:
+        return None
+    maps = hazards.hazard_maps(elevation, options)
+    if options.check_footprints:
+        maps = replace(maps, safety=hazards.check_footprints(maps.safety, elevation, resolution, options))
+    to_world = world_from_surface(first.world_from_camera.rotation, to_surface)
+    apriori = to_world.inv().apply(scene.apriori_site_world - first.world_from_camera.translation)
+    apriori_cell = elevation.cells(apriori[:2])
+    site_cell = hazards.safe_site(maps.safety, apriori_cell)
+    return Ground(to_surface, to_world, points, elevation, maps, apriori_cell, site_cell)
+
+
+def site_world(scene: LandingScene, ground: Ground) -> Vector3 | None:
+    """The site in the world frame, metres, on the smooth surface; None if no cell is safe."""
+    if ground.site_cell is None:
+        return None
+    x, y = ground.elevation.places(np.array(ground.site_cell, dtype=np.float64))
+    site = np.array([x, y, ground.hazards.smooth_m[ground.site_cell]])
+    return np.asarray(scene.views[0].world_from_camera.translation + ground.world_from_surface.apply(site))

@@ -7,8 +7,9 @@ from enum import IntEnum
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
+from marsyard.algorithms.arrays import Mask, Points3, Raster, Vector2
 from marsyard.algorithms.hda.kernels import elevation as kernels
 from marsyard.algorithms.hda.motion import Motion
 from marsyard.algorithms.hda.options import HdaOptions
@@ -27,8 +28,8 @@ class ElevationMap:
     - cell_m: Side of a cell
     """
 
-    elevation_m: Float[np.ndarray, "rows columns"]
-    corner_m: Float[np.ndarray, "2"]
+    elevation_m: Raster
+    corner_m: Vector2
     cell_m: float
 
     def places(self, cells: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
@@ -41,7 +42,7 @@ class ElevationMap:
         return np.asarray(offsets[..., ::-1])
 
 
-def elevation_map(points: Float[np.ndarray, "n 3"]) -> ElevationMap | None:
+def elevation_map(points: Points3) -> ElevationMap | None:
     """The map of points in the surface frame; None if they cover no area.
 
     The cell side is sqrt(A / N) with A the area of the horizontal bounding box: about one point per cell. An elevation
@@ -86,9 +87,9 @@ class HazardMaps:
     """
 
     planes: Float[np.ndarray, "m n 3"]
-    smooth_m: Float[np.ndarray, "rows columns"]
-    roughness_m: Float[np.ndarray, "rows columns"]
-    slope_rad: Float[np.ndarray, "rows columns"]
+    smooth_m: Raster
+    roughness_m: Raster
+    slope_rad: Raster
     safety: UInt8[np.ndarray, "rows columns"]
 
 
@@ -99,9 +100,7 @@ def hazard_maps(ground: ElevationMap, options: HdaOptions) -> HazardMaps:
     return HazardMaps(planes, smooth, roughness, slope, safe_landing_map(slope, roughness, ground.cell_m, options))
 
 
-def smooth_surface(
-    ground: ElevationMap, options: HdaOptions
-) -> tuple[Float[np.ndarray, "m n 3"], Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
+def smooth_surface(ground: ElevationMap, options: HdaOptions) -> tuple[Float[np.ndarray, "m n 3"], Raster, Raster]:
     """Robust planes of the footprints, and elevation (metres) and slope (radians) interpolated between their middles.
 
     Squares of the footprint's side are spread evenly over the map. Beyond the outermost middles the extrapolation is
@@ -162,10 +161,7 @@ def _interpolate(
 
 
 def safe_landing_map(
-    slope_rad: Float[np.ndarray, "rows columns"],
-    roughness_m: Float[np.ndarray, "rows columns"],
-    cell_m: float,
-    options: HdaOptions,
+    slope_rad: Raster, roughness_m: Raster, cell_m: float, options: HdaOptions
 ) -> UInt8[np.ndarray, "rows columns"]:
     """Classify cells by slope and roughness: values of `Safety`.
 
@@ -183,7 +179,7 @@ def safe_landing_map(
     return np.asarray(safety.astype(np.uint8))
 
 
-def grassfire(marked: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
+def grassfire(marked: Mask) -> Raster:
     """Distance of every cell from the nearest marked cell, cells; infinite without any (grassfire transform, Blum
     1973).
     """
@@ -193,13 +189,11 @@ def grassfire(marked: Bool[np.ndarray, "rows columns"]) -> Float[np.ndarray, "ro
     return np.asarray(distances.astype(np.float64))
 
 
-def _dilate(marked: Bool[np.ndarray, "rows columns"], reach: float) -> Bool[np.ndarray, "rows columns"]:
+def _dilate(marked: Mask, reach: float) -> Mask:
     return np.asarray(marked | (grassfire(marked) <= reach))
 
 
-def safe_site(
-    safety: UInt8[np.ndarray, "rows columns"], apriori_cell: Float[np.ndarray, "2"]
-) -> tuple[int, int] | None:
+def safe_site(safety: UInt8[np.ndarray, "rows columns"], apriori_cell: Vector2) -> tuple[int, int] | None:
     """The safe cell (row, column) farthest from all unsafe cells, ties broken by distance to the a-priori site.
 
     None if no cell is safe. Cells outside the map are unsafe.

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from scipy.spatial.transform import RigidTransform
 
+from marsyard.algorithms.arrays import Flags, Points2
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.motion import Motion
+from marsyard.algorithms.hda.motion import Motion, View, Views, points_at_depth, project_points, undistort
 from marsyard.algorithms.hda.options import HdaOptions
-from marsyard.algorithms.hda.view import View, points_at_depth, project_points, undistort
 
 
 class Fate(IntEnum):
@@ -37,17 +37,17 @@ class Matches:
     - points: Points of the accepted matches in the first camera's frame, metres
     """
 
-    first: Float[np.ndarray, "n 2"]
-    starts: Float[np.ndarray, "n 2"]
-    ends: Float[np.ndarray, "n 2"]
-    second: Float[np.ndarray, "n 2"]
+    first: Points2
+    starts: Points2
+    ends: Points2
+    second: Points2
     correlations: Float[np.ndarray, "n"]
     depths: Float[np.ndarray, "n"]
     fates: UInt8[np.ndarray, "n"]
     points: Float[np.ndarray, "m 3"]
 
     @property
-    def accepted(self) -> Bool[np.ndarray, "n"]:
+    def accepted(self) -> Flags:
         """Whether each match passed all checks."""
         return np.asarray(self.fates == Fate.ACCEPTED)
 
@@ -57,7 +57,7 @@ def depth_bounds(depth_range_m: tuple[float, float], margin: float) -> tuple[flo
     return (1.0 - margin) * depth_range_m[0], (1.0 + margin) * depth_range_m[1]
 
 
-def pixel_lattice(size: tuple[int, int], spacing_px: int, border_px: int) -> Float[np.ndarray, "n 2"]:
+def pixel_lattice(size: tuple[int, int], spacing_px: int, border_px: int) -> Points2:
     """Pixels (u, v) of a centred grid over an image of size (columns, rows), inside the border."""
     axes = []
     for extent in size:
@@ -67,28 +67,22 @@ def pixel_lattice(size: tuple[int, int], spacing_px: int, border_px: int) -> Flo
 
 
 def epipolar_segments(
-    second: View,
-    second_from_first: RigidTransform,
-    places: Float[np.ndarray, "n 2"],
-    bounds_m: tuple[float, float],
-    border_px: int,
-) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"], Bool[np.ndarray, "n"]]:
+    second: View, second_from_first: RigidTransform, places: Points2, bounds_m: tuple[float, float], border_px: int
+) -> tuple[Points2, Points2, Flags]:
     """Ends of the epipolar segments of undistorted coordinates (Eqs. 6-8), and whether both are inside the border."""
     ends = []
     room = np.ones(len(places), dtype=bool)
     for depth in bounds_m:
         moved = second_from_first.apply(points_at_depth(places, np.full(len(places), depth)))
-        pixels, seen = project_points(second.camera, moved)
+        pixels, visible = project_points(second.camera, moved)
         with np.errstate(invalid="ignore"):
             inside = (pixels >= border_px) & (pixels <= np.array(second.camera.size) - 1.0 - border_px)
-        room &= seen & inside.all(axis=1)
+        room &= visible & inside.all(axis=1)
         ends.append(pixels)
     return ends[0], ends[1], room
 
 
-def triangulate(
-    first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"], second_from_first: RigidTransform
-) -> Float[np.ndarray, "n"]:
+def triangulate(first: Points2, second: Points2, second_from_first: RigidTransform) -> Float[np.ndarray, "n"]:
     """Depths z in the first camera's frame that best fit z' h' = z R h + t, metres; NaN for parallel rays.
 
     Least squares over both depths (Weng, Ahuja & Huang 1993); h and h' are homogeneous undistorted coordinates.
@@ -104,11 +98,7 @@ def triangulate(
 
 
 def match_pixels(
-    views: tuple[View, View],
-    second_from_first: RigidTransform,
-    pixels: Float[np.ndarray, "n 2"],
-    bounds_m: tuple[float, float],
-    options: HdaOptions,
+    views: Views, second_from_first: RigidTransform, pixels: Points2, bounds_m: tuple[float, float], options: HdaOptions
 ) -> Matches:
     """Match whole pixels of the first image along their epipolar segments.
 
@@ -122,10 +112,10 @@ def match_pixels(
     places = undistort(first.camera, pixels)
     starts, ends, room = epipolar_segments(second, second_from_first, places, bounds_m, border)
     pixels, places, starts, ends = pixels[room], places[room], starts[room], ends[room]
-    whole = pixels.astype(np.int64)
-    found = matching.search_segments(first.counts, second.counts, whole, starts, ends, options.search_half_px)
+    rounded = pixels.astype(np.int64)
+    matches = matching.search_segments(first.counts, second.counts, rounded, starts, ends, options.search_half_px)
     matched, correlations = matching.refine_shifts(
-        first.counts, second.counts, whole[:, ::-1], (found - whole)[:, ::-1], options.search_half_px
+        first.counts, second.counts, rounded[:, ::-1], (matches - rounded)[:, ::-1], options.search_half_px
     )
     depths = triangulate(places, undistort(second.camera, matched), second_from_first)
     fates = np.full(len(pixels), Fate.ACCEPTED, dtype=np.uint8)
@@ -134,7 +124,7 @@ def match_pixels(
     if options.max_return_px is not None:
         left = np.flatnonzero(fates == Fate.ACCEPTED)
         way = return_distance(
-            views, second_from_first, whole[left], found[left], places[left], bounds_m, options.search_half_px
+            views, second_from_first, rounded[left], matches[left], places[left], bounds_m, options.search_half_px
         )
         fates[left[way > options.max_return_px]] = Fate.NOT_RETURNED
     accepted = fates == Fate.ACCEPTED
@@ -144,11 +134,11 @@ def match_pixels(
 
 
 def return_distance(
-    views: tuple[View, View],
+    views: Views,
     second_from_first: RigidTransform,
     pixels: Int[np.ndarray, "n 2"],
     found: Int[np.ndarray, "n 2"],
-    places: Float[np.ndarray, "n 2"],
+    places: Points2,
     bounds_m: tuple[float, float],
     half_px: int,
 ) -> Float[np.ndarray, "n"]:
@@ -168,9 +158,7 @@ def return_distance(
     return np.asarray(np.hypot(*(returned - pixels).T))
 
 
-def clip_to_image(
-    size: tuple[int, int], inside: Float[np.ndarray, "n 2"], ends: Float[np.ndarray, "n 2"], border_px: float
-) -> Float[np.ndarray, "n 2"]:
+def clip_to_image(size: tuple[int, int], inside: Points2, ends: Points2, border_px: float) -> Points2:
     """Ends of lines from positions inside an image of size (columns, rows), clipped at the border."""
     away = np.nan_to_num(ends - inside)
     limits = np.where(away > 0.0, np.array(size) - 1.0 - border_px, border_px)
@@ -180,7 +168,7 @@ def clip_to_image(
 
 
 def dense_structure(
-    views: tuple[View, View], second_from_first: RigidTransform, depth_range_m: tuple[float, float], options: HdaOptions
+    views: Views, second_from_first: RigidTransform, depth_range_m: tuple[float, float], options: HdaOptions
 ) -> Matches:
     """Matches of a grid of pixels, searched within the widened depth range of the features."""
     pixels = pixel_lattice(views[0].camera.size, options.grid_px, options.search_half_px + 1)
@@ -193,9 +181,7 @@ SPOT_OFFSETS_PX = np.arange(-4.0, 5.0, 2.0)
 MIN_SPOT_MATCHES = 5
 
 
-def scale_factor(
-    views: tuple[View, View], motion: Motion, places: Float[np.ndarray, "n 2"], range_m: float, options: HdaOptions
-) -> float:
+def scale_factor(views: Views, motion: Motion, places: Points2, range_m: float, options: HdaOptions) -> float:
     """Factor on all lengths of the motion that makes the depth on the optical axis equal the laser's range.
 
     Pixels about the laser's spot are matched as structure is; with too few matches the plane through the features'

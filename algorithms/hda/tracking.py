@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt16
+from jaxtyping import Float, Int
 
+from marsyard.algorithms.arrays import Counts, Flags, Points2, Raster, Values, Vector2
 from marsyard.algorithms.hda.kernels import matching
 from marsyard.algorithms.hda.options import HdaOptions
 from marsyard.algorithms.image.correlation import halve
@@ -46,7 +47,7 @@ def template_reach_px(options: HdaOptions) -> int:
     return max((size.template_half + 1) << level for level, size in enumerate(sizes))
 
 
-def pyramid(counts: UInt16[np.ndarray, "rows columns"], levels: int) -> tuple[Float[np.ndarray, "_ _"], ...]:
+def pyramid(counts: Counts, levels: int) -> tuple[Float[np.ndarray, "_ _"], ...]:
     """The image and its block averages over 2, 4, ... pixels, finest first, float32."""
     result = [counts.astype(np.float32)]
     for _ in range(levels - 1):
@@ -54,9 +55,7 @@ def pyramid(counts: UInt16[np.ndarray, "rows columns"], levels: int) -> tuple[Fl
     return tuple(result)
 
 
-def eigenvalue_test(
-    image: Float[np.ndarray, "rows columns"], support: int, min_eigenvalue: float
-) -> Float[np.ndarray, "rows columns"]:
+def eigenvalue_test(image: Raster, support: int, min_eigenvalue: float) -> Raster:
     """P of Eq. 2 where both eigenvalues of the structure tensor exceed the minimum l, minus infinity elsewhere.
 
     P is (a - l)(c - l) - b b with a > l (Benedetti & Perona 1998). The tensor is the mean, not the sum, over
@@ -67,7 +66,7 @@ def eigenvalue_test(
     return np.asarray(np.where((p > 0.0) & (a > min_eigenvalue), p, -np.inf), dtype=np.float32)
 
 
-def select_features(counts: UInt16[np.ndarray, "rows columns"], options: HdaOptions) -> Float[np.ndarray, "n 2"]:
+def select_features(counts: Counts, options: HdaOptions) -> Points2:
     """Pixels (u, v) of the best feature in each block that has one, block by block along rows.
 
     Features keep the distance from the image border that their template needs at every pyramid level.
@@ -82,8 +81,8 @@ def select_features(counts: UInt16[np.ndarray, "rows columns"], options: HdaOpti
     best = blocks.reshape(*blocks.shape[:2], -1).argmax(axis=-1)
     row, column = (i * side for i in np.indices(best.shape))
     row, column = row + best // side, column + best % side
-    found = np.isfinite(blocks.max(axis=(2, 3)))
-    return np.column_stack([column[found], row[found]]).astype(np.float64)
+    has_peak = np.isfinite(blocks.max(axis=(2, 3)))
+    return np.column_stack([column[has_peak], row[has_peak]]).astype(np.float64)
 
 
 #: Limits of an alignment: a height change of a fifth stretches the image by a quarter, and the first steps overshoot.
@@ -101,19 +100,13 @@ class Tracks:
     - accepted: Whether the correlation exceeds the threshold and, with `align`, the alignment succeeded
     """
 
-    first: Float[np.ndarray, "n 2"]
-    second: Float[np.ndarray, "n 2"]
-    correlations: Float[np.ndarray, "n"]
-    accepted: Bool[np.ndarray, "n"]
+    first: Points2
+    second: Points2
+    correlations: Values
+    accepted: Flags
 
 
-def track_features(
-    first: UInt16[np.ndarray, "rows columns"],
-    second: UInt16[np.ndarray, "rows columns"],
-    features: Float[np.ndarray, "n 2"],
-    expected: Float[np.ndarray, "n 2"],
-    options: HdaOptions,
-) -> Tracks:
+def track_features(first: Counts, second: Counts, features: Points2, expected: Points2, options: HdaOptions) -> Tracks:
     """Track features by correlation, coarse to fine, within the window about their expected pixels (u, v).
 
     Twice the best shift at a level starts the search at the next finer level. Tracks end at the top of the biquadratic
@@ -142,12 +135,8 @@ def track_features(
 
 
 def align_track(
-    first: Float[np.ndarray, "rows columns"],
-    second: Float[np.ndarray, "rows columns"],
-    place: Int[np.ndarray, "2"],
-    found: Float[np.ndarray, "2"],
-    options: HdaOptions,
-) -> Float[np.ndarray, "2"] | None:
+    first: Raster, second: Raster, place: Int[np.ndarray, "2"], found: Vector2, options: HdaOptions
+) -> Vector2 | None:
     """Pixel (u, v) in the second image of a position (row, column) in the first, aligned from the match `found`.
 
     The template may stretch. None if the alignment fails or its correlation is too low.

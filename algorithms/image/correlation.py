@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy import fft, ndimage
 
+from marsyard.algorithms.arrays import Raster, Vector2
 from marsyard.algorithms.image.kernels import correlation as kernels
 
 _ROW, _COLUMN = np.mgrid[-1.0:2.0, -1.0:2.0]
@@ -24,14 +25,14 @@ class Peak:
     on_border: bool
 
 
-def highest_peak(surface: Float[np.ndarray, "rows columns"]) -> Peak:
+def highest_peak(surface: Raster) -> Peak:
     """The maximum of the surface; the first of equals."""
     row, column = (int(i) for i in np.unravel_index(int(np.argmax(surface)), surface.shape))
     on_border = row in (0, surface.shape[0] - 1) or column in (0, surface.shape[1] - 1)
     return Peak(row, column, float(surface[row, column]), on_border)
 
 
-def biquadratic_offset(surface: Float[np.ndarray, "rows columns"], peak: Peak) -> Float[np.ndarray, "2"]:
+def biquadratic_offset(surface: Raster, peak: Peak) -> Vector2:
     """Offset (row, column) of the top of the least-squares quadric through the 3 x 3 values about the peak.
 
     In pixels, clipped to [-1, 1]; zero on the border and without a maximum. Its bias towards whole pixels reaches
@@ -51,7 +52,7 @@ def biquadratic_offset(surface: Float[np.ndarray, "rows columns"], peak: Peak) -
     return np.asarray(np.clip(offset, -1.0, 1.0))
 
 
-def peak_width(surface: Float[np.ndarray, "rows columns"], peak: Peak, level: float = 0.75) -> float:
+def peak_width(surface: Raster, peak: Peak, level: float = 0.75) -> float:
     """Full width of the peak at `level` times its height along its longest direction, in pixels.
 
     The major axis of the ellipse with the second moments of the connected region above the level. A sharp peak of one
@@ -66,7 +67,7 @@ def peak_width(surface: Float[np.ndarray, "rows columns"], peak: Peak, level: fl
     return float(4.0 * np.sqrt(np.linalg.eigvalsh(moments)[-1] + 1.0 / 12.0))
 
 
-def second_peak(surface: Float[np.ndarray, "rows columns"], peak: Peak, exclusion: float) -> float:
+def second_peak(surface: Raster, peak: Peak, exclusion: float) -> float:
     """The highest local maximum (of 3 x 3) further than `exclusion` pixels from the peak; 0 without a positive one."""
     maxima = np.argwhere(surface >= ndimage.maximum_filter(surface, size=3, mode="nearest"))
     distances = np.hypot(maxima[:, 0] - peak.row, maxima[:, 1] - peak.column)
@@ -86,9 +87,7 @@ def cross_sums(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ 
     return np.asarray(products[: window.shape[0] - template.shape[0] + 1, : window.shape[1] - template.shape[1] + 1])
 
 
-def pseudo_normalized_correlation(
-    template: Float[np.ndarray, "n m"], window: Float[np.ndarray, "rows columns"]
-) -> Float[np.ndarray, "_ _"]:
+def pseudo_normalized_correlation(template: Float[np.ndarray, "n m"], window: Raster) -> Float[np.ndarray, "_ _"]:
     """``2 sum(A B) / (sum(A A) + sum(B B))`` with A the template and B the window's patch, each less its own mean.
 
     Entry (i, j) belongs to the patch with its upper left pixel at (i, j) of the window; the shape is (rows - n + 1,
@@ -107,9 +106,7 @@ def pseudo_normalized_correlation(
 REACH_PX = 2
 
 
-def normalized_correlation(
-    template: Float[np.ndarray, "n m"], window: Float[np.ndarray, "rows columns"]
-) -> Float[np.ndarray, "_ _"]:
+def normalized_correlation(template: Float[np.ndarray, "n m"], window: Raster) -> Float[np.ndarray, "_ _"]:
     """``sum(A B) / sqrt(sum(A A) sum(B B))`` with A the template and B the window's patch, each less its own mean.
 
     Entry (i, j) belongs to the patch with its upper left pixel at (i, j) of the window; the shape is (rows - n + 1,
@@ -117,14 +114,12 @@ def normalized_correlation(
     in float32. (Tracking paper, Eq. 11.) Raises ValueError if the template is larger than the window.
     """
     _check_fit(template, window)
-    a, bright_a = kernels.centred(np.ascontiguousarray(template, dtype=np.float32))
-    b, bright_b = kernels.centred(np.ascontiguousarray(window, dtype=np.float32))
+    a, bright_a = kernels.subtract_mean(np.ascontiguousarray(template, dtype=np.float32))
+    b, bright_b = kernels.subtract_mean(np.ascontiguousarray(window, dtype=np.float32))
     return np.asarray(kernels.surface(a, b, _flat_energy(template, max(bright_a, bright_b))))
 
 
-def coarse_to_fine_peak(
-    template: Float[np.ndarray, "n m"], window: Float[np.ndarray, "rows columns"], levels: int, candidates: int
-) -> Peak:
+def coarse_to_fine_peak(template: Float[np.ndarray, "n m"], window: Raster, levels: int, candidates: int) -> Peak:
     """The maximum of `normalized_correlation`, searched at reduced resolution first.
 
     Template and window are halved `levels` times. The best local maxima of the coarsest correlation, at most
@@ -144,7 +139,7 @@ def coarse_to_fine_peak(
     order = np.argsort(-values, kind="stable")[: candidates if levels else 1]
     places, values = maxima[order], values[order]
     for small, large in reversed(pyramid[:-1]):
-        a, bright = kernels.centred(np.ascontiguousarray(small, dtype=np.float32))
+        a, bright = kernels.subtract_mean(np.ascontiguousarray(small, dtype=np.float32))
         b = np.ascontiguousarray(large, dtype=np.float32)
         places, values = kernels.search_near(a, b, 2 * places, REACH_PX, _flat_energy(small, bright))
     best = int(np.argmax(values))
@@ -153,7 +148,7 @@ def coarse_to_fine_peak(
     return Peak(row, column, float(values[best]), row in (0, last[0]) or column in (0, last[1]))
 
 
-def halve(image: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "_ _"]:
+def halve(image: Raster) -> Float[np.ndarray, "_ _"]:
     """Means of 2 x 2 pixels; an odd last row or column is dropped."""
     rows, columns = image.shape[0] // 2, image.shape[1] // 2
     even = np.ascontiguousarray(image[: 2 * rows, : 2 * columns])

@@ -15,15 +15,13 @@ Given T this is a linear recursion in P; T itself follows because P_M = T is lin
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
 
+from marsyard.algorithms.arrays import Raster
 from marsyard.algorithms.image.kernels import frame_transfer as kernels
 from marsyard.sim.measurements import DetectorCalibration
 
 
-def remove_frame_transfer(
-    signal: Float[np.ndarray, "rows columns"], calibration: DetectorCalibration, rows_summed: int
-) -> Float[np.ndarray, "rows columns"]:
+def remove_frame_transfer(signal: Raster, calibration: DetectorCalibration, rows_summed: int) -> Raster:
     """The signal of the exposure alone, in the units of `signal`, from whole columns of a delivered image.
 
     `signal` holds counts above the offset, all rows, any columns; `rows_summed` physical rows per row. The inversion is

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from scipy import ndimage
 from scipy.interpolate import BSpline
 
+from marsyard.algorithms.arrays import Patch, Raster, Vector2
 from marsyard.algorithms.image.kernels import quintic
 from marsyard.algorithms.image.kernels import registration as kernels
 
@@ -30,34 +31,30 @@ _BASIS = BSpline.basis_element(np.arange(ORDER + 2) - (ORDER + 1) / 2.0, extrapo
 _SLOPE = _BASIS.derivative()
 
 
-def spline_coefficients(image: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
+def spline_coefficients(image: Raster) -> Raster:
     """Coefficients of the quintic spline through the image; borders mirror about their last pixels."""
     return np.asarray(ndimage.spline_filter(image, order=ORDER, output=np.float64, mode="mirror"))
 
 
-def shifted_patch(
-    coefficients: Float[np.ndarray, "rows columns"], corner: Float[np.ndarray, "2"], shape: tuple[int, int]
-) -> Float[np.ndarray, "3 n m"]:
+def shifted_patch(coefficients: Raster, corner: Vector2, shape: tuple[int, int]) -> Float[np.ndarray, "3 n m"]:
     """The patch of `shape` with its upper left pixel at `corner` (row, column), and its derivatives by row and column.
 
     All pixels share the fraction of the shift: the spline is a separable filter of six taps. The patch must lie at
     least three pixels inside the image.
     """
-    whole = np.floor(corner)
-    places = (corner - whole)[:, np.newaxis] - _TAPS
+    integer_part = np.floor(corner)
+    places = (corner - integer_part)[:, np.newaxis] - _TAPS
     taps = np.stack([_BASIS(places), _SLOPE(places)])
     samples = np.empty((3, *shape))
-    quintic.sample_with_derivatives(coefficients, int(whole[0]), int(whole[1]), taps[:, 0], taps[:, 1], samples)
+    quintic.sample_with_derivatives(
+        coefficients, int(integer_part[0]), int(integer_part[1]), taps[:, 0], taps[:, 1], samples
+    )
     return samples
 
 
 def refine_shift(
-    template: Float[np.ndarray, "n m"],
-    window: Float[np.ndarray, "rows columns"],
-    corner: Float[np.ndarray, "2"],
-    iterations: int = 6,
-    reach: float = 1.5,
-) -> Float[np.ndarray, "2"] | None:
+    template: Float[np.ndarray, "n m"], window: Raster, corner: Vector2, iterations: int = 6, reach: float = 1.5
+) -> Vector2 | None:
     """Refine the corner (row, column) of a template in the window to hundredths of a pixel.
 
     Minimises ``sum (A - gain B)^2`` over shift and gain, A and B less their means, from `corner` by Gauss-Newton. None
@@ -122,7 +119,7 @@ LIMITS = Limits()
 class Registration:
     """Best match: corner (row, column in the window) of the unwarped template, and normalised correlation."""
 
-    corner: Float[np.ndarray, "2"]
+    corner: Vector2
     score: float
 
 
@@ -132,15 +129,10 @@ class SplinePart:
 
     near: tuple[int, int]
     far: tuple[int, int]
-    coefficients: Float[np.ndarray, "rows columns"]
+    coefficients: Raster
 
 
-def build_spline(
-    window: Float[np.ndarray, "rows columns"],
-    corner: Float[np.ndarray, "2"],
-    side: int,
-    known: SplinePart | None = None,
-) -> SplinePart:
+def build_spline(window: Raster, corner: Vector2, side: int, known: SplinePart | None = None) -> SplinePart:
     """The spline about a template of `side` pixels with its upper left one at `corner` (row, column).
 
     Returns `known`, of the same window, if it is the same part.
@@ -154,11 +146,7 @@ def build_spline(
 
 
 def register_template(
-    template: Float[np.ndarray, "n n"],
-    window: Float[np.ndarray, "rows columns"] | SplinePart,
-    corner: Float[np.ndarray, "2"],
-    warp: Warp,
-    limits: Limits = LIMITS,
+    template: Patch, window: Raster | SplinePart, corner: Vector2, warp: Warp, limits: Limits = LIMITS
 ) -> Registration | None:
     """Register a template in a window, or in the part of it about `corner`, from `corner` (row, column).
 
@@ -179,11 +167,7 @@ def register_template(
 
 
 def similarity_patch(
-    image: Float[np.ndarray, "rows columns"],
-    centre: Float[np.ndarray, "2"],
-    side: int,
-    magnification: float = 1.0,
-    roll_rad: float = 0.0,
+    image: Raster, centre: Vector2, side: int, magnification: float = 1.0, roll_rad: float = 0.0
 ) -> Float[np.ndarray, "side side"]:
     """The square of `side` pixels about `centre` of the magnified and rolled image.
 

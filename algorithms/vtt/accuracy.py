@@ -1,4 +1,4 @@
-"""Approach accuracy: Eqs. 1 to 5 of the tracking paper, and its Table I.
+"""Approach accuracy (Eqs. 1 to 5 and Table I of the tracking paper), and the hand-over to the arm (sections 3 and 7.4).
 
 Distances are in metres; 3 sigma where the disparity error is that of 3 sigma (the paper takes 1 pixel).
 """
@@ -7,8 +7,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Decimal
+from enum import Enum
 
 import numpy as np
+from jaxtyping import Float
+
+from marsyard.algorithms.interface import TargetUpdate
+from marsyard.algorithms.vtt.stereo import disparity_px_m
+from marsyard.sim.measurements import MastCalibration
 
 #: Target distances before and after the traverse (section 4.2), metres.
 START_M, GOAL_M = 10.0, 2.0
@@ -106,3 +112,59 @@ def accuracy_row(design: StereoDesign) -> AccuracyRow:
 def table_1() -> tuple[AccuracyRow, AccuracyRow]:
     """Table I: pancam and navcam."""
     return accuracy_row(PANCAM), accuracy_row(NAVCAM)
+
+
+class HandOffOutcome(Enum):
+    """How a hand-off ended. Every member but HANDED_OVER is an expected failure: the arm gets no target."""
+
+    HANDED_OVER = "the arm has the target"
+    NOT_TRACKED = "the target is not tracked"
+    NOT_AT_GOAL = "the rover is not at the commanded distance from the target"
+
+
+@dataclass(frozen=True)
+class ArmTarget:
+    """Target for the arm: position in the rover frame, metres, and its 3 sigma error by Eq. 5."""
+
+    position_rover: Float[np.ndarray, "3"]
+    error_m: float
+
+
+@dataclass(frozen=True)
+class HandOff:
+    """The outcome, and the target if it was handed over."""
+
+    outcome: HandOffOutcome
+    target: ArmTarget | None
+
+
+@dataclass(frozen=True)
+class GoalReached:
+    """Goal criterion: the target's horizontal distance from the rover's origin."""
+
+    distance_m: float
+    tolerance_m: float
+
+    def holds(self, position_rover: Float[np.ndarray, "3"]) -> bool:
+        """Whether a target at this position is at the commanded distance."""
+        return abs(float(np.hypot(position_rover[0], position_rover[1])) - self.distance_m) <= self.tolerance_m
+
+
+def hand_off(update: TargetUpdate, goal: GoalReached, mast: MastCalibration, drift_px: float = 2.5) -> HandOff:
+    """Hand the target over to the arm, if it is tracked and the rover is at its goal.
+
+    `drift_px` is the assumed drift (paper: 2.5 px from 10 m to 2 m). The range for the error is that from the mast's
+    elevation axis.
+    """
+    position = update.position_rover
+    if not update.found or position is None:
+        return HandOff(HandOffOutcome.NOT_TRACKED, None)
+    if not goal.holds(position):
+        return HandOff(HandOffOutcome.NOT_AT_GOAL, None)
+    axis = mast.geometry.base_m + np.array([0.0, 0.0, mast.geometry.elbow_m[2]])
+    range_m = float(np.linalg.norm(position - axis))
+    error = tracked_approach_error_m(
+        stereo_range_error_m(range_m, disparity_px_m(mast.left, mast.right), 1.0),
+        drift_error_m(range_m, mast.left.focal_lengths[0], drift_px),
+    )
+    return HandOff(HandOffOutcome.HANDED_OVER, ArmTarget(position, error))

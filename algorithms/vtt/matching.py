@@ -1,4 +1,4 @@
-"""Template extraction and matching (sections 4.3.2 and 4.3.3)."""
+"""Prediction of the target, magnification and roll (4.1, 4.3.1); template extraction and matching (4.3.2, 4.3.3)."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, UInt16
+from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
+from marsyard.algorithms.arrays import Counts, Patch, Vector2, Vector3
 from marsyard.algorithms.image.correlation import Peak, biquadratic_offset, coarse_to_fine_peak, normalized_correlation
 from marsyard.algorithms.image.registration import SURROUND, Warp, build_spline, register_template, similarity_patch
 from marsyard.algorithms.vtt.options import VttOptions
-from marsyard.algorithms.vtt.target import bearing_rad
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.measurements import MastImage
+from marsyard.sim.frames import SITE_FROM_WORLD, compose
+from marsyard.sim.measurements import MastImage, RoverTarget, SiteTarget
 
 
 @dataclass(frozen=True)
@@ -33,8 +34,8 @@ class Sighting:
     """
 
     image: MastImage
-    pixel: Float[np.ndarray, "2"]
-    position_head: Float[np.ndarray, "3"]
+    pixel: Vector2
+    position_head: Vector3
     camera: CameraModel
     world_from_head: RigidTransform
     world_from_rover: RigidTransform
@@ -67,19 +68,19 @@ class Match:
     - template: The old image about the target, magnified and rolled
     """
 
-    pixel: Float[np.ndarray, "2"]
+    pixel: Vector2
     score: float
-    template: Float[np.ndarray, "n n"]
+    template: Patch
 
 
 #: Registrations after the shift, in this order.
 _WARPS: dict[Warp, tuple[Warp, ...]] = {"shift": (), "stretch": ("stretch",), "bend": ("stretch", "bend")}
 #: Matches a sighting in a new image near a full-frame pixel; None if the window does not fit.
-Matcher = Callable[[Sighting, MastImage, Float[np.ndarray, "2"], Change, VttOptions], Match | None]
+Matcher = Callable[[Sighting, MastImage, Vector2, Change, VttOptions], Match | None]
 
 
 def cut_patch(
-    image: MastImage, pixel: Float[np.ndarray, "2"], side: int, change: Change | None = None
+    image: MastImage, pixel: Vector2, side: int, change: Change | None = None
 ) -> Float[np.ndarray, "side side"]:
     """A square about a full-frame pixel, at its sub-pixel position, magnified and rolled by `change`."""
     applied = Change() if change is None else change
@@ -91,9 +92,7 @@ def cut_patch(
     return similarity_patch(region.astype(np.float64), centre - near, side, applied.magnification, applied.roll_rad)
 
 
-def search_window(
-    image: MastImage, pixel: Float[np.ndarray, "2"], side: int
-) -> tuple[UInt16[np.ndarray, "rows columns"], tuple[int, int]]:
+def search_window(image: MastImage, pixel: Vector2, side: int) -> tuple[Counts, tuple[int, int]]:
     """The square of `side` pixels about a full-frame pixel, clipped to the image, and its corner in the frame."""
     near = np.rint(pixel - 0.5 * (side - 1)).astype(int) - np.array(image.corner)
     far = np.maximum(near + side, 0)
@@ -102,7 +101,7 @@ def search_window(
     return window, (int(near[0]) + image.corner[0], int(near[1]) + image.corner[1])
 
 
-def has_room(image: MastImage, pixel: Float[np.ndarray, "2"], side: int) -> bool:
+def has_room(image: MastImage, pixel: Vector2, side: int) -> bool:
     """Whether a square of `side` pixels about a full-frame pixel lies in the image."""
     local = pixel - np.array(image.corner, dtype=np.float64)
     rows, columns = image.counts.shape
@@ -119,18 +118,13 @@ class Refinement:
     - warped_score: Normalised correlation of the warped template
     """
 
-    corner: Float[np.ndarray, "2"]
+    corner: Vector2
     score: float
     warped_score: float
 
 
 def refine_match(
-    template: Float[np.ndarray, "n n"],
-    image: MastImage,
-    corner: Float[np.ndarray, "2"],
-    offset: Float[np.ndarray, "2"],
-    whole: Peak,
-    options: VttOptions,
+    template: Patch, image: MastImage, corner: Vector2, offset: Vector2, whole: Peak, options: VttOptions
 ) -> Refinement:
     """Refine a match by registration: a shift, then the stretch and bend of the options.
 
@@ -155,7 +149,7 @@ def refine_match(
 
 
 def match_by_correlation(
-    sighting: Sighting, image: MastImage, predicted: Float[np.ndarray, "2"], change: Change, options: VttOptions
+    sighting: Sighting, image: MastImage, predicted: Vector2, change: Change, options: VttOptions
 ) -> Match | None:
     """The paper's matcher: coarse-to-fine normalised correlation of the magnified, rolled template in a window."""
     template = cut_patch(sighting.image, sighting.pixel, options.template_px, change)
@@ -175,3 +169,65 @@ def match_by_correlation(
             offset = biquadratic_offset(normalized_correlation(template, about), Peak(1, 1, peak.value, False))
         best = refine_match(template, image, corner, offset, peak, options)
     return Match(best.corner[::-1] + half + image.corner, best.score, template)
+
+
+def designated_position_world(target: RoverTarget | SiteTarget, world_from_rover: RigidTransform) -> Vector3:
+    """World position of a target designated by position; `world_from_rover` is the pose at designation."""
+    if isinstance(target, RoverTarget):
+        return np.asarray(world_from_rover.apply(target.position_rover.copy()))
+    return np.asarray(SITE_FROM_WORLD.inv().apply(target.position_site.copy()))
+
+
+def pose_change(old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform) -> RigidTransform:
+    """The transform from the old frame into the new frame."""
+    return compose(new_world_from_frame.inv(), old_world_from_frame)
+
+
+def predicted_position(
+    position: Vector3, old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform
+) -> Vector3:
+    """Position of a static point in a frame that moved (rover or mast head), from its old position there."""
+    return np.asarray(pose_change(old_world_from_frame, new_world_from_frame).apply(position.copy()))
+
+
+def bearing_rad(direction_world: Vector3) -> float:
+    """Azimuth of a direction, clockwise from north, radians in (-pi, pi]."""
+    return float(np.arctan2(direction_world[0], direction_world[1]))
+
+
+def magnification(old_position: Vector3, old_centre: Vector3, new_position: Vector3, new_centre: Vector3) -> float:
+    """Scale factor, Eq. 6: the target's old distance from the camera over its new one.
+
+    Positions and camera centres are each in the rover frame of their own stop.
+    """
+    return float(np.linalg.norm(old_position - old_centre) / np.linalg.norm(new_position - new_centre))
+
+
+def horizontal_axis(camera: CameraModel) -> Vector3:
+    """Unit vector Hx along the image's x axis, Eqs. 7 to 9; A and H need not be perpendicular."""
+    hs = np.linalg.norm(np.cross(camera.a, camera.h))
+    hc = camera.a @ camera.h
+    return np.asarray((camera.h - hc * camera.a) / hs)
+
+
+def lever_pixels(
+    old_position: Vector3,
+    old_camera: CameraModel,
+    new_camera: CameraModel,
+    new_from_old: RigidTransform,
+    lever_m: float,
+) -> Float[np.ndarray, "2 2"] | None:
+    """Pixels (u, v) in the new image of the target and of a point `lever_m` along the old image's x axis (before Eq.
+    10).
+
+    Each camera is in the frame of its own stop. None if the new camera cannot image one of the points.
+    """
+    points = np.stack([old_position, old_position + lever_m * horizontal_axis(old_camera)])
+    pixels, visible = new_camera.project(np.asarray(new_from_old.apply(points)))
+    return pixels if np.all(visible) else None
+
+
+def roll_angle(lever_px: Float[np.ndarray, "2 2"]) -> float:
+    """Clockwise roll of the target's image, radians, from `lever_pixels`: Eq. 10 and the text after it."""
+    across, down = lever_px[1] - lever_px[0]
+    return float(np.arctan2(down, across))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
+from marsyard.algorithms.arrays import Points2, Vector2, Vector3
 from marsyard.algorithms.image.registration import SURROUND
 from marsyard.algorithms.interface import MastAim, PixelBox
 from marsyard.algorithms.vtt.options import VttOptions
@@ -23,9 +24,7 @@ STEPS, TOLERANCE_PX = 12, 1e-2
 _SLACK_PX = 1e-6
 
 
-def mast_angles(
-    position_rover: Float[np.ndarray, "3"], mast: MastCalibration, pair: bool = False
-) -> tuple[float, float] | None:
+def mast_angles(position_rover: Vector3, mast: MastCalibration, pair: bool = False) -> tuple[float, float] | None:
     """Azimuth and elevation that bring a point to the middle of the left frame.
 
     With `pair`, its pixels in both frames lie equally far, in opposite directions, from the middles: a near target
@@ -50,11 +49,8 @@ def mast_angles(
 
 
 def _offset(
-    position_rover: Float[np.ndarray, "3"],
-    mast: MastGeometry,
-    cameras: tuple[CameraModel, ...],
-    angles: Float[np.ndarray, "2"],
-) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
+    position_rover: Vector3, mast: MastGeometry, cameras: tuple[CameraModel, ...], angles: Vector2
+) -> tuple[Vector2, Float[np.ndarray, "2 2"]]:
     """Mean offset of the point's pixels from the frames' middles, and its derivative by azimuth and elevation.
 
     For a head rotation about an axis w through a, a point p fixed in the rover moves by -w x (p - a) in the head.
@@ -72,14 +68,12 @@ def _offset(
     return np.mean(offsets, axis=0), np.mean(slopes, axis=0)
 
 
-def middle(camera: CameraModel) -> Float[np.ndarray, "2"]:
+def middle(camera: CameraModel) -> Vector2:
     """The middle of the frame, pixels."""
     return 0.5 * (np.array(camera.size, dtype=np.float64) - 1.0)
 
 
-def box_around(
-    pixels: Float[np.ndarray, "n 2"], margin_px: float, camera: CameraModel, horizontal_px: float = 0.0
-) -> PixelBox | None:
+def box_around(pixels: Points2, margin_px: float, camera: CameraModel, horizontal_px: float = 0.0) -> PixelBox | None:
     """The part of the frame within the margin of all pixels, wider by `horizontal_px`; None if a pixel is outside."""
     if not bool(np.all(camera.in_frame(pixels))):
         return None
@@ -89,9 +83,7 @@ def box_around(
     return PixelBox((int(near[0]), int(near[1])), (int(far[0] - near[0]), int(far[1] - near[1])))
 
 
-def aim_at_position(
-    position_rover: Float[np.ndarray, "3"], mast: MastCalibration, options: VttOptions
-) -> MastAim | None:
+def aim_at_position(position_rover: Vector3, mast: MastCalibration, options: VttOptions) -> MastAim | None:
     """Mast aim for a target position; None if the mast cannot show it.
 
     The right image part covers the searched disparities of the whole left search window.
@@ -114,8 +106,8 @@ def aim_at_pixel(target: PixelTarget, mast: MastCalibration, options: VttOptions
     margin = 0.5 * options.search_px + SURROUND
     box = box_around(target.pixel[None], margin, mast.left)
     curve = epipolar_pixels(mast.left.rays(target.pixel), mast.left, mast.right, options.seed_range_m)
-    seen = curve[mast.right.in_frame(curve)]
-    if box is None or len(seen) == 0:
+    visible = curve[mast.right.in_frame(curve)]
+    if box is None or len(visible) == 0:
         return None
-    right_box = box_around(seen, 0.5 * options.template_px + options.epipolar_tolerance_px + SURROUND, mast.right)
+    right_box = box_around(visible, 0.5 * options.template_px + options.epipolar_tolerance_px + SURROUND, mast.right)
     return None if right_box is None else MastAim(target.azimuth_rad, target.elevation_rad, box, right_box)

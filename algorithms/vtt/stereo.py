@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
+from marsyard.algorithms.arrays import Patch, Points2, Raster, Vector2, Vector3
 from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak, normalized_correlation
 from marsyard.algorithms.vtt.matching import Refinement, refine_match
 from marsyard.algorithms.vtt.options import VttOptions
@@ -26,19 +27,17 @@ class StereoMatch:
     - band_corner: (u, v) of the band's upper left pixel in the full frame
     """
 
-    pixel: Float[np.ndarray, "2"]
+    pixel: Vector2
     score: float
-    band: Float[np.ndarray, "rows columns"]
+    band: Raster
     band_corner: tuple[int, int]
 
 
 #: Origin and unit direction of a line of sight.
-Sight = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]
+Sight = tuple[Vector3, Vector3]
 
 
-def epipolar_pixels(
-    sight: Sight, left: CameraModel, right: CameraModel, ranges_m: tuple[float, float]
-) -> Float[np.ndarray, "n 2"]:
+def epipolar_pixels(sight: Sight, left: CameraModel, right: CameraModel, ranges_m: tuple[float, float]) -> Points2:
     """Right pixels of the points along a left pixel's line of sight, from far to near; both cameras in one frame.
 
     Points are about half a pixel of disparity apart; those invisible to the right camera are omitted. Lens distortion
@@ -66,7 +65,7 @@ def search_ranges(left: CameraModel, right: CameraModel, range_m: float, dispari
 
 
 def point_stereo(
-    template: Float[np.ndarray, "n n"], image: MastImage, curve: Float[np.ndarray, "points 2"], options: VttOptions
+    template: Patch, image: MastImage, curve: Float[np.ndarray, "points 2"], options: VttOptions
 ) -> StereoMatch | None:
     """Match the left template near the epipolar `curve` (full-frame pixels) of the right image; None if it does not
     fit.
@@ -100,14 +99,12 @@ def point_stereo(
     )
 
 
-def triangulated(
-    left: CameraModel, right: CameraModel, left_pixel: Float[np.ndarray, "2"], right_pixel: Float[np.ndarray, "2"]
-) -> Float[np.ndarray, "3"] | None:
+def triangulate(left: CameraModel, right: CameraModel, left_pixel: Vector2, right_pixel: Vector2) -> Vector3 | None:
     """The midpoint of the shortest segment between two pixels' lines of sight: see `nearest_point`."""
     return nearest_point(left.rays(left_pixel), right.rays(right_pixel))
 
 
-def nearest_point(left: Sight, right: Sight) -> Float[np.ndarray, "3"] | None:
+def nearest_point(left: Sight, right: Sight) -> Vector3 | None:
     """The midpoint of the shortest segment between two lines of sight, in their frame, metres.
 
     None if they are parallel or meet behind a camera.

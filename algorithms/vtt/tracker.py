@@ -1,44 +1,114 @@
-"""The visual target tracker: the loop of section 4.1 and its states.
+"""The visual target tracker: the loop of section 4.1, its states, and the criteria of a loss.
 
-The steps are functions of `target`, `pointing`, `matching`, `stereo`, `loss` and `handoff`. The state of a track is an
+The steps are functions of `pointing`, `matching`, `stereo`, `loss` and `accuracy`. The state of a track is an
 immutable `Track`; the tracker holds the latest one.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float, UInt16
 from scipy.spatial.transform import RigidTransform
 
+from marsyard.algorithms.arrays import Counts, Patch, Vector2, Vector3
 from marsyard.algorithms.interface import MastAim, TargetLoss, TargetUpdate, TrackingState
-from marsyard.algorithms.vtt.loss import Evidence, Journey, Tolerances, find_losses, next_state, tolerances
-from marsyard.algorithms.vtt.matching import (
-    Change,
-    Match,
-    Matcher,
-    Sighting,
-    cut_patch,
-    has_room,
-    match_by_correlation,
-    search_window,
-)
+from marsyard.algorithms.vtt import matching
+from marsyard.algorithms.vtt.accuracy import stereo_range_error_m
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position
-from marsyard.algorithms.vtt.stereo import StereoMatch, epipolar_pixels, nearest_point, point_stereo, search_ranges
-from marsyard.algorithms.vtt.target import (
-    designated_position_world,
-    lever_pixels,
-    magnification,
-    pose_change,
-    predicted_position,
-    roll_angle,
+from marsyard.algorithms.vtt.stereo import (
+    StereoMatch,
+    disparity_px_m,
+    epipolar_pixels,
+    nearest_point,
+    point_stereo,
+    search_ranges,
 )
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import compose
 from marsyard.sim.measurements import MastCalibration, PixelTarget, RoverMeasurements, TargetDesignation
+
+
+@dataclass(frozen=True)
+class Journey:
+    """Distances that determine the tolerances.
+
+    - seed_m, last_m, now_m: From the camera to the target at the seed, at the last match, and now
+    - step_m, driven_m: Rover motion since the last match, and path length since the seed
+    """
+
+    seed_m: float
+    last_m: float
+    now_m: float
+    step_m: float
+    driven_m: float
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """Largest accepted corrections: of the target's distance, and of its position since the seed."""
+
+    distance_m: float
+    position_m: float
+
+
+def tolerances(journey: Journey, left: CameraModel, right: CameraModel, options: VttOptions) -> Tolerances:
+    """The tolerances of Fig. 5 for this update, by the formula of the module."""
+    scale = disparity_px_m(left, right)
+
+    def tolerance(before_m: float, moved_m: float, across_m: float) -> float:
+        error_px = options.stereo_disparity_error_px
+        before, now = (stereo_range_error_m(one, scale, 1.0, error_px) for one in (before_m, journey.now_m))
+        return options.tolerance_floor_m + math.hypot(before, now, options.pose_error * moved_m, across_m)
+
+    return Tolerances(
+        distance_m=tolerance(journey.last_m, journey.step_m, 0.0),
+        position_m=tolerance(journey.seed_m, journey.driven_m, options.direction_error_rad * journey.now_m),
+    )
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Input of the four loss criteria.
+
+    - match_score, stereo_score: Normalised correlations of the match and of point stereo
+    - distance_correction_m: Measured less predicted distance of the target
+    - position_correction_m: Distance of the target from its position at the seed, in the estimated world frame
+    """
+
+    match_score: float
+    stereo_score: float
+    distance_correction_m: float
+    position_correction_m: float
+
+
+def find_losses(evidence: Evidence, allowed: Tolerances, options: VttOptions) -> tuple[TargetLoss, ...]:
+    """Failed loss criteria."""
+    criteria = {
+        TargetLoss.LOW_MATCH_SCORE: evidence.match_score < options.min_match_score,
+        TargetLoss.LOW_STEREO_SCORE: evidence.stereo_score < options.min_stereo_score,
+        TargetLoss.DISTANCE_JUMP: abs(evidence.distance_correction_m) > allowed.distance_m,
+        TargetLoss.POSITION_JUMP: evidence.position_correction_m > allowed.position_m,
+    }
+    return tuple(loss for loss, lost in criteria.items() if lost)
+
+
+def next_state(state: TrackingState, lost_updates: int, found: bool, limit: int) -> tuple[TrackingState, int]:
+    """State after an update, and number of updates since the loss (Fig. 6).
+
+    A loss leads to LOST; up to `limit` further updates may recover the target; then FAILURE is final.
+    """
+    if state in (TrackingState.FAILURE, TrackingState.NO_TARGET):
+        return state, lost_updates
+    if found:
+        return TrackingState.NORMAL, 0
+    if state is TrackingState.NORMAL:
+        return (TrackingState.LOST, 0) if limit else (TrackingState.FAILURE, 0)
+    tries = lost_updates + 1
+    return (TrackingState.FAILURE if tries >= limit else TrackingState.LOST), tries
 
 
 @dataclass(frozen=True)
@@ -62,17 +132,17 @@ class VttDetails:
     """
 
     seeded: bool
-    predicted_pixel: Float[np.ndarray, "2"] | None
-    window: UInt16[np.ndarray, "rows columns"] | None = None
+    predicted_pixel: Vector2 | None
+    window: Counts | None = None
     window_corner: tuple[int, int] | None = None
-    change: Change | None = None
-    match: Match | None = None
-    template: Float[np.ndarray, "n n"] | None = None
+    change: matching.Change | None = None
+    match: matching.Match | None = None
+    template: Patch | None = None
     stereo: StereoMatch | None = None
     distance_m: float = float("nan")
     azimuth_rad: float = float("nan")
     azimuth_change_rad: float = 0.0
-    position_world: Float[np.ndarray, "3"] | None = None
+    position_world: Vector3 | None = None
     step_m: float = 0.0
     evidence: Evidence | None = None
     allowed: Tolerances | None = None
@@ -91,12 +161,12 @@ class Track:
     - driven_m: Estimated path length of the rover since the seed
     """
 
-    designated: PixelTarget | Float[np.ndarray, "3"]
+    designated: PixelTarget | Vector3
     world_from_rover: RigidTransform
     state: TrackingState = TrackingState.NORMAL
     lost_updates: int = 0
-    sighting: Sighting | None = None
-    seed_world: Float[np.ndarray, "3"] | None = None
+    sighting: matching.Sighting | None = None
+    seed_world: Vector3 | None = None
     seed_distance_m: float = float("nan")
     driven_m: float = 0.0
 
@@ -106,10 +176,12 @@ class VisualTargetTracker:
     """Tracks a target by its template, scaled and rolled with the rover's motion; see `TargetTracker`.
 
     `PURE_NCC` as options is the paper's baseline; `matcher` replaces the search in the left image (see
-    `marsyard.algorithms.vtt.lucas_kanade`).
+    `marsyard.algorithms.vtt.matching`).
     """
 
-    def __init__(self, options: VttOptions | None = None, matcher: Matcher = match_by_correlation) -> None:
+    def __init__(
+        self, options: VttOptions | None = None, matcher: matching.Matcher = matching.match_by_correlation
+    ) -> None:
         self.options = VttOptions() if options is None else options
         self.matcher = matcher
         self.track: Track | None = None
@@ -124,7 +196,7 @@ class VisualTargetTracker:
         if isinstance(target, PixelTarget):
             self.track = Track(target, world_from_rover)
         else:
-            self.track = Track(designated_position_world(target, world_from_rover), world_from_rover)
+            self.track = Track(matching.designated_position_world(target, world_from_rover), world_from_rover)
 
     def clear(self) -> None:
         """Clear the target."""
@@ -147,14 +219,14 @@ class VisualTargetTracker:
             predicted = expected_position(self.track, measurements.world_from_rover)
             return TargetUpdate(TrackingState.FAILURE, (), predicted)
         if self.track.sighting is None:
-            found = seed_track(self.track, measurements, self.options)
+            result = seed_track(self.track, measurements, self.options)
         else:
-            found = follow_track(self.track, self.track.sighting, measurements, self.options, self.matcher)
-        self.track = advance_track(self.track, found, measurements, self.options)
-        position = found.position_rover
+            result = follow_track(self.track, self.track.sighting, measurements, self.options, self.matcher)
+        self.track = advance_track(self.track, result, measurements, self.options)
+        position = result.position_rover
         if position is None:
             position = expected_position(self.track, measurements.world_from_rover)
-        return TargetUpdate(self.track.state, found.losses, position, found.details)
+        return TargetUpdate(self.track.state, result.losses, position, result.details)
 
 
 @dataclass(frozen=True)
@@ -163,8 +235,8 @@ class Finding:
 
     losses: tuple[TargetLoss, ...]
     details: VttDetails
-    position_rover: Float[np.ndarray, "3"] | None = None
-    sighting: Sighting | None = None
+    position_rover: Vector3 | None = None
+    sighting: matching.Sighting | None = None
 
 
 @dataclass(frozen=True)
@@ -192,16 +264,16 @@ class Stop:
         """The right camera."""
         return self.measurements.mast.right
 
-    def distance_m(self, position_head: Float[np.ndarray, "3"]) -> float:
+    def distance_m(self, position_head: Vector3) -> float:
         """From the left camera's centre."""
         return float(np.linalg.norm(position_head - self.left.c))
 
 
-def expected_position(track: Track, world_from_frame: RigidTransform) -> Float[np.ndarray, "3"] | None:
+def expected_position(track: Track, world_from_frame: RigidTransform) -> Vector3 | None:
     """Predicted target position in a frame of this pose (rover or head); None for a pixel target before the seed."""
     if track.sighting is not None:
         last = track.sighting
-        return predicted_position(last.position_head, last.world_from_head, world_from_frame)
+        return matching.predicted_position(last.position_head, last.world_from_head, world_from_frame)
     if isinstance(track.designated, PixelTarget):
         return None
     return np.asarray(world_from_frame.inv().apply(track.designated.copy()))
@@ -216,11 +288,12 @@ def seed_track(track: Track, measurements: RoverMeasurements, options: VttOption
         expected = np.asarray(stop.world_from_head.inv().apply(track.designated.copy()))
         pixel = stop.left.project(expected)[0]
         ranges = search_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
-    if not np.all(np.isfinite(pixel)) or not has_room(measurements.left, pixel, options.template_px):
+    if not np.all(np.isfinite(pixel)) or not matching.has_room(measurements.left, pixel, options.template_px):
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(True, None))
-    template = cut_patch(measurements.left, pixel, options.template_px)
-    window, window_corner = search_window(measurements.left, pixel, options.search_px)
-    details = VttDetails(True, pixel, window, window_corner, match=Match(pixel, 1.0, template), template=template)
+    template = matching.cut_patch(measurements.left, pixel, options.template_px)
+    window, window_corner = matching.search_window(measurements.left, pixel, options.search_px)
+    match = matching.Match(pixel, 1.0, template)
+    details = VttDetails(True, pixel, window, window_corner, match=match, template=template)
     located = triangulate_target(stop, pixel, template, ranges, details, options)
     stereo = located.details.stereo
     if located.sighting is not None and stereo is not None and stereo.score < options.min_stereo_score:
@@ -229,24 +302,29 @@ def seed_track(track: Track, measurements: RoverMeasurements, options: VttOption
 
 
 def follow_track(
-    track: Track, last: Sighting, measurements: RoverMeasurements, options: VttOptions, matcher: Matcher
+    track: Track,
+    last: matching.Sighting,
+    measurements: RoverMeasurements,
+    options: VttOptions,
+    matcher: matching.Matcher,
 ) -> Finding:
     """Actions 1 to 6 of section 4.1 except pointing, and the loss criteria."""
     stop = Stop.of(measurements)
-    new_from_old = pose_change(last.world_from_head, stop.world_from_head)
+    new_from_old = matching.pose_change(last.world_from_head, stop.world_from_head)
     expected = np.asarray(new_from_old.apply(last.position_head.copy()))
-    seen = lever_pixels(last.position_head, last.camera, stop.left, new_from_old, options.roll_lever_m)
-    if seen is None:
+    lever_px = matching.lever_pixels(last.position_head, last.camera, stop.left, new_from_old, options.roll_lever_m)
+    if lever_px is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), VttDetails(False, None))
-    predicted = seen[0]
-    change = Change(magnification(last.position_head, last.camera.c, expected, stop.left.c), roll_angle(seen))
-    window, window_corner = search_window(measurements.left, predicted, options.search_px)
+    predicted = lever_px[0]
+    magnification = matching.magnification(last.position_head, last.camera.c, expected, stop.left.c)
+    change = matching.Change(magnification, matching.roll_angle(lever_px))
+    window, window_corner = matching.search_window(measurements.left, predicted, options.search_px)
     details = VttDetails(False, predicted, window, window_corner, change)
-    applied = Change(change.magnification if options.scale else 1.0, change.roll_rad if options.roll else 0.0)
+    applied = matching.Change(change.magnification if options.scale else 1.0, change.roll_rad if options.roll else 0.0)
     match = matcher(last, measurements.left, predicted, applied, options)
     if match is None:
         return Finding((TargetLoss.OUT_OF_VIEW,), details)
-    template = cut_patch(measurements.left, match.pixel, options.template_px)
+    template = matching.cut_patch(measurements.left, match.pixel, options.template_px)
     details = replace(details, match=match, template=template)
     ranges = search_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
     located = triangulate_target(stop, match.pixel, template, ranges, details, options)
@@ -256,12 +334,7 @@ def follow_track(
 
 
 def triangulate_target(
-    stop: Stop,
-    pixel: Float[np.ndarray, "2"],
-    template: Float[np.ndarray, "n n"],
-    ranges_m: tuple[float, float],
-    details: VttDetails,
-    options: VttOptions,
+    stop: Stop, pixel: Vector2, template: Patch, ranges_m: tuple[float, float], details: VttDetails, options: VttOptions
 ) -> Finding:
     """Triangulate the target from its left pixel by point stereo over these ranges."""
     sight = stop.left.rays(pixel)
@@ -282,12 +355,14 @@ def triangulate_target(
         azimuth_rad=float(np.arctan2(-ahead[1], ahead[0])),
         position_world=np.asarray(stop.world_from_head.apply(position)),
     )
-    sighting = Sighting(stop.measurements.left, pixel, position, stop.left, stop.world_from_head, world_from_rover)
+    sighting = matching.Sighting(
+        stop.measurements.left, pixel, position, stop.left, stop.world_from_head, world_from_rover
+    )
     return Finding((), details, in_rover[0], sighting)
 
 
 def check_losses(
-    track: Track, last: Sighting, located: Finding, stop: Stop, expected_m: float, options: VttOptions
+    track: Track, last: matching.Sighting, located: Finding, stop: Stop, expected_m: float, options: VttOptions
 ) -> Finding:
     """Apply the four loss criteria to a match."""
     details, sighting = located.details, located.sighting

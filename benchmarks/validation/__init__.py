@@ -1,1 +1,1 @@
-"""Measures what the simulation claims against references that share no code with it."""
+"""Validation of the simulation against independent references."""

@@ -1,4 +1,4 @@
-"""Measures the bars, prints them, and writes docs/validation.md: ``python -m benchmarks.validation [--only NAME]``."""
+"""Run all checks, print them and write docs/validation.md: ``python -m benchmarks.validation [--only NAME]``."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def main() -> int:
         measured[check.name] = list(check.run(arguments.quick))
         _print(console, f"{check.name} ({time.perf_counter() - start:.0f} s)", measured[check.name])
         if not arguments.quick:
-            # after each check, so that an interruption loses no more than one
+            # after each check, so that an interruption loses only the current check
             document.write(CHECKS, document.keep({check.name: measured[check.name]}, arguments.quick))
     missed = [measure.claim for measures in measured.values() for measure in measures if not measure.passed]
     for claim in missed:

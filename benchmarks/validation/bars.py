@@ -1,7 +1,7 @@
-"""Bars of figures without a requirement: three times the value measured when the bar was set.
+"""Bounds of figures without a requirement: three times the value measured when the bound was set.
 
-A much looser bar would detect only gross faults. These figures repeat to a few per cent on one machine; the factor of
-three allows for other processors and OpenGL libraries. A raised entry needs a reason next to it.
+A looser bound would detect only gross faults. The figures repeat to a few per cent on one machine; the factor of three
+allows for other processors and OpenGL libraries. Document the reason for every increased entry.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 FACTOR = 3.0
 
-#: By claim: the figure measured, of both OpenGL backends the larger (x86_64, llvmpipe of Mesa 22.3.6).
+#: Measured value per claim, the larger of both OpenGL backends (x86_64, llvmpipe of Mesa 22.3.6).
 MEASURED: Mapping[str, float] = {
     "markers, rms: MER descent camera, CAHVOR, 45 deg": 0.00058,
     "markers, worst: MER descent camera, CAHVOR, 45 deg": 0.0018,
@@ -50,7 +50,7 @@ MEASURED: Mapping[str, float] = {
     "opposition peak from the antisolar point: Sony XC-55": 0.015,
     "rendered reflectance is reciprocal: Lambert": 7.6e-08,
     "rendered brightness against the formula: Lambert": 6.8e-08,
-    # exact but for rounding of a sum of a million terms, which differs between processors
+    # rounding error of a sum of a million terms, which differs between processors
     "spherical albedo from the stated one: Lambert": 1e-12,
     "rendered reflectance is reciprocal: Mars": 8.3e-08,
     "rendered brightness against the formula: Mars": 6e-08,
@@ -66,6 +66,6 @@ MEASURED: Mapping[str, float] = {
 }
 
 
-def bar_of(claim: str) -> float:
-    """The bar of a claim, to two digits. Raises KeyError where none was measured."""
+def find_bar(claim: str) -> float:
+    """Bound of a claim, rounded to two digits. Raises KeyError for an unknown claim."""
     return float(f"{FACTOR * MEASURED[claim]:.2g}")

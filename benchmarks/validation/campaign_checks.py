@@ -1,4 +1,4 @@
-"""The bars on campaigns: rows that do not depend on how they were run, and algorithms that do their worst."""
+"""Checks of campaigns: rows do not depend on the executor or on interruptions, and misbehaving cases are isolated."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.validation.chaos import DEEDS, ChaosParameters, deed
+from benchmarks.validation.chaos import DEEDS, ChaosParameters, draw_fault
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.execution.workers import ExecutorConfig
@@ -32,12 +32,12 @@ case_time_s = 6
 memory_gb = 0.4
 """
 
-#: Seconds between kills, drawn evenly: from before the first row to well into the cases.
+#: Minimum and maximum of the uniform time between kills, seconds.
 KILLED_AFTER_S = (0.2, 6.0)
 
 
 class Silence:
-    """A watch that says nothing."""
+    """A progress watch without output."""
 
     def begin(self, stage: str, total: int) -> None:
         pass
@@ -50,13 +50,13 @@ class Silence:
 
 
 def same_rows(quick: bool) -> Iterator[Measure]:
-    """Rows of campaigns run in every way, against those of one worker: cases that misbehave, and rendered ones."""
+    """Compare rows of all ways to run a campaign with rows of one worker, for misbehaving and rendered cases."""
     share, cases, kills = (0.03, 60, 3) if quick else (0.03, 400, 10)
     with TemporaryDirectory() as name:
         folder = Path(name)
         settings = [f"share={share}", f"cases={cases}"]
         what = f"cases, {100 * share:g} % of which misbehave"
-        yield from _in_every_way(str(_written(folder)), folder / "chaos", settings, kills, what)
+        yield from _in_every_way(str(_write_campaign(folder)), folder / "chaos", settings, kills, what)
         rendered = ["cases=8" if quick else "cases=40", "retain.showcase=none"]
         yield from _in_every_way("dimes-smoke", folder / "rendered", rendered, kills, "rendered descents")
 
@@ -70,7 +70,7 @@ def _in_every_way(campaign: str, folder: Path, settings: Sequence[str], kills: i
     ways: dict[str, Callable[[], list[dict[str, Any]]]] = {
         "two workers": lambda: _rows_of(campaign, folder / "two", ExecutorConfig(2), settings),
         "a Dask cluster of two": lambda: _rows_of(campaign, folder / "cluster", cluster, settings),
-        f"a runner killed {kills} times": lambda: _killed(campaign, folder / "killed", settings, kills),
+        f"a runner killed {kills} times": lambda: _run_with_kills(campaign, folder / "killed", settings, kills),
         "single replays": lambda: [dict(replay(folder / "one", case).row) for case in replayed],
     }
     for way, run in ways.items():
@@ -82,11 +82,11 @@ def _in_every_way(campaign: str, folder: Path, settings: Sequence[str], kills: i
 
 
 def survival(quick: bool) -> Iterator[Measure]:
-    """An algorithm that misbehaves at random, next to one that does not."""
+    """Compare a campaign with randomly misbehaving cases with an undisturbed one."""
     cases, share = (60, 0.15) if quick else (400, 0.03)
     with TemporaryDirectory() as name:
         folder = Path(name)
-        file = _written(folder)
+        file = _write_campaign(folder)
         took, rows = {}, {}
         for part in (0.0, share):
             began = time.monotonic()
@@ -95,7 +95,7 @@ def survival(quick: bool) -> Iterator[Measure]:
             )
             took[part] = time.monotonic() - began
         campaign = load_campaign(str(file), [f"share={share}"])
-        deeds = [_deed(campaign, case) for case in range(cases)]
+        deeds = [_draw_fault(campaign, case) for case in range(cases)]
         wrong = sum(row["outcome"] != DEEDS.get(done, "VALID") for row, done in zip(rows[share], deeds, strict=True))
         healthy = [k for k, done in enumerate(deeds) if not done]
         changed = sum(bool(differing_columns(rows[share][k], rows[0.0][k])) for k in healthy)
@@ -111,13 +111,13 @@ def survival(quick: bool) -> Iterator[Measure]:
         )
 
 
-def _deed(campaign: Any, case: int) -> str:
+def _draw_fault(campaign: Any, case: int) -> str:
     parameters = campaign.parameters(case)
     assert isinstance(parameters, ChaosParameters)
-    return deed(parameters, campaign.streams(case))
+    return draw_fault(parameters, campaign.streams(case))
 
 
-def _written(folder: Path) -> Path:
+def _write_campaign(folder: Path) -> Path:
     path = folder / "chaos.toml"
     path.write_text(FILE)
     return path
@@ -130,8 +130,8 @@ def _rows_of(
     return read_rows(directory / "cases.parquet")
 
 
-def _killed(campaign: str, directory: Path, settings: Sequence[str], kills: int) -> list[dict[str, Any]]:
-    """The rows of a campaign whose runner is killed at random moments, and resumed each time."""
+def _run_with_kills(campaign: str, directory: Path, settings: Sequence[str], kills: int) -> list[dict[str, Any]]:
+    """Rows of a campaign that is killed at random times and resumed each time."""
     rng = np.random.default_rng(7)
     program = [sys.executable, "-m", "marsyard"]
     command = [*program, "run", campaign, "--out", str(directory), "--jobs", "2"]
@@ -144,7 +144,7 @@ def _killed(campaign: str, directory: Path, settings: Sequence[str], kills: int)
         runner.kill()
         runner.wait()
         command = [*program, "resume", str(directory), "--jobs", "2", "--allow-changed"]
-    # cases crash, as they are to: status 1
+    # exit status 1 because some cases crash
     subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=False)
     return read_rows(directory / "cases.parquet")
 

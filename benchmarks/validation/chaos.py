@@ -1,4 +1,4 @@
-"""A scenario whose cases misbehave by chance, as a user's algorithm may."""
+"""A scenario whose cases misbehave at random, as a custom algorithm may."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ class ChaosParameters(BaseModel):
     share: float = Field(default=0.0, ge=0.0, le=1.0, description="of cases that misbehave")
 
 
-#: What a case that misbehaves may do, and the outcome that it is to have.
+#: Faults of misbehaving cases, and their expected outcomes.
 DEEDS = {"raise": "CRASHED", "loop": "TIMED_OUT", "swell": "OUT_OF_MEMORY", "abort": "CRASHED"}
 
 
-def deed(parameters: ChaosParameters, streams: Streams) -> str:
-    """What a case does; empty where it is healthy."""
+def draw_fault(parameters: ChaosParameters, streams: Streams) -> str:
+    """Fault of a case; empty for a healthy case."""
     rng = streams.generator("chaos")
     return str(rng.choice(list(DEEDS))) if rng.random() < parameters.share else ""
 
 
 class ChaosScenario:
-    """Works for a while, and then answers, or raises, loops in C, allocates without end, or aborts."""
+    """Compute for `work_s`, then answer, raise, loop in C, allocate without end, or abort."""
 
     name = "chaos"
     parameters_type = ChaosParameters
@@ -40,17 +40,17 @@ class ChaosScenario:
         return ()
 
     def prepare(self, parameters: ChaosParameters, shared_input: int) -> None:
-        """Nothing: there are no shared inputs."""
+        """There are no shared inputs."""
 
     def run(self, parameters: ChaosParameters, streams: Streams) -> CaseResult:
         end = time.process_time() + parameters.work_s
         while time.process_time() < end:
             pass
-        done = deed(parameters, streams)
+        done = draw_fault(parameters, streams)
         if done == "raise":
             raise ZeroDivisionError("by chance")
         if done == "loop":
-            # two to the power of 64 ways to share the letters out, in C
+            # backtracks 2^64 times in C
             re.match("(a+)+$", "a" * 64 + "b")
         if done == "abort":
             os.abort()

@@ -1,4 +1,4 @@
-"""The bars on DIMES' IMU check, and DIMES next to ready-made registration on the same descents."""
+"""Checks of DIMES' IMU check, and comparison of DIMES with standard registration methods on the same descents."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmarks.dimes_threshold import STORED, WRONG_BY_M_S
-from benchmarks.estimators import ESTIMATORS, recorded, tried
+from benchmarks.estimators import ESTIMATORS, recorded, run_estimator
 from benchmarks.threshold_derivation import ThresholdInputs
 from benchmarks.validation.imu_reference import Reference
 from benchmarks.validation.records import Check, Measure
@@ -21,15 +21,15 @@ REQUIREMENT_M_S = 5.0
 
 
 def imu_check(quick: bool) -> Iterator[Measure]:
-    """The threshold against a second implementation of the Monte Carlo from which it was derived."""
+    """Compare the threshold with a second implementation of its Monte Carlo derivation."""
     inputs, descents = ThresholdInputs(), 300 if quick else 3000
     rng = np.random.default_rng(SEED)
-    reference = Reference.drawn(inputs, descents, rng)
+    reference = Reference.draw(inputs, descents, rng)
     threshold = DimesOptions().imu_threshold_m_s
     single = reference.single()
     how = f"{descents} descents of a second implementation by first-order propagation; threshold {threshold:g} m/s"
-    # bars: three standard errors of the quantiles of so many draws, sqrt(q (1 - q) / n) over density and quantile; the
-    # density times the quantile is 0.44 at the median and 0.03 at 99.5 %
+    # bounds: three standard errors of the quantiles, sqrt(q (1 - q) / n) divided by density times quantile, which is
+    # 0.44 at the median and 0.03 at 99.5 %
     median = float(np.median(single)) / _stored_median_m_s() - 1.0
     bar = 3.4 / math.sqrt(descents)
     yield Measure("right tracks' discrepancy, median, from the stored derivation's", abs(median), "", bar, how)
@@ -57,7 +57,7 @@ def imu_check(quick: bool) -> Iterator[Measure]:
 
 
 def _stored_median_m_s() -> float:
-    """Median discrepancy of one right track in each pair, as the threshold's derivation found it."""
+    """Median discrepancy of one correct track in each pair, from the stored derivation."""
     quantiles = json.loads(STORED.read_text())["discrepancy_quantiles_m_s"]
     return float(quantiles["one right track in each pair"]["0.5"])
 
@@ -65,19 +65,16 @@ def _stored_median_m_s() -> float:
 def estimators(quick: bool) -> Iterator[Measure]:
     descents = recorded("dimes-smoke", 4 if quick else 48)
     for name, estimator in ESTIMATORS.items():
-        found = tried(estimator, descents)
-        valid = found.valid
+        results = run_estimator(estimator, descents)
+        valid = results.valid
         rms = float(np.sqrt(np.mean(valid**2))) if valid.size else float("nan")
         wrong = int(np.sum(valid > REQUIREMENT_M_S))
         how = (
             f"{valid.size} of {len(descents)} descents of dimes-smoke answered, {wrong} wrong by more than 5 m/s, "
             f"largest error {valid.max() if valid.size else float('nan'):.2g} m/s, "
-            f"{1e3 * float(np.median(found.seconds)):.0f} core-ms a triple"
+            f"{1e3 * float(np.median(results.seconds)):.0f} core-ms a triple"
         )
         yield Measure(f"velocity error, rms: {name}", rms, "m/s", None, how)
 
 
-CHECKS = (
-    Check("imu-check", "DIMES", imu_check),
-    Check("estimators", "DIMES", estimators),
-)
+CHECKS = (Check("imu-check", "DIMES", imu_check), Check("estimators", "DIMES", estimators))

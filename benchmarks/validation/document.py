@@ -1,4 +1,4 @@
-"""Keeps the figures as JSON and writes docs/validation.md from them and the template."""
+"""Store the figures as JSON and write docs/validation.md from figures and template."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from benchmarks.validation.records import Check, Measure
 from benchmarks.validation.scenes import renderer
-from marsyard.sim.processor import processor_features
+from marsyard.sim.kernel_cache import processor_features
 
 ROOT = Path(__file__).parents[2]
 TEMPLATE = Path(__file__).parent / "template.md"
@@ -23,19 +23,19 @@ PACKAGES = ("marsyard", "numpy", "scipy", "numba", "pyrender2", "trimesh")
 
 
 def figure(value: float) -> str:
-    """Two significant digits; shares as per cent to two places."""
+    """Format a number with two significant digits."""
     return f"{value:.2g}"
 
 
 def shown(measure: Measure, value: float) -> str:
-    """A value in its unit; a share that must be large is shown in per cent."""
+    """Format a value with its unit; fractions with a lower bound are given in per cent."""
     if measure.sense == "at least":
         return f"{100.0 * value:.2f} %"
     return f"{figure(value)} {measure.unit}".strip()
 
 
 def keep(measured: dict[str, list[Measure]], quick: bool) -> dict[str, dict]:
-    """Adds these checks' figures to those kept before, and returns all."""
+    """Add the figures of these checks to the stored figures, and return all."""
     kept: dict[str, dict] = json.loads(RESULTS.read_text())["checks"] if RESULTS.exists() else {}
     environment = _environment(quick)
     for name, measures in measured.items():
@@ -55,7 +55,7 @@ def _environment(quick: bool) -> dict[str, str]:
 
 
 def write(checks: Sequence[Check], kept: dict[str, dict]) -> None:
-    """Writes the page; rows stand in the order of the checks, so that runs differ by their figures alone."""
+    """Write the page with rows in the order of the checks, so that only figures differ between runs."""
     text = TEMPLATE.read_text()
     sections: dict[str, list[str]] = {}
     for check in checks:
@@ -76,7 +76,7 @@ def _row(measure: Measure) -> str:
 
 
 def _environments(checks: Sequence[Check], kept: dict[str, dict]) -> str:
-    """Machine and versions of the figures: the common ones once, then each difference with its checks."""
+    """Describe machine and versions: the common environment once, then exceptions with their checks."""
     stored = {check.name: kept[check.name]["environment"] for check in checks if check.name in kept}
     if not stored:
         return "Nothing has been measured yet."

@@ -1,6 +1,6 @@
-"""How far a picture's patches have moved: symmetric Gauss-Newton, and fits to the peak of the correlation.
+"""Motion of image patches: symmetric Gauss-Newton estimation, and fits to the peak of the correlation.
 
-Nothing here is shared with the algorithms under test: the estimator that judges the renderer stands on its own.
+Independent of the algorithms under test, because this estimator validates the renderer.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from scipy.interpolate import BSpline
 
 #: Side of a patch and half of it, pixels.
 PATCH, HALF = 31, 15
-#: Smoothing of both pictures before they are compared, pixels.
+#: Standard deviation of the smoothing of both images, pixels.
 SIGMA_PX = 1.0
-#: Picture needed around a patch: its shift and the reach of the quintic spline.
+#: Margin around a patch for its shift and the support of the quintic spline.
 MARGIN = HALF + 6
 
 
@@ -28,7 +28,7 @@ def _quintic() -> tuple[BSpline, BSpline]:
 
 
 def _taps(shift: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whole part of shifts, and the weights of the six spline coefficients around, with their derivatives."""
+    """Integer part of shifts, and weights of the six neighbouring spline coefficients with their derivatives."""
     whole = np.floor(shift).astype(int)
     away = (shift - whole)[:, None] - np.arange(-2.0, 4.0)
     value, slope = _quintic()
@@ -36,14 +36,14 @@ def _taps(shift: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 class SmoothPicture:
-    """A picture smoothed by a Gaussian of one pixel, to be evaluated between its pixels by a quintic spline."""
+    """Image smoothed by a Gaussian of one pixel, interpolated by a quintic spline."""
 
     def __init__(self, picture: np.ndarray) -> None:
         smoothed = ndimage.gaussian_filter(picture.astype(np.float64), SIGMA_PX)
         self._coefficients = ndimage.spline_filter(smoothed, order=5)
 
     def patches(self, centres: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values of patches about `centres` + `shift` (both (u, v), shape (n, 2)), and their derivatives by u and v.
+        """Values of patches around `centres` + `shift` (both (u, v), shape (n, 2)), and their derivatives by u and v.
 
         Shapes (n, PATCH, PATCH) and (n, 2, PATCH, PATCH).
         """
@@ -64,27 +64,27 @@ class SmoothPicture:
 
 @dataclass(frozen=True)
 class Shifts:
-    """What symmetric Gauss-Newton found.
+    """Result of symmetric Gauss-Newton estimation.
 
     Attributes
     ----------
     found
-        (u, v) by which each patch moved from the first picture to the second, shape (n, 2).
+        Motion (u, v) of each patch from the first image to the second, shape (n, 2).
     response
-        Shape (n, 2, PATCH, PATCH, 2): how the estimate (first axis) answers to motion of each pixel (last axis). A
-        patch whose pixels do not all move alike is expected to be found at the sum of its pixels' motions so weighted.
+        Derivative of the estimate (second axis) with respect to the motion of each pixel (last axis), shape
+        (n, 2, PATCH, PATCH, 2). The expected estimate is the sum of the pixel motions with these weights.
     """
 
     found: np.ndarray
     response: np.ndarray
 
     def expected(self, motion: np.ndarray) -> np.ndarray:
-        """What should have been found, given each pixel's true motion, shape (n, PATCH, PATCH, 2)."""
+        """Expected estimate for the true motion of each pixel, shape (n, PATCH, PATCH, 2)."""
         return np.einsum("nirck,nrck->ni", self.response, motion)
 
 
 def symmetric_shifts(first: SmoothPicture, second: SmoothPicture, centres: np.ndarray, iterations: int = 8) -> Shifts:
-    """Shifts d that make ``first(x - d / 2) = gain * second(x + d / 2) + offset`` in each patch, by least squares."""
+    """Estimate shifts d with ``first(x - d / 2) = gain * second(x + d / 2) + offset`` per patch by least squares."""
     count = len(centres)
     shift = np.zeros((count, 2))
     gain, offset = np.ones(count), np.zeros(count)
@@ -109,17 +109,17 @@ def symmetric_shifts(first: SmoothPicture, second: SmoothPicture, centres: np.nd
 
 
 def peak_fits(first: np.ndarray, second: np.ndarray, centres: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shifts (u, v) by three-point parabolas along each axis, and by a biquadratic through 3 x 3 values.
+    """Estimate shifts (u, v) by three-point parabolas along each axis, and by a quadric through 3 x 3 values.
 
     Both fit the peak of the normalised correlation over shifts of up to two pixels.
     """
     reach = np.arange(-HALF, HALF + 1)
     rows, columns = centres[:, 1, None] + reach, centres[:, 0, None] + reach
-    template = _normalised(first[rows[:, :, None], columns[:, None, :]])
+    template = _normalise(first[rows[:, :, None], columns[:, None, :]])
     surface = np.empty((len(centres), 5, 5))
     for i in range(5):
         for j in range(5):
-            moved = _normalised(second[(rows + i - 2)[:, :, None], (columns + j - 2)[:, None, :]])
+            moved = _normalise(second[(rows + i - 2)[:, :, None], (columns + j - 2)[:, None, :]])
             surface[:, i, j] = np.sum(template * moved, axis=(1, 2))
     best = surface[:, 1:4, 1:4].reshape(len(centres), -1).argmax(axis=1)
     top, left = best // 3, best % 3
@@ -135,13 +135,13 @@ def peak_fits(first: np.ndarray, second: np.ndarray, centres: np.ndarray) -> tup
     return whole + parabola, whole + _biquadratic(z)
 
 
-def _normalised(patches: np.ndarray) -> np.ndarray:
+def _normalise(patches: np.ndarray) -> np.ndarray:
     away = patches - patches.mean(axis=(1, 2), keepdims=True, dtype=np.float64)
     return away / np.sqrt(np.sum(away**2, axis=(1, 2), keepdims=True))
 
 
 def _biquadratic(z: np.ndarray) -> np.ndarray:
-    """Top (u, v) of the quadric through 3 x 3 values by least squares."""
+    """Maximum (u, v) of the least-squares quadric through 3 x 3 values."""
     v, u = np.mgrid[-1.0:2.0, -1.0:2.0]
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1).reshape(9, 6)
     _, bu, bv, uu, uv, vv = np.linalg.pinv(terms) @ z.reshape(-1, 9).T

@@ -1,4 +1,4 @@
-"""The bars on geometry: markers, world points, ranges against an independent ray cast."""
+"""Checks of geometry: markers, world points, and ranges against independent ray casting."""
 
 from __future__ import annotations
 
@@ -13,31 +13,23 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.validation.bars import bar_of
+from benchmarks.validation.bars import find_bar
 from benchmarks.validation.markers import MARKERS
 from benchmarks.validation.motion import View, render
 from benchmarks.validation.raycast import Ground, meet_triangles
 from benchmarks.validation.records import Check, Measure
-from benchmarks.validation.scenes import (
-    OVERHEAD,
-    PAINT,
-    cameras,
-    descent_view,
-    ground_view,
-    renderer,
-    rock_view,
-)
+from benchmarks.validation.scenes import OVERHEAD, PAINT, cameras, descent_view, ground_view, renderer, rock_view
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import Scene
 from marsyard.sim.terrain import Surface
 
 LIBRARIES = {"osmesa": "libOSMesa.so.8", "egl": "libEGL.so.1"}
-#: By which share a pixel's range may differ from the mean of its neighbours' away from silhouettes. A smooth ground
-#: grazed at 3 deg from a mast bends by less.
+#: Maximum relative difference of a pixel's range from the mean of its neighbours; larger values mark silhouettes.
+#: Smooth ground seen from a mast at 3 deg differs by less.
 BEND = 0.003
-#: Samples along the line of sight from which the renderer smooths the ground within a pixel.
+#: Number of terrain samples per pixel along the line of sight from which the renderer smooths the ground.
 FINE_UNTIL = 8.0
-#: Farther than this over rough ground a pixel covers metres of it, and silhouettes are everywhere.
+#: Maximum range over rough ground, m; beyond it pixels cover metres of ground and contain silhouettes.
 FARTHEST_ON_FOOT_M = 40.0
 
 
@@ -50,7 +42,7 @@ def _available(backend: str) -> bool:
 
 
 def _marker_errors(backend: str, count: int) -> dict:
-    """Errors of the markers in a process of its own: a process keeps to one backend."""
+    """Errors of the markers, measured in a separate process because a process can use only one backend."""
     environment = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"}
     done = subprocess.run(
         [sys.executable, "-m", "benchmarks.validation.markers", backend, str(count)],
@@ -74,11 +66,11 @@ def run_markers(quick: bool) -> Iterator[Measure]:
         for camera, error in result["errors"].items():
             for figure in ("rms", "worst"):
                 claim = f"markers, {figure}: {camera}"
-                yield Measure(f"{claim}, {backend}", error[figure], "px", bar_of(claim), how)
+                yield Measure(f"{claim}, {backend}", error[figure], "px", find_bar(claim), how)
 
 
 def _tilted_plane(slope: tuple[float, float], side: int, spacing: float) -> Surface:
-    """A plane over one period, in whose middle its edges are out of sight."""
+    """A plane over one period of the surface; its edges are not visible from the centre."""
     row, column = np.mgrid[:side, :side] - side / 2.0
     samples = np.zeros((side, side, 2), dtype=np.float32)
     samples[..., 0] = spacing * (slope[0] * column + slope[1] * row)
@@ -91,7 +83,7 @@ def run_planes(quick: bool) -> Iterator[Measure]:
     upward /= np.linalg.norm(upward)
     for name, camera in cameras().items():
         turn = Rotation.align_vectors(np.array([[0.15, 0.1, -1.0]]), camera.boresight()[None])[0]
-        # a wide camera sees the horizon: what lies beyond two heights is left out
+        # points beyond two camera heights are excluded because wide cameras see the horizon
         height, spacing = 500.0, 6.0
         middle = np.array([0.5 * side * spacing, 0.5 * side * spacing, height])
         scene = Scene(_tilted_plane(slope, side, spacing), (middle[0], middle[1]), OVERHEAD, PAINT)
@@ -102,16 +94,16 @@ def run_planes(quick: bool) -> Iterator[Measure]:
         error = np.abs(points @ upward / frame.range_m)[near].max()
         how = f"all {int(near.sum())} pixels within two heights of a plane tilted by 10 deg"
         claim = f"world points of a tilted plane: {name}"
-        yield Measure(claim, float(error), "of range", bar_of(claim), how)
+        yield Measure(claim, float(error), "of range", find_bar(claim), how)
 
 
 @dataclass(frozen=True)
 class Ranges:
-    """Ranges of some pixels away from silhouettes: the picture's, and those of an independent ray cast."""
+    """Ranges of pixels away from silhouettes: rendered and from independent ray casting."""
 
     picture: np.ndarray
     cast: np.ndarray
-    #: Share of the pixels looked at that lie near silhouettes, and that see the ground smoothed.
+    #: Fractions of pixels near silhouettes, and of pixels with smoothed ground.
     near_silhouettes: float
     smoothed: float
 
@@ -123,9 +115,9 @@ class Ranges:
 def cast_ranges(view: View, count: int, farthest: float, step: float) -> Ranges:
     """Ranges at random pixels nearer than `farthest`.
 
-    The independent cast also finds silhouettes: the ranges of a pixel and of opposite neighbours are not nearly on a
-    line, or some rays meet an object and some the ground. Pixels so oblique that each covers many samples along its
-    line of sight are left out as well: the renderer smooths the ground there on purpose.
+    The independent ray casting also detects silhouettes: the ranges of a pixel and of opposite neighbours are not
+    collinear, or some rays hit an object and some the ground. Oblique pixels that cover many terrain samples are
+    excluded, because the renderer smooths the ground there.
     """
     frame = render(renderer(), view)
     columns, rows = view.camera.size
@@ -133,15 +125,15 @@ def cast_ranges(view: View, count: int, farthest: float, step: float) -> Ranges:
     pixels = np.stack([rng.integers(1, columns - 1, count), rng.integers(1, rows - 1, count)], axis=-1)
     picture = frame.range_m[pixels[:, 1], pixels[:, 0]]
     pixels, picture = pixels[picture < farthest], picture[picture < farthest]
-    camera, ground = view.camera.moved(view.world_from_body), Ground(view.scene.surface)
+    camera, ground = view.camera.transform(view.world_from_body), Ground(view.scene.surface)
 
     def cast(right: float, down: float) -> tuple[np.ndarray, np.ndarray]:
-        """Ranges at shifted pixels, and whether an object is seen rather than the ground."""
+        """Ranges at shifted pixels, and whether the ray hits an object."""
         origins, directions = camera.rays(pixels + np.array([right, down]))
         origins = np.array(origins)
-        found = ground.cast(origins, directions, 1.3 * farthest, step)
+        hits = ground.cast(origins, directions, 1.3 * farthest, step)
         objects = meet_triangles(view.scene.objects, origins, directions)
-        return np.minimum(found, objects), objects < found
+        return np.minimum(hits, objects), objects < hits
 
     here, is_object = cast(0.0, 0.0)
     away = np.ones(len(here), dtype=bool)

@@ -1,4 +1,4 @@
-"""A scenario whose cases do to their process, and to each other, what a user's algorithm may do."""
+"""A scenario whose cases damage their process or other cases, as a custom algorithm may."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from marsyard.scenarios.algorithm_run import Handover
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 
-#: What outlives a case in this module, as in a user's.
+#: Objects that survive the end of a case.
 _kept: list[Any] = []
 
 
@@ -77,7 +77,7 @@ def _kill_supervisor() -> None:
 
 
 def _loop() -> None:
-    # two to the power of 64 ways to share the letters out, in C
+    # backtracks 2^64 times in C
     re.match("(a+)+$", "a" * 64 + "b")
 
 
@@ -96,7 +96,7 @@ def _alter_state() -> None:
     import cv2
 
     cv2.setUseOptimized(False)
-    # upwards, on x86
+    # rounding upwards on x86
     ctypes.CDLL("libm.so.6").fesetround(0x800)
     os.chdir("/")
     os.environ["LEFT_BEHIND"] = "1"
@@ -121,11 +121,10 @@ def _spoil_inputs() -> None:
     handover.check()
 
 
-#: What the next case of the same process finds spoiled.
+#: Mark of a process whose state a case has changed.
 _SPOILED = "spoiled"
 
-#: What a case that misbehaves may do, and the outcome that it is to have; a case that answers has the row of a healthy
-#: one.
+#: Faults of misbehaving cases and their expected outcomes; a VALID case must have the row of a healthy case.
 DEEDS: Mapping[str, tuple[Callable[[], object], str]] = {
     "leave a thread": (_leave_thread, "VALID"),
     "leave a pool of processes": (_leave_pool, "VALID"),
@@ -156,14 +155,14 @@ DEEDS: Mapping[str, tuple[Callable[[], object], str]] = {
 }
 
 
-def deed(parameters: HostileParameters, streams: Streams) -> str:
-    """What a case does; empty where it is healthy."""
+def draw_fault(parameters: HostileParameters, streams: Streams) -> str:
+    """Fault of a case; empty for a healthy case."""
     rng = streams.generator("deed")
     return str(rng.choice(list(DEEDS))) if rng.random() < parameters.misbehaving else ""
 
 
 class HostileScenario:
-    """Computes some numbers, of which any altered state would change one, and misbehaves before or after."""
+    """Compute numbers that change with any altered process state, then apply the fault of the case."""
 
     name = "hostile"
     parameters_type = HostileParameters
@@ -172,14 +171,14 @@ class HostileScenario:
         return ()
 
     def prepare(self, parameters: HostileParameters, shared_input: int) -> None:
-        """Nothing: there are no shared inputs."""
+        """There are no shared inputs."""
 
     def run(self, parameters: HostileParameters, streams: Streams) -> CaseResult:
         if _SPOILED in _kept:
             raise RuntimeError("an earlier case of this process has spoiled it")
         time.sleep(0.02)
         row = _numbers(streams)
-        wrong = DEEDS[done][0]() if (done := deed(parameters, streams)) else None
+        wrong = DEEDS[done][0]() if (done := draw_fault(parameters, streams)) else None
         return CaseResult("VALID", True, {**row, **(wrong if isinstance(wrong, dict) else {})})
 
 

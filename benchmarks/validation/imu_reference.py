@@ -1,16 +1,16 @@
-"""The Monte Carlo behind DIMES' IMU check a second time: other code and templates, errors by first-order propagation.
+"""Second implementation of the Monte Carlo for DIMES' IMU check, with first-order propagation of errors.
 
-`benchmarks.threshold_derivation` places features with DIMES' own ground intersection, template grid and combination
-of tracks, through camera models. Here a template is a random place with room, a camera is a ray's slope, and each error
-moves the velocity by its partial derivative. Only what is drawn is the same (`ThresholdInputs`).
+`benchmarks.threshold_derivation` uses DIMES' ground intersection, template grid, combination of tracks and camera
+models. Here templates are at random positions with feasible overlap, cameras are slopes of rays, and each error changes
+the velocity by its partial derivative. Only the distributions are common (`ThresholdInputs`).
 
-With s the slope of a ray (horizontal over downward), H the height, T the time between pictures: a feature is placed at
-H s, so that relative errors a of both heights, rotations e of both attitudes and a height h of the feature change the
+Let s be the slope of a ray (horizontal over downward), H the height and T the time between images. A feature is located
+at H s. Relative errors a of both heights, rotations e of both attitudes and a height h of the feature change the
 velocity of a track from view 1 to view 2 by
 
     (H1 a1 s1 - H2 a2 s2 + H1 d(e1, s1) - H2 d(e2, s2) + h (s1 - s2)) / T,
 
-where d(e, s) is the change of a slope s as its ray is rotated by e.
+where d(e, s) is the change of a slope s by the rotation e of its ray.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.threshold_derivation import ThresholdInputs
 
-#: The descent camera binned to 256 x 256: focal length over pixel pitch, and pixels from the middle to the edge.
+#: Descent camera binned to 256 x 256: focal length over pixel pitch, and pixels from centre to edge.
 FOCAL_PX, HALF_PX = 14.67e-3 / 48e-6, 127.5
-#: DIMES' template side, least distance of two templates, search beyond the greatest speed (all pixels), as the field
-#: test paper and `DimesOptions` have them.
+#: Template side, minimum distance of two templates and margin of the search window, in pixels, as in the field test
+#: paper and `DimesOptions`.
 TEMPLATE_PX, APART_PX, MARGIN_PX = 31, 31.0, 4
-#: Places tried for two templates of a pair before it counts as one without room.
+#: Positions tried per pair; without two templates among them, the pair has no feasible overlap.
 TRIES = 200
 REQUIRED_M_S = 5.0
 
 
 @dataclass(frozen=True)
 class Reference:
-    """Velocity errors of right tracks and the IMU's, m/s, axes east and north.
+    """Velocity errors of correct tracks and of the IMU, m/s, axes east and north.
 
     Attributes
     ----------
     tracks
-        By descent, pair and template, shape (n, 2, 2, 2).
+        Errors by descent, pair and template, shape (n, 2, 2, 2).
     imu
-        Error of the IMU's change of velocity, shape (n, 2).
+        Error of the velocity change of the IMU, shape (n, 2).
     """
 
     tracks: Float[np.ndarray, "n 2 2 2"]
     imu: Float[np.ndarray, "n 2"]
 
     @classmethod
-    def drawn(cls, inputs: ThresholdInputs, descents: int, rng: np.random.Generator) -> Reference:
-        """Draws descents that have room for two templates in each pair."""
+    def draw(cls, inputs: ThresholdInputs, descents: int, rng: np.random.Generator) -> Reference:
+        """Draw descents with feasible overlap for two templates in each pair."""
         tracks = np.empty((descents, 2, 2, 2))
         for number in range(descents):
             while (errors := _descent_errors(inputs, rng)) is None:
@@ -59,25 +59,25 @@ class Reference:
         return cls(tracks, inputs.imu_sd_m_s * rng.standard_normal((descents, 2)))
 
     def single(self) -> Float[np.ndarray, " n"]:
-        """The discrepancy of one right track in each pair."""
+        """Discrepancy of one correct track in each pair."""
         return np.asarray(np.linalg.norm(self.tracks[:, 1, 0] - self.tracks[:, 0, 0] - self.imu, axis=-1))
 
     def best(self) -> Float[np.ndarray, " n"]:
-        """The least discrepancy of two right tracks in each pair."""
+        """Minimum discrepancy of two correct tracks in each pair."""
         return np.asarray(_discrepancies(self.tracks, self.imu).min(axis=(1, 2)))
 
     def right_or_refused(
         self, templates: int, wrong_by_m_s: tuple[float, float], threshold_m_s: float, rng: np.random.Generator
     ) -> tuple[float, float]:
-        """Shares of descents with a right velocity and with none, where one track of so many a pair is wrong."""
+        """Fractions of descents with a correct velocity and without one, if one track is wrong."""
         tracks = self.tracks[:, :, :templates].copy()
         n = len(tracks)
         angle, size = rng.uniform(0.0, 2.0 * np.pi, n), rng.uniform(*wrong_by_m_s, n)
         wrong = np.column_stack([size * np.cos(angle), size * np.sin(angle)])
         tracks[np.arange(n), rng.integers(2, size=n), rng.integers(templates, size=n)] += wrong
-        found = _discrepancies(tracks, self.imu).reshape(n, -1)
-        second = tracks[np.arange(n), 1, found.argmin(axis=1) % templates]
-        passed = found.min(axis=1) < threshold_m_s
+        discrepancies = _discrepancies(tracks, self.imu).reshape(n, -1)
+        second = tracks[np.arange(n), 1, discrepancies.argmin(axis=1) % templates]
+        passed = discrepancies.min(axis=1) < threshold_m_s
         right = passed & (np.linalg.norm(second, axis=1) <= REQUIRED_M_S)
         return float(right.mean()), float(np.mean(~passed))
 
@@ -85,13 +85,13 @@ class Reference:
 def _discrepancies(
     tracks: Float[np.ndarray, "n 2 templates 2"], imu: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n templates templates"]:
-    """Of each track of the first pair (rows) with each of the second (columns)."""
+    """Discrepancies of tracks of the first pair (rows) and of the second pair (columns)."""
     change = tracks[:, 1, None, :] - tracks[:, 0, :, None] - imu[:, None, None]
     return np.asarray(np.linalg.norm(change, axis=-1))
 
 
 def _descent_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> Float[np.ndarray, "2 2 2"] | None:
-    """Velocity errors by pair and template; None where a pair has no room for two templates."""
+    """Velocity errors by pair and template; None if a pair has no feasible overlap for two templates."""
     heights, interval = np.array(inputs.altitudes_m), inputs.interval_s
     attitudes = [_attitude(inputs, rng) for _ in heights]
     speed, course = inputs.max_speed_m_s * np.sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * np.pi)
@@ -106,13 +106,13 @@ def _descent_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> Float[
         (h1, h2), (a1, a2), (e1, e2) = (one[pair : pair + 2] for one in (heights, of_height, turned))
         later = (h1 * slopes - moved) / h2
         relief = inputs.feature_height_sd_m * rng.standard_normal((2, 1))
-        displaced = h1 * (a1 * slopes + _turned(e1, slopes)) - h2 * (a2 * later + _turned(e2, later))
+        displaced = h1 * (a1 * slopes + _rotate_slopes(e1, slopes)) - h2 * (a2 * later + _rotate_slopes(e2, later))
         errors[pair] = (displaced + relief * (slopes - later)) / interval
     return np.asarray(errors + inputs.match_sd_m_s * rng.standard_normal((2, 2, 2)))
 
 
 def _attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotation:
-    """Coning, nodding and any heading, as `ThresholdInputs` states them."""
+    """Draw an attitude with coning, nodding and random heading according to `ThresholdInputs`."""
     heading = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0.0, 2.0 * np.pi)])
     tilts = []
     for limit_deg in (inputs.max_cone_deg, inputs.max_nod_deg):
@@ -123,7 +123,7 @@ def _attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotation:
 
 
 def _attitude_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
-    """Rotation of each picture's measured attitude against the true one, radians, world axes."""
+    """Rotation of each measured attitude relative to the true one, radians, world axes."""
     common = np.radians(inputs.common_attitude_sd_deg) * rng.standard_normal(3)
     own = np.radians(inputs.attitude_sd_deg) * rng.standard_normal((3, 3))
     rates = np.radians(inputs.max_rate_deg_s) * rng.uniform(size=3)
@@ -133,7 +133,7 @@ def _attitude_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> Float
     return np.asarray(common + own + tags)
 
 
-def _turned(error: Float[np.ndarray, "3"], slopes: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+def _rotate_slopes(error: Float[np.ndarray, "3"], slopes: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """First-order change of slopes whose rays are rotated by a small vector."""
     rays = np.column_stack([slopes, -np.ones(len(slopes))])
     change = np.cross(error, rays)
@@ -143,7 +143,7 @@ def _turned(error: Float[np.ndarray, "3"], slopes: Float[np.ndarray, "n 2"]) -> 
 def _templates(
     attitudes: list[Rotation], heights: Float[np.ndarray, "2"], inputs: ThresholdInputs, rng: np.random.Generator
 ) -> Float[np.ndarray, "2 2"] | None:
-    """Slopes in the first view of two random places with room in both views; None where none were found."""
+    """Slopes of two random templates in the first view with feasible overlap; None if none are found."""
     pixels = rng.uniform(-HALF_PX, HALF_PX, (TRIES, 2))
     rays = attitudes[0].apply(np.column_stack([pixels / FOCAL_PX, -np.ones(TRIES)]))
     down = -rays[:, 2]
@@ -162,7 +162,7 @@ def _templates(
 
 
 def _inside(attitude: Rotation, slopes: Float[np.ndarray, "n 2"], half: float) -> Bool[np.ndarray, " n"]:
-    """Whether the frame holds squares of ground about these slopes; `half` is their half side over the height."""
+    """Whether ground squares around these slopes are inside the frame; `half` is half the side over the height."""
     inside = np.ones(len(slopes), dtype=bool)
     for corner in ((-half, -half), (-half, half), (half, -half), (half, half)):
         body = attitude.inv().apply(np.column_stack([slopes + np.array(corner), -np.ones(len(slopes))]))

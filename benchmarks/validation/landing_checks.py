@@ -1,4 +1,4 @@
-"""The bars on hazard detection from rendered pairs without noise: motion, and the elevation map."""
+"""Checks of hazard detection from rendered pairs without noise: motion and elevation map."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from marsyard.sim.sensor import DetectorParameters, LaserParameters, preset
 from marsyard.sim.streams import Streams
 
 SEED = 20050107
-#: Terrains of the sites' banks, the campaigns' own.
+#: Terrain banks of the sites, as in the campaigns.
 BANK = {"bank": 8, "bank_seed": 1}
 SITES = ("heli-benign", "heli-hazardous")
 ROTATION_BAR_DEG, BASELINE_BAR, ELEVATION_BAR = 0.05, 0.0075, 0.005
-#: 160 x 120 structure pixels. The paper's 59 features and some 200: their number is what bounds the motion over rocks,
-#: whose sides no affine warp follows.
+#: 160 x 120 structure pixels, with about 59 features as in the paper and with about 200. The number of features limits
+#: the accuracy of motion over rocks, because affine warps do not fit the sides of rocks.
 PAPER = HdaOptions(track_seed=TrackSeed.POSE, grid_px=4)
 OPTIONS = replace(PAPER, block_px=32)
 
 
 def noise_free(camera: str) -> DetectorParameters:
-    """A camera's detector with 16 bits and so large a well that light's own noise is below 1e-4 of the signal."""
+    """Detector of a camera with 16 bits and a large full well, so that shot noise is below 1e-4 of the signal."""
     well = 1e9
     own = preset(camera).detector
     return own.model_copy(
@@ -48,7 +48,7 @@ def noise_free(camera: str) -> DetectorParameters:
 
 
 def exact(site: str, rng: np.random.Generator) -> LandingScenarioParameters:
-    """A pair as hda-map draws it, of the campaigns' baseline, with attitudes of a helicopter, without any error."""
+    """Parameters of an image pair as in `hda-map`, with attitudes of a helicopter and without errors."""
     none = {"position_m": 0.0, "motion_m": 0.0, "tilt_deg": 0.0, "azimuth_deg": 0.0, "turn_deg": 0.0}
     east, north = rng.uniform(0.0, 102.4, 2)
     roll, pitch, yaw = rng.normal(0.0, 2.0, 3)
@@ -76,7 +76,7 @@ def exact(site: str, rng: np.random.Generator) -> LandingScenarioParameters:
 
 
 def errors(number: int) -> dict[str, dict[str, Scalar]]:
-    """Of one pair, over gentle ground or over rocks, slopes and gullies in turn; with the paper's features and ours."""
+    """Errors of one pair with both sets of options; the sites alternate."""
     streams = Streams(SEED, "landing checks", number)
     p = exact(SITES[number % len(SITES)], streams.generator("pair"))
     world = World.of(p)
@@ -93,7 +93,7 @@ def errors(number: int) -> dict[str, dict[str, Scalar]]:
 
 
 def _rms(rows: Sequence[dict[str, Scalar]], value: Callable[[dict[str, Scalar]], float]) -> float:
-    """Over all pairs; NaN, which misses every bar, where one gave no map."""
+    """Root mean square over all pairs; NaN, which exceeds every bound, if a pair has no map."""
     return float(np.sqrt(np.mean([value(row) ** 2 for row in rows])))
 
 

@@ -1,4 +1,4 @@
-"""The bars on light: the opposition peak, cast shadows, and the reflectance law."""
+"""Checks of light: opposition peak, cast shadows, reflectance law, clouds and sun."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
-from benchmarks.validation.bars import bar_of
+from benchmarks.validation.bars import find_bar
 from benchmarks.validation.motion import View, render
 from benchmarks.validation.raycast import Ground, meet_triangles
 from benchmarks.validation.records import Check, Measure
@@ -20,7 +20,7 @@ from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import CloudLayer, CloudParameters, DustySky, Photometry, PixelRays, Scene, Sun, Texture
 from marsyard.sim.terrain import Surface
 
-#: Brightness is then albedo times the cosine of incidence in the sun, and 0 in shadow.
+#: Brightness is albedo times the cosine of incidence in sunlight, and 0 in shadow.
 LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
 FLAT_ALBEDO = 0.2
 FARTHEST_FROM_A_MAST_M = 40.0
@@ -39,18 +39,18 @@ def _flat(albedo: float = FLAT_ALBEDO) -> Surface:
 
 
 def run_opposition(quick: bool) -> Iterator[Measure]:
-    """The peak's centre, found in the picture alone, against the point opposite the sun."""
+    """Compare the centre of the opposition peak in the image with the antisolar point."""
     law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
     rng = np.random.default_rng(3)
     surface = _flat()
     for name, camera in cameras().items():
         errors = []
         for _ in range(3 if quick else 10):
-            # the peak is put at a random pixel, the sun opposite
+            # the antisolar point is at a random pixel
             pixel = rng.uniform(0.2, 0.8, 2) * camera.size
             turn = Rotation.align_vectors(np.array([[0.2, 0.1, -1.0]]), camera.boresight()[None])[0]
             pose = rigid(turn, np.array([0.0, 0.0, 800.0]))
-            _, ray = camera.moved(pose).rays(pixel)
+            _, ray = camera.transform(pose).rays(pixel)
             if ray[2] > -0.3:
                 continue
             view = View(Scene(surface, (0.0, 0.0), Sun(-ray), law), camera, pose)
@@ -58,18 +58,18 @@ def run_opposition(quick: bool) -> Iterator[Measure]:
             errors.append(float(np.linalg.norm(_peak(radiance) - pixel)))
         how = f"{len(errors)} suns; centre of the light above 90 % of the peak's height"
         claim = f"opposition peak from the antisolar point: {name}"
-        yield Measure(claim, max(errors), "px", bar_of(claim), how)
+        yield Measure(claim, max(errors), "px", find_bar(claim), how)
 
 
 def _peak(radiance: np.ndarray) -> np.ndarray:
-    """Centre of what lies within a tenth of the peak's height of its top."""
+    """Centre of the light above 90 % of the peak's height."""
     weight = np.clip(radiance - radiance.max() + 0.1 * np.ptp(radiance), 0.0, None)
     v, u = np.mgrid[: radiance.shape[0], : radiance.shape[1]]
     return np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
 
 
 def _uniform(view: View, sun: Sun) -> View:
-    """The view under another sun, all of one albedo and Lambert's law."""
+    """The view with another sun, uniform albedo and Lambert's law."""
     samples = view.scene.surface.levels[0].copy()
     samples[..., 1] = FLAT_ALBEDO
     scene = replace(
@@ -80,7 +80,7 @@ def _uniform(view: View, sun: Sun) -> View:
         objects=replace(view.scene.objects, albedo=np.full(len(view.scene.objects), FLAT_ALBEDO)),
         ground_texture=Texture(),
         object_texture=Texture(),
-        # one ray a pixel: light is compared where that ray ends
+        # one ray per pixel, because light is compared at the intersection of this ray
         edge_rays=1,
     )
     return replace(view, scene=scene)
@@ -98,7 +98,7 @@ def _shadow_row(name: str, view: View, sun: Sun, count: int, farthest: float, st
     share = frame.radiance.ravel()[pixels] / (FLAT_ALBEDO * np.maximum(facing, 1e-6))
     ours = (facing > 0.0) & (share > 0.5)
     ground = Ground(view.scene.surface)
-    # far away the renderer sees the ground smoothed: its shadows are judged, not its heights
+    # the renderer smooths distant ground: use exact heights, because only shadows are compared
     on_ground = frame.body.ravel()[pixels] < 0
     points[on_ground, 2] = ground.height(points[on_ground, 0], points[on_ground, 1])
     hidden = ground.hides(points, towards, step)
@@ -107,12 +107,12 @@ def _shadow_row(name: str, view: View, sun: Sun, count: int, farthest: float, st
     theirs = (facing > 0.0) & ~hidden
     agree = float(np.mean(ours == theirs))
     cast = (facing > 0.0) & hidden
-    found = f", of which {np.mean(~ours[cast]):.0%} are dark in the picture" if cast.any() else ""
+    dark_text = f", of which {np.mean(~ours[cast]):.0%} are dark in the picture" if cast.any() else ""
     how = (
         f"{pixels.size} random pixels, {np.mean(facing <= 0.0):.1%} turned from the sun, "
-        f"{np.mean(cast):.1%} in cast shadow{found}; {np.mean(theirs & ~ours):.2%} wrongly dark"
+        f"{np.mean(cast):.1%} in cast shadow{dark_text}; {np.mean(theirs & ~ours):.2%} wrongly dark"
     )
-    # three times the worst disagreement seen from the air, 0.03 %; from a mast twice the worst, 0.24 %
+    # about three times the maximum disagreement from the air (0.03 %), and twice that from a mast (0.24 %)
     bar = 0.999 if farthest > FARTHEST_FROM_A_MAST_M else 0.995
     return Measure(f"shadows as an independent ray cast has them: {name}", agree, "", bar, how, "at least")
 
@@ -138,7 +138,7 @@ def run_shadows(quick: bool) -> Iterator[Measure]:
 
 
 def _single_pixel() -> Cahv:
-    """A camera of few pixels that looks straight down."""
+    """A nadir camera with 9 x 9 pixels."""
     return Cahv.from_field_of_view(
         horizontal_rad=0.002,
         size=(9, 9),
@@ -149,14 +149,14 @@ def _single_pixel() -> Cahv:
 
 
 def _rendered_brightness(law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray) -> float:
-    """Brightness of flat ground in the direct sun, from the middle pixel of a picture."""
+    """Brightness of flat ground in direct sunlight, from the central pixel of an image."""
     turn = Rotation.align_vectors(-to_eye[None], np.array([[0.0, 0.0, -1.0]]))[0]
     view = View(Scene(_flat(), (0.0, 0.0), Sun(to_sun), law), _single_pixel(), rigid(turn, 100.0 * to_eye))
     return float(render(renderer(), view).radiance[4, 4])
 
 
 def _law(law: Photometry, cos_i: np.ndarray, cos_e: np.ndarray, cos_g: npt.ArrayLike) -> np.ndarray:
-    """The law as `Photometry` states it, for unit albedo and K, written out again."""
+    """Independent implementation of the law of `Photometry`, for unit albedo and K."""
     g = np.arccos(np.clip(cos_g, -1.0, 1.0))
     surge = 1.0 + law.surge_amplitude / (1.0 + np.tan(0.5 * g) / law.surge_width)
     share = law.lunar_fraction
@@ -175,7 +175,7 @@ def run_reflectance(quick: bool) -> Iterator[Measure]:
                 for _ in range(2)
             )
             there, back = _rendered_brightness(bare, first, second), _rendered_brightness(bare, second, first)
-            # I/F over the cosine of incidence is pi times the bidirectional reflectance
+            # I/F divided by the cosine of incidence is pi times the bidirectional reflectance
             away.append(abs(there / first[2] / (back / second[2]) - 1.0))
             expected = FLAT_ALBEDO * bare.normalisation() * _law(bare, first[2], second[2], float(first @ second))
             off.append(float(abs(there / expected - 1.0)))
@@ -186,13 +186,13 @@ def run_reflectance(quick: bool) -> Iterator[Measure]:
             ("rendered brightness against the formula", max(off), how),
             ("spherical albedo from the stated one", albedo, "the law integrated over sun and eye by Sobol points"),
         ):
-            yield Measure(f"{claim}: {name}", measured, "", bar_of(f"{claim}: {name}"), by)
+            yield Measure(f"{claim}: {name}", measured, "", find_bar(f"{claim}: {name}"), by)
 
 
 def _spherical_albedo(law: Photometry, log2_points: int) -> float:
-    """Share of light from all sides that the law with A = K = 1 returns, by quasi Monte Carlo.
+    """Fraction of isotropic light that the law with A = K = 1 reflects, by quasi-Monte Carlo.
 
-    Sun and eye are drawn in proportion to their cosines, so that the mean of I/F over the cosine of incidence is it.
+    Sun and eye are drawn in proportion to their cosines. The result is the mean of I/F over the cosine of incidence.
     """
     one, two, turn = qmc.Sobol(3, rng=np.random.default_rng(1)).random_base2(log2_points).T
     cos_i, cos_e = np.sqrt(1.0 - one), np.sqrt(1.0 - two)
@@ -201,7 +201,7 @@ def _spherical_albedo(law: Photometry, log2_points: int) -> float:
 
 
 def run_clouds(quick: bool) -> Iterator[Measure]:
-    """Cover of the ground, and the motion of the shadows, in the pictures alone."""
+    """Measure cloud cover and motion of cloud shadows in images."""
     camera, law = cameras()["MER descent camera, CAHVOR, 45 deg"], LAMBERT
     sun = Sun(direction(np.radians(150.0), np.radians(45.0)))
     given = CloudParameters(cover=0.3, size_m=400.0, optical_depth=50.0)
@@ -228,7 +228,7 @@ def run_clouds(quick: bool) -> Iterator[Measure]:
         "share of the ground in clouds' shadows, from the stated one", abs(float(np.mean(covers)) - 0.3), "", 0.1, how
     )
     how = "two pictures 3.75 s apart, the later from a place that drifted with the wind; change over slope at the edges"
-    # 0 was measured, as the same function is evaluated at a shifted place: the bar is what rounding may make of it
+    # the same function is evaluated at a shifted position: the bound allows for rounding
     yield Measure("motion of clouds' shadows from the wind's", max(moved), "px", 1e-4, how)
 
 
@@ -238,7 +238,7 @@ def _from_above(scene: Scene, camera: CameraModel, place: np.ndarray, time_s: fl
 
 
 def run_sun(quick: bool) -> Iterator[Measure]:
-    """Location and light of the sun's disc in the sky."""
+    """Measure position and light of the sun's disc in the sky."""
     camera = cameras()["MER navcam, CAHVOR, 45 deg"]
     off, flux = [], []
     for azimuth_deg, elevation_deg in (
@@ -257,9 +257,9 @@ def run_sun(quick: bool) -> Iterator[Measure]:
         angle = np.square(rays.pixel_angles.astype(np.float64)).reshape(radiance.shape)
         flux.append(abs(float((light * angle).sum()) / np.pi - 1.0))
     claim = "the sun's disc from the sun's direction"
-    yield Measure(claim, max(off), "px", bar_of(claim), f"{len(off)} suns in the navcam's sky")
+    yield Measure(claim, max(off), "px", find_bar(claim), f"{len(off)} suns in the navcam's sky")
     claim = "light of the sun's disc from the direct sun"
-    yield Measure(claim, max(flux), "", bar_of(claim), "the same pictures")
+    yield Measure(claim, max(flux), "", find_bar(claim), "the same pictures")
 
 
 CHECKS = (

@@ -1,10 +1,10 @@
-"""Markers on rolling ground: does the renderer put them where the camera model does?
+"""Positions of rendered markers on undulating ground, compared with the camera model.
 
-Markers are spots of paint (Gaussians of albedo on black ground) at random pixels of each camera, laid where that
-pixel's ray meets the ground. Where the centre of light of a marker's picture should be is computed from the camera
-model alone: perspective moves it by hundredths of a pixel from the centre's own pixel.
+Markers are Gaussian spots of albedo on black ground, at the ground intersections of random pixels' rays. The expected
+centre of light is computed from the camera model only; perspective moves it by hundredths of a pixel.
 
-Run as a program it measures all cameras with one backend and prints the errors as JSON: a process can use only one.
+As a program, this module measures all cameras with one backend and prints the errors as JSON, because a process can use
+only one backend.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from marsyard.sim.render import PixelRays, Renderer, Scene
 from marsyard.sim.terrain import Surface
 
 SIDE = 2048
-#: Size of a marker's picture: the geometric mean of its ellipse's sigmas, pixels.
+#: Size of a marker in the image: geometric mean of the standard deviations of its ellipse, pixels.
 SPOT_PX = 2.7
-#: Half a side of the window in which a marker's light is summed, and minimum distance of markers, pixels.
+#: Half side of the window in which the light is summed, and minimum distance of markers, pixels.
 WINDOW, APART = 14, 46
-#: Most oblique view of a marker, from the vertical.
+#: Maximum angle between the line of sight and the vertical.
 MAX_OBLIQUITY_RAD = np.radians(68.0)
 #: Maximum off-nadir angle of a camera's axis.
 MAX_TILT_RAD = np.radians(30.0)
@@ -37,7 +37,7 @@ MARKERS = 1000
 
 @dataclass(frozen=True)
 class Marked:
-    """A ground with markers, a camera above it, and where the markers should be seen."""
+    """Ground with markers, a camera above it, and the expected pixels of the markers."""
 
     scene: Scene
     camera: CameraModel
@@ -46,7 +46,7 @@ class Marked:
 
 
 def _looking_down(camera: CameraModel, rng: np.random.Generator) -> Rotation:
-    """A random attitude in which the camera's middle looks down, tilted by up to `MAX_TILT_RAD`."""
+    """Draw an attitude with a downward boresight, tilted by up to `MAX_TILT_RAD`."""
     tilt, about, spin = rng.uniform(0.2, 1.0) * MAX_TILT_RAD, *rng.uniform(0.0, 2.0 * np.pi, 2)
     target = np.array([np.sin(tilt) * np.cos(about), np.sin(tilt) * np.sin(about), -np.cos(tilt)])
     turned = Rotation.align_vectors(target[None], camera.boresight()[None])[0]
@@ -54,7 +54,7 @@ def _looking_down(camera: CameraModel, rng: np.random.Generator) -> Rotation:
 
 
 def _rolling(extent_m: float, rng: np.random.Generator) -> np.ndarray:
-    """Heights of a periodic ground of long waves, slopes of some degrees."""
+    """Heights of a periodic ground of long waves with slopes of a few degrees."""
     phase = np.arange(SIDE) * (2.0 * np.pi / SIDE)
     heights = np.zeros((SIDE, SIDE))
     for _ in range(6):
@@ -65,11 +65,11 @@ def _rolling(extent_m: float, rng: np.random.Generator) -> np.ndarray:
     return heights
 
 
-def marked_view(camera: CameraModel, height_m: float, rng: np.random.Generator) -> Marked:
-    """Ground with as many markers as the picture has room for."""
+def mark_view(camera: CameraModel, height_m: float, rng: np.random.Generator) -> Marked:
+    """Create ground with as many markers as fit into the image."""
     pose = rigid(_looking_down(camera, rng), np.array([0.0, 0.0, height_m]))
-    world_camera = camera.moved(pose)
-    pixels = _scattered(camera.size, rng)
+    world_camera = camera.transform(pose)
+    pixels = _scatter_points(camera.size, rng)
     origins, rays = world_camera.rays(pixels)
     steep = rays[:, 2] < -np.cos(MAX_OBLIQUITY_RAD)
     pixels, origins, rays = pixels[steep], np.array(origins[steep]), rays[steep]
@@ -102,8 +102,8 @@ def marked_view(camera: CameraModel, height_m: float, rng: np.random.Generator) 
     return Marked(scene, camera, pose, expected)
 
 
-def _scattered(size: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
-    """Random pixels, no two near each other: a grid in disorder."""
+def _scatter_points(size: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
+    """Random pixels with a minimum distance: a jittered grid."""
     cell = APART + 12
     across, down = (side // cell for side in size)
     corners = np.stack(np.meshgrid(np.arange(across), np.arange(down)), axis=-1).reshape(-1, 2)
@@ -115,7 +115,7 @@ def _scattered(size: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
 
 
 def _picture_area(camera: CameraModel, ground: Ground, points: np.ndarray) -> np.ndarray:
-    """Area in the picture of a square metre of plan, pixels."""
+    """Image area of one square metre of horizontal ground, pixels."""
     jacobian = camera.projection_jacobian(points)
     gradient = ground.gradient(points[..., 0], points[..., 1])
     by_plan = jacobian[..., :2] + jacobian[..., 2:] * gradient[..., None, :]
@@ -123,7 +123,7 @@ def _picture_area(camera: CameraModel, ground: Ground, points: np.ndarray) -> np
 
 
 def _paint(albedo: np.ndarray, place: np.ndarray, sigma: float) -> None:
-    """Adds a Gaussian spot to a periodic grid; place and sigma in samples."""
+    """Add a Gaussian spot to a periodic grid; position and sigma in samples."""
     reach = int(np.ceil(6.0 * sigma))
     columns, rows = (round(float(one)) + np.arange(-reach, reach + 1) for one in place[:2])
     spot = np.exp(-((rows[:, None] - place[1]) ** 2 + (columns[None, :] - place[0]) ** 2) / (2.0 * sigma**2))
@@ -131,7 +131,7 @@ def _paint(albedo: np.ndarray, place: np.ndarray, sigma: float) -> None:
 
 
 def _centre_of_light(camera: CameraModel, ground: Ground, marker: np.ndarray, sigma: float) -> np.ndarray:
-    """Mean of the pixels of a marker's points, weighted by brightness under the overhead sun and by picture area."""
+    """Mean pixel of a marker, weighted by brightness under the overhead sun and by image area."""
     offset = sigma * np.linspace(-5.5, 5.5, 45)
     dx, dy = np.meshgrid(offset, offset)
     x, y = marker[0] + dx, marker[1] + dy
@@ -144,7 +144,7 @@ def _centre_of_light(camera: CameraModel, ground: Ground, marker: np.ndarray, si
     return (weight[near, None] * pixels[near]).sum(axis=0) / weight[near].sum()
 
 
-def _found(radiance: np.ndarray, near: np.ndarray) -> np.ndarray:
+def _locate_marker(radiance: np.ndarray, near: np.ndarray) -> np.ndarray:
     u0, v0 = np.rint(near).astype(int)
     v, u = np.mgrid[v0 - WINDOW : v0 + WINDOW + 1, u0 - WINDOW : u0 + WINDOW + 1]
     light = radiance[v, u].astype(np.float64)
@@ -152,15 +152,15 @@ def _found(radiance: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 
 def marker_errors(renderer: Renderer, camera: CameraModel, seed: int, count: int = MARKERS) -> np.ndarray:
-    """Error (u, v) of markers over as many poses as it takes, shape (count, 2)."""
+    """Errors (u, v) of `count` markers over several poses, shape (count, 2)."""
     rng = np.random.default_rng(seed)
     rays = PixelRays.of(camera)
     errors: list[np.ndarray] = []
     while len(errors) < count:
-        # from a mast's height to a parachute's
-        marked = marked_view(camera, float(10.0 ** rng.uniform(0.2, 3.3)), rng)
+        # from the height of a mast to that of a parachute descent
+        marked = mark_view(camera, float(10.0 ** rng.uniform(0.2, 3.3)), rng)
         radiance = renderer.render(marked.scene, rays, marked.pose).radiance
-        errors += [_found(radiance, near) - near for near in marked.expected]
+        errors += [_locate_marker(radiance, near) - near for near in marked.expected]
     return np.stack(errors[:count])
 
 

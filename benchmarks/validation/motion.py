@@ -1,8 +1,7 @@
-"""Does a picture move as the camera does? What aliases, pops or swims moves by something else.
+"""Subpixel motion of rendered images compared with the motion of the camera; detects aliasing.
 
-The camera is moved sideways so that the picture's middle moves by 0.0, 0.1 ... 1.0 pixel along its columns. Where each
-pixel's point should be found is known from the truth: the world point that it sees, projected by the moved camera.
-Patches that hold the edge of something before something else are left out: what an edge hides is no motion.
+The camera moves sideways so that the image centre moves by 0.0, 0.1 ... 1.0 pixel along the columns. The true motion of
+each pixel is the projection of its world point by the moved camera. Patches with occluding edges are excluded.
 """
 
 from __future__ import annotations
@@ -19,18 +18,18 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.render import Frame, PixelRays, Renderer, Scene
 
 STEPS_PX = np.linspace(0.0, 1.0, 11)
-#: Motions within a patch may differ by this fraction of the motion; otherwise it contains an edge.
+#: Maximum relative difference of the motions within a patch; larger values mark an edge.
 MAX_SPREAD = 0.1
-#: Patches that show more than one body.
+#: Body number of patches that show more than one body.
 MIXED = -3
 
 
 @dataclass(frozen=True)
 class View:
-    """A scene, a camera in the body frame, and where the body is.
+    """A scene, a camera in the body frame, and the pose of the body.
 
-    `footprint` is the part of a pixel over which the renderer averages ground and texture: 1, or almost 0
-    for point samples.
+    `footprint` is the fraction of a pixel over which the renderer averages ground and texture: 1, or almost 0 for
+    point samples.
     """
 
     scene: Scene
@@ -38,13 +37,13 @@ class View:
     world_from_body: RigidTransform
     footprint: float = 1.0
 
-    def moved(self, offset_world_m: np.ndarray) -> View:
-        """The same seen from elsewhere."""
+    def transform(self, offset_world_m: np.ndarray) -> View:
+        """The same view from a shifted position."""
         pose = rigid(self.world_from_body.rotation, self.world_from_body.translation + offset_world_m)
         return replace(self, world_from_body=pose)
 
     def rays(self, camera: CameraModel) -> PixelRays:
-        """Rays of the view's camera, or of a part of it."""
+        """Rays of the camera or of a part of it."""
         rays = PixelRays.of(camera)
         return replace(rays, pixel_angles=np.float32(self.footprint) * rays.pixel_angles)
 
@@ -56,11 +55,11 @@ class Motion:
     Attributes
     ----------
     step_px
-        By how much the picture's middle moved.
+        Motion of the image centre.
     error, parabola, biquadratic
-        Motion found by symmetric Gauss-Newton and by fits to the correlation's peak, less the true motion.
+        Motion by symmetric Gauss-Newton estimation and by fits to the correlation peak, minus the true motion.
     body
-        What each patch shows: a body's number, the ground's (-1), or `MIXED`.
+        Body of each patch: number of the body, -1 for the ground, or `MIXED`.
     """
 
     step_px: float
@@ -71,30 +70,30 @@ class Motion:
 
 
 def render(renderer: Renderer, view: View, samples: int = 1) -> Frame:
-    """The view's picture; with `samples` > 1 only its radiance is the mean of samples x samples in each pixel."""
+    """Render the view; with `samples` > 1, the radiance is the mean of samples x samples rays in each pixel."""
     rays = view.rays(view.camera)
     frame = renderer.render(view.scene, rays, view.world_from_body)
     if samples == 1:
         return frame
     return Frame(
-        supersampled(renderer, view, samples), frame.range_m, frame.body, frame.normal, frame.world_from_body, rays
+        supersample(renderer, view, samples), frame.range_m, frame.body, frame.normal, frame.world_from_body, rays
     )
 
 
-#: Side in samples of the pieces in which an oversampled picture is rendered.
+#: Side in samples of the parts in which an oversampled image is rendered.
 PIECE = 1024
 
 
-def supersampled(renderer: Renderer, view: View, samples: int) -> np.ndarray:
-    """Mean over samples x samples rays in each pixel, each ray seeing as fine as its own share of the pixel."""
-    fine = view.camera.scaled(samples)
+def supersample(renderer: Renderer, view: View, samples: int) -> np.ndarray:
+    """Mean over samples x samples rays in each pixel; the footprint of each ray is its part of the pixel."""
+    fine = view.camera.scale(samples)
     columns, rows = view.camera.size
     step = PIECE // samples
     picture = np.empty((rows, columns))
     for row in range(0, rows, step):
         for column in range(0, columns, step):
             size = (min(step, columns - column), min(step, rows - row))
-            part = fine.cropped(column * samples, row * samples, (size[0] * samples, size[1] * samples))
+            part = fine.crop(column * samples, row * samples, (size[0] * samples, size[1] * samples))
             radiance = renderer.render(view.scene, view.rays(part), view.world_from_body).radiance
             blocks = radiance.reshape(size[1], samples, size[0], samples)
             picture[row : row + size[1], column : column + size[0]] = blocks.mean(axis=(1, 3), dtype=np.float64)
@@ -102,7 +101,7 @@ def supersampled(renderer: Renderer, view: View, samples: int) -> np.ndarray:
 
 
 def sideways(view: View, frame: Frame) -> np.ndarray:
-    """World offset that moves the picture's middle one pixel towards growing columns."""
+    """World offset that moves the image centre by one pixel along the columns."""
     rows, columns = frame.range_m.shape
     middle = (slice(rows // 2 - HALF, rows // 2 + HALF + 1), slice(columns // 2 - HALF, columns // 2 + HALF + 1))
     distance = float(np.median(frame.range_m[middle]))
@@ -111,12 +110,12 @@ def sideways(view: View, frame: Frame) -> np.ndarray:
 
 
 def true_motion(frame: Frame, view: View, other: View) -> np.ndarray:
-    """Motion (u, v) of every pixel's point from one view to another; NaN in the sky and where it is not seen."""
+    """Motion (u, v) of every pixel's point between two views; NaN in the sky and for invisible points."""
     points = frame.points_world()
-    camera = view.camera.moved(other.world_from_body)
+    camera = view.camera.transform(other.world_from_body)
     pixels, _ = camera.project(points)
-    # a pixel's own ray closes to 1e-4 px in single precision; the difference of two projections is better
-    here, _ = view.camera.moved(view.world_from_body).project(points)
+    # the difference of two projections is more accurate than the pixel position of a ray in single precision (1e-4 px)
+    here, _ = view.camera.transform(view.world_from_body).project(points)
     return pixels - here
 
 
@@ -126,14 +125,14 @@ def _windows(values: np.ndarray, centres: np.ndarray) -> np.ndarray:
 
 
 def patch_grid(size: tuple[int, int], stride: int = PATCH) -> np.ndarray:
-    """Centres (u, v) of patches side by side."""
+    """Centres (u, v) of a grid of patches."""
     u = np.arange(MARGIN, size[0] - MARGIN, stride)
     v = np.arange(MARGIN, size[1] - MARGIN, stride)
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
 def _whole_patches(motion: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """The patches all of whose pixels move nearly alike."""
+    """Select patches with nearly uniform motion."""
     windows = _windows(motion, centres)
     spread = np.ptp(windows, axis=(1, 2)).max(axis=-1)
     alike = spread <= MAX_SPREAD * np.linalg.norm(windows, axis=-1).max(axis=(1, 2))
@@ -143,17 +142,17 @@ def _whole_patches(motion: np.ndarray, centres: np.ndarray) -> np.ndarray:
 def measure(
     renderer: Renderer, view: View, steps: np.ndarray = STEPS_PX, samples: int = 1, stride: int = PATCH
 ) -> Iterator[Motion]:
-    """Errors of the motion measured on pictures of the view, step by step."""
+    """Yield the errors of the measured motion for each step."""
     first = render(renderer, view, samples)
     unit = sideways(view, first)
     first_smooth = SmoothPicture(first.radiance)
-    one_pixel = true_motion(first, view, view.moved(unit))
+    one_pixel = true_motion(first, view, view.transform(unit))
     centres = _whole_patches(one_pixel, patch_grid(view.camera.size, stride))
     for step in steps:
-        other = view.moved(step * unit)
+        other = view.transform(step * unit)
         second = render(renderer, other, samples)
         shifts = symmetric_shifts(first_smooth, SmoothPicture(second.radiance), centres)
-        # halfway between the two pictures, as the estimator sees it
+        # motion relative to the midpoint of both images, as in the estimator
         ahead, back = true_motion(first, view, other), true_motion(second, other, view)
         seen_from_both = ~np.isnan(_windows(ahead - back, centres)).any(axis=(1, 2, 3))
         motion = 0.5 * (_windows(ahead, centres) - _windows(back, centres))
@@ -164,11 +163,11 @@ def measure(
             (shifts.found - shifts.expected(motion))[seen_from_both],
             (parabola - mean_ahead)[seen_from_both],
             (biquadratic - mean_ahead)[seen_from_both],
-            _shown(_windows(first.body, centres))[seen_from_both],
+            _shown_requirement(_windows(first.body, centres))[seen_from_both],
         )
 
 
-def _shown(bodies: np.ndarray) -> np.ndarray:
-    """The one body that each patch shows, or `MIXED`."""
+def _shown_requirement(bodies: np.ndarray) -> np.ndarray:
+    """Body of each patch, or `MIXED`."""
     lowest, highest = bodies.min(axis=(1, 2)), bodies.max(axis=(1, 2))
     return np.where(lowest == highest, lowest, MIXED)

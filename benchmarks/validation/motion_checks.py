@@ -1,4 +1,4 @@
-"""The bars on motion: over every site from 2 km, and over rock from a mast."""
+"""Checks of image motion: all sites from 2 km, and rocks from a mast."""
 
 from __future__ import annotations
 
@@ -7,56 +7,56 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.validation.bars import bar_of
+from benchmarks.validation.bars import find_bar
 from benchmarks.validation.estimators import PATCH
-from benchmarks.validation.motion import STEPS_PX, Motion, View, measure, render, supersampled
+from benchmarks.validation.motion import STEPS_PX, Motion, View, measure, render, supersample
 from benchmarks.validation.records import Check, Measure
 from benchmarks.validation.scenes import descent_view, renderer, rock_view, tile_view
 from marsyard.sim.render.renderer import edge_pixels
 from marsyard.sim.terrain.sites import sites
 
-#: With 16 samples a pixel instead of 256 the pictures themselves are less true.
+#: Bound for the quick control: images with 16 samples per pixel are less accurate than with 256.
 QUICK_CONTROL_BAR_PX = 0.005
 DESCENT_HEIGHT_M = 2000.0
-#: From which the descent camera's pixel is 0.25 m on the tile, whose picture has 0.5 m.
+#: Height at which a pixel of the descent camera is 0.25 m; the orthoimage has 0.5 m.
 TILE_HEIGHT_M = 300.0
 DISTANCES_M = (10.0, 5.0, 2.0)
-#: Those from which the picture holds the rock's outline; nearer, the rock fills it.
+#: Distances at which the image contains the outline of the rock.
 OUTLINE_DISTANCES_M = (10.0, 5.0)
 ROCK_SITE = "gusev"
-#: 256 patches of 31 x 31 from the air.
+#: Size of descent images, with 256 patches of 31 x 31.
 DESCENT_SIZE = (512, 512)
-#: 210 patches, for the control of 256 samples a pixel.
+#: Size of control images with 256 samples per pixel: 210 patches.
 CONTROL_SIZE = (486, 455)
 CONTROL_SAMPLES = 16
-#: Where the control is taken: where an estimator that locks to pixels is worst, and halfway.
+#: Steps of the control: maximum of pixel locking, and half a pixel.
 CONTROL_STEPS_PX = np.array([0.25, 0.5])
 QUICK_STEPS_PX = np.array([0.3, 0.5, 0.8])
 
 
 def bias(errors: Sequence[np.ndarray]) -> float:
-    """Largest mean error along either axis over the steps."""
+    """Maximum mean error over both axes and all steps."""
     return float(max(np.abs(error.mean(axis=0)).max() for error in errors))
 
 
 def uncertainty(errors: Sequence[np.ndarray]) -> float:
-    """Largest standard error of those means."""
+    """Maximum standard error of the mean errors."""
     return float(max((error.std(axis=0, ddof=1) / np.sqrt(len(error))).max() for error in errors))
 
 
 def _row(claim: str, errors: Sequence[np.ndarray], steps: np.ndarray, bar: float | None = None) -> Measure:
-    """A row on a bias; its bar is the measured one (`bars`) unless another is given."""
+    """Row of a bias; the default bound is that of `bars`."""
     scatter = max(error.std(axis=0, ddof=1).max() for error in errors)
     patches = min(len(error) for error in errors)
     how = (
         f"{patches} patches, {len(steps)} steps from {steps[0]:.2g} to {steps[-1]:.2g} px; "
         f"one patch scatters by {scatter:.2g} px, the mean by {uncertainty(errors):.1g} px"
     )
-    return Measure(claim, bias(errors), "px", bar_of(claim) if bar is None else bar, how)
+    return Measure(claim, bias(errors), "px", find_bar(claim) if bar is None else bar, how)
 
 
 def _fits(motions: Sequence[Motion]) -> tuple[float, float]:
-    """Largest mean errors of parabola and biquadratic; the median patch, for a parabola can run away."""
+    """Maximum median errors of parabola and quadric; medians, because parabolas have outliers."""
     return tuple(  # type: ignore[return-value]
         float(max(np.abs(np.median(getattr(motion, fit), axis=0)).max() for motion in motions))
         for fit in ("parabola", "biquadratic")
@@ -73,7 +73,7 @@ def run(quick: bool) -> Iterator[Measure]:
         fits.append(_fits(motions))
         yield _row(f"bias of motion, {name} from 2 km", [motion.error for motion in motions], steps)
     for distance in DISTANCES_M:
-        # from 10 m the rock holds fewer than 200 patches side by side: let them overlap
+        # overlapping patches at 10 m, because fewer than 200 separate patches fit onto the rock
         stride = 24 if distance > 5.0 else PATCH
         motions = list(measure(renderer(), rock_view(ROCK_SITE, distance), steps, stride=stride))
         fits.append(_fits(motions))
@@ -113,14 +113,14 @@ def _commonest_rock(motion: Motion) -> int:
     return int(np.bincount(rocks).argmax())
 
 
-def _controlled() -> Iterator[tuple[str, View]]:
+def _control_views() -> Iterator[tuple[str, View]]:
     yield "gusev from 2 km", descent_view("gusev", DESCENT_HEIGHT_M, CONTROL_SIZE)
     yield "rock at 5 m", rock_view(ROCK_SITE, 5.0, CONTROL_SIZE)
 
 
 def run_control(quick: bool) -> Iterator[Measure]:
     samples = 4 if quick else CONTROL_SAMPLES
-    for name, view in _controlled():
+    for name, view in _control_views():
         motions = list(measure(renderer(), view, CONTROL_STEPS_PX, samples))
         claim = f"the estimator's own bias, {name}, {samples**2} samples a pixel"
         bar = QUICK_CONTROL_BAR_PX if quick else None
@@ -128,14 +128,14 @@ def run_control(quick: bool) -> Iterator[Measure]:
 
 
 def _edge_error(view: View) -> tuple[float, float, int]:
-    """Rms error of radiance at pixels that hold an edge, over the mean, by one ray and as rendered; and their number.
+    """Relative RMS error of radiance at edge pixels with one ray and as rendered, and the number of pixels.
 
-    Against 256 rays a pixel, each of which sees ground and texture as smooth as the pixel.
+    The reference has 256 rays per pixel, with ground and texture as smooth as in the pixel.
     """
     single = replace(view, scene=replace(view.scene, edge_rays=1))
     one, several = render(renderer(), single), render(renderer(), view)
     edges = edge_pixels(one.radiance, one.range_m, one.body)
-    true = supersampled(renderer(), replace(single, footprint=float(CONTROL_SAMPLES)), CONTROL_SAMPLES)
+    true = supersample(renderer(), replace(single, footprint=float(CONTROL_SAMPLES)), CONTROL_SAMPLES)
     before, after = (
         float(np.sqrt(np.mean((frame.radiance - true).ravel()[edges] ** 2)) / true.mean()) for frame in (one, several)
     )
@@ -146,8 +146,8 @@ def run_edges(quick: bool) -> Iterator[Measure]:
     size = (192, 160) if quick else (384, 320)
     for distance in OUTLINE_DISTANCES_M:
         whole = rock_view(ROCK_SITE, distance)
-        # the upper left of the picture holds an outline before the ground far behind
-        view = replace(whole, camera=whole.camera.cropped(0, 0, size))
+        # the upper left part of the image contains an outline in front of distant ground
+        view = replace(whole, camera=whole.camera.crop(0, 0, size))
         before, after, count = _edge_error(view)
         yield Measure(
             f"radiance at outlines, rms, {distance:g} m from a rock",

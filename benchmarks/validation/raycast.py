@@ -1,7 +1,7 @@
-"""An independent ray cast: SciPy's B-spline and bisection for the ground, brute force for triangles.
+"""Independent ray casting: SciPy's B-splines and bisection for the ground, brute force for triangles.
 
-Nothing here is taken from the renderer: heights come from `scipy.ndimage.map_coordinates`, triangles are met by solving
-for the weights of their corners.
+Independent of the renderer: heights are from `scipy.ndimage.map_coordinates`, and triangles are intersected by solving
+for barycentric coordinates.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from scipy.ndimage import map_coordinates
 from marsyard.sim.render import Objects
 from marsyard.sim.terrain import Surface
 
-#: Rays and steps along them that are held at a time.
+#: Maximum number of ray points in memory.
 BLOCK = 2_000_000
 
 
 class Ground:
-    """A surface's heights as SciPy evaluates them."""
+    """Heights of a surface, evaluated by SciPy."""
 
     def __init__(self, surface: Surface) -> None:
         self._control = surface.levels[0][..., 0].astype(np.float64)
@@ -36,13 +36,13 @@ class Ground:
         return np.stack([by_x, by_y], axis=-1)
 
     def clearance(self, origins: np.ndarray, directions: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Height of points along rays above the ground."""
+        """Height above ground of points along rays."""
         x, y, z = (origins[:, k] + t * directions[:, k] for k in range(3))
         return z - self.height(x, y)
 
     def cast(self, origins: np.ndarray, directions: np.ndarray, farthest: float, step: float) -> np.ndarray:
-        """Distance of each ray to the ground, found by steps of at most `step` m and bisection; infinite if none."""
-        found = np.full(len(directions), np.inf)
+        """Distance of each ray to the ground by steps of at most `step` metres and bisection; infinite if none."""
+        ranges = np.full(len(directions), np.inf)
         with np.errstate(divide="ignore"):
             above = np.where(directions[:, 2] < 0.0, (self.highest - origins[:, 2]) / directions[:, 2], 0.0)
             below = np.where(directions[:, 2] < 0.0, (self.lowest - origins[:, 2]) / directions[:, 2], np.inf)
@@ -52,8 +52,8 @@ class Ground:
             longest = float((stop - start)[order].max())
             count = max(int(BLOCK / (longest / step + 2)), 1)
             block, order = order[-count:], order[:-count]
-            found[block] = self._cast_block(origins[block], directions[block], start[block], stop[block], step)
-        return found
+            ranges[block] = self._cast_block(origins[block], directions[block], start[block], stop[block], step)
+        return ranges
 
     def _cast_block(
         self, origins: np.ndarray, directions: np.ndarray, start: np.ndarray, stop: np.ndarray, step: float
@@ -73,7 +73,7 @@ class Ground:
         return np.where(hit, 0.5 * (low + high), np.inf)
 
     def hides(self, points: np.ndarray, towards: np.ndarray, step: float) -> np.ndarray:
-        """Whether the ground stands between points on it and something far away."""
+        """Whether the ground occludes a distant light source in the direction `towards`."""
         reach = max((self.highest - float(points[:, 2].min())) / max(towards[2], 1e-3), step)
         t = np.concatenate([[0.05 * step], np.arange(step, reach + step, step)])
         hidden = np.zeros(len(points), dtype=bool)
@@ -86,19 +86,19 @@ class Ground:
 
 
 def meet_triangles(objects: Objects, origins: np.ndarray, directions: np.ndarray, nearest: float = 0.0) -> np.ndarray:
-    """Distance of each ray to the nearest triangle beyond `nearest`, infinite if none; every body that it may meet."""
-    found = np.full(len(directions), np.inf)
+    """Distance of each ray to the nearest triangle beyond `nearest`; infinite if none."""
+    ranges = np.full(len(directions), np.inf)
     for body in range(len(objects)):
         corners = objects.triangles[objects.first_triangle[body] : objects.first_triangle[body + 1]]
         rays = _passing(corners, origins, directions)
         if rays.size:
             distance = _nearest_of(corners, origins[rays], directions[rays], nearest)
-            found[rays] = np.minimum(found[rays], distance)
-    return found
+            ranges[rays] = np.minimum(ranges[rays], distance)
+    return ranges
 
 
 def _passing(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Rays that pass a body nearer than its farthest corner lies from its middle."""
+    """Rays that intersect the bounding sphere of a body."""
     middle = corners.reshape(-1, 3).mean(axis=0)
     radius = np.linalg.norm(corners - middle, axis=-1).max()
     to_middle = middle - origins
@@ -107,11 +107,11 @@ def _passing(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray) -
 
 
 def _nearest_of(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray, nearest: float) -> np.ndarray:
-    """Solves ``origin + t direction = a + p (b - a) + q (c - a)`` for each ray and triangle by Cramer's rule."""
+    """Solve ``origin + t direction = a + p (b - a) + q (c - a)`` for each ray and triangle by Cramer's rule."""
     a, b, c = (corners[None, :, k] for k in range(3))
     first, second = b - a, c - a
     normal = np.cross(first, second)
-    found = np.empty(len(directions))
+    ranges = np.empty(len(directions))
     size = max(BLOCK // (4 * corners.shape[0]), 1)
     for at in range(0, len(directions), size):
         origin, direction = origins[at : at + size, None], directions[at : at + size, None]
@@ -123,5 +123,5 @@ def _nearest_of(corners: np.ndarray, origins: np.ndarray, directions: np.ndarray
             p = np.sum(second * across, axis=-1) * scale
             q = -np.sum(first * across, axis=-1) * scale
         hit = (p >= -1e-12) & (q >= -1e-12) & (p + q <= 1.0 + 1e-12) & (t > nearest)
-        found[at : at + size] = np.where(hit, t, np.inf).min(axis=1)
-    return found
+        ranges[at : at + size] = np.where(hit, t, np.inf).min(axis=1)
+    return ranges

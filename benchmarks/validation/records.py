@@ -1,4 +1,4 @@
-"""What a check hands back: a claim, its bar and the figure measured."""
+"""Results of checks: claim, bound and measured value."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ class Measure:
     Attributes
     ----------
     claim
-        What is held.
+        Validated property.
     measured, unit
-        The figure, and what it is counted in; "" for a share.
+        Measured value and its unit; "" for a fraction.
     bar, sense
-        The figure that it has to keep to, None where it is reported and not judged; and on which side of it.
+        Bound (None for values without a bound), and whether it is an upper or lower bound.
     how
-        How it was measured, short.
+        Short description of the method.
     """
 
     claim: str
@@ -32,25 +32,25 @@ class Measure:
 
     @property
     def passed(self) -> bool:
-        """Whether the bar is kept; what is not judged is."""
+        """Whether the bound is met; True without a bound."""
         if self.bar is None:
             return True
-        # written so that NaN misses every bar
+        # NaN exceeds every bound
         return self.measured <= self.bar if self.sense == "at most" else self.measured >= self.bar
 
 
 @dataclass(frozen=True)
 class Check:
-    """Measurements made together.
+    """A group of measurements.
 
     Attributes
     ----------
     name
-        What the command line calls it.
+        Name on the command line.
     section
-        Heading in the document under which its rows stand.
+        Heading of its rows in the document.
     run
-        Makes the measurements; its argument selects few samples (with the same bars).
+        Function that yields the measurements; its argument selects fewer samples (with the same bounds).
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The bar on random streams: no two of ten million have the same seed."""
+"""Check of random streams: no two of ten million streams have the same seed."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.sim.streams import stream_key
 
-#: NumPy's `SeedSequence`, whose algorithm is fixed: constants of numpy/random/bit_generator.pyx.
+#: Constants of NumPy's `SeedSequence` (numpy/random/bit_generator.pyx), whose algorithm is fixed.
 _INIT, _MULT, _LEFT, _RIGHT, _SHIFT = 0x43B0D7E5, 0x931E8875, 0xCA01F9DD, 0x4973F715, 16
 _POOL = 4
 _MASK = 2**32 - 1
@@ -19,7 +19,7 @@ CAMPAIGNS, CASES = 25, 20_000
 
 
 class _Hash:
-    """The hash of `SeedSequence` over many sequences at once; its constant changes from call to call."""
+    """Vectorised hash of `SeedSequence`; its constant changes with every call."""
 
     def __init__(self) -> None:
         self._constant = _INIT
@@ -31,40 +31,39 @@ class _Hash:
         return mixed ^ (mixed >> np.uint32(_SHIFT))
 
 
-def _mixed(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _mix(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     result = np.asarray(np.uint32(_LEFT) * x - np.uint32(_RIGHT) * y, dtype=np.uint32)
     return result ^ (result >> np.uint32(_SHIFT))
 
 
 def seeds(words: np.ndarray) -> np.ndarray:
-    """The seeds that NumPy makes of many entropies at once: the pools of `SeedSequence`, 128 bits each.
+    """Compute the 128-bit pools of `SeedSequence` for many entropies.
 
-    What a generator starts from is a bijection of the pool, word by word: two streams start alike only if their pools
-    are equal.
+    The initial state of a generator is a bijection of the pool. Two streams are equal only if their pools are equal.
 
     Parameters
     ----------
     words
-        Entropy, (sequences, words) of uint32: the root seed's, filled up to four, then the spawn key's.
+        Entropy, (sequences, words) of uint32: words of the root seed, padded to four, then of the spawn key.
 
     Returns
     -------
-    (sequences, 2) of uint64.
+    Pools, (sequences, 2) of uint64.
     """
     hashed = _Hash()
     pool = [hashed(words[:, place]) for place in range(_POOL)]
     for source in range(_POOL):
         for target in range(_POOL):
             if source != target:
-                pool[target] = _mixed(pool[target], hashed(pool[source]))
+                pool[target] = _mix(pool[target], hashed(pool[source]))
     for source in range(_POOL, words.shape[1]):
         for target in range(_POOL):
-            pool[target] = _mixed(pool[target], hashed(words[:, source]))
+            pool[target] = _mix(pool[target], hashed(words[:, source]))
     return np.ascontiguousarray(np.stack(pool, axis=1)).view(np.uint64)
 
 
 def stream_words(seed: int, campaign: str, cases: np.ndarray, name: str) -> np.ndarray:
-    """The entropy of one stream of many cases, as `seeds` takes it."""
+    """Entropy of one stream for many cases, in the layout of `seeds`."""
     head = [seed & _MASK, seed >> 32, 0, 0]
     key = list(stream_key(campaign, 0, name))
     words = np.tile(np.array([*head, *key], dtype=np.uint32), (cases.size, 1))
@@ -73,13 +72,13 @@ def stream_words(seed: int, campaign: str, cases: np.ndarray, name: str) -> np.n
 
 
 def stream_names() -> list[str]:
-    """Twenty streams as campaigns have them."""
+    """Names of twenty streams of campaigns."""
     drawn = [f"dispersion:{path}" for path in load_campaign("dimes-gusev").drawn_paths]
     return [*drawn[:14], "altimeter", "detector noise", "gusts", "image clock", "inertial unit", "landing"]
 
 
 def all_seeds(campaigns: int, cases: int, names: Sequence[str]) -> np.ndarray:
-    """The seeds of all streams of so many campaigns: of two names in turn, root seeds counting up, as users do."""
+    """Seeds of all streams of campaigns with two alternating names and increasing root seeds."""
     numbers = np.arange(cases)
     return np.concatenate(
         [
@@ -91,17 +90,17 @@ def all_seeds(campaigns: int, cases: int, names: Sequence[str]) -> np.ndarray:
 
 
 def collisions(found: np.ndarray) -> int:
-    """How many rows are equal to one before them."""
+    """Count rows that are equal to an earlier row."""
     order = np.lexsort((found[:, 1], found[:, 0]))
     return int(np.all(found[order[1:]] == found[order[:-1]], axis=1).sum())
 
 
 def run_streams(quick: bool) -> Iterator[Measure]:
-    """Seeds of neighbouring campaigns, cases and streams."""
+    """Count equal seeds of neighbouring campaigns, cases and streams."""
     names = stream_names()
-    found = all_seeds(CAMPAIGNS // 5 if quick else CAMPAIGNS, CASES // 10 if quick else CASES, names)
-    how = f"{len(found):,} streams: {len(names)} names, cases from 0, root seeds from 0, two campaigns; 128-bit seeds"
-    yield Measure("seeds of two random streams that are equal", collisions(found), "pairs", 0.0, how)
+    results = all_seeds(CAMPAIGNS // 5 if quick else CAMPAIGNS, CASES // 10 if quick else CASES, names)
+    how = f"{len(results):,} streams: {len(names)} names, cases from 0, root seeds from 0, two campaigns; 128-bit seeds"
+    yield Measure("seeds of two random streams that are equal", collisions(results), "pairs", 0.0, how)
 
 
 CHECKS = (Check("streams", "Random streams", run_streams),)

@@ -1,4 +1,4 @@
-"""The scenes and cameras that the checks look at."""
+"""Scenes and cameras of the checks."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from marsyard.sim.terrain.imported import RealTerrain
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 from marsyard.sim.terrain.sites import Site, SiteTexture, site
 
-#: The bank from which the checks take their terrains.
+#: Seed of the terrain bank of the checks.
 SEED = 20
 HAZCAM_LABEL = Path(__file__).parents[3] / "shared/data/mer_opportunity/1F483288473EFFCMUFP1214L0M1.IMG"
-#: The HiRISE tile in Gale: 1 m posts, picture of 0.5 m.
+#: HiRISE tile in Gale: 1 m posts, 0.5 m orthoimage.
 TILE = Path(__file__).parents[3] / "shared/data/gale_hirise/gale_1m_dem_0p5m_ortho.npz"
-#: Where the descents look: anywhere.
+#: Arbitrary position of the descents, metres.
 DESCENT_PLACE = (1000.0, 1200.0)
-#: Where the large rock lies, its size, and how high the mast's camera stands.
+#: Position and size of the large rock, and height of the mast camera.
 ROCK_PLACE, ROCK_DIAMETER_M, MAST_M = (50.0, 50.0), 2.5, 1.6
-#: Ground that is as bright as its albedo, from wherever it is seen.
+#: Lambertian ground without skylight.
 PAINT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0)
 OVERHEAD = Sun(np.array([0.0, 0.0, 1.0]))
 
@@ -38,12 +38,12 @@ def renderer() -> Renderer:
 
 
 def forward(camera: CameraModel) -> CameraModel:
-    """The camera alone, at the body's origin."""
-    return camera.moved(rigid(Rotation.identity(), -np.asarray(camera.c)))
+    """Move the camera to the origin of the body frame."""
+    return camera.transform(rigid(Rotation.identity(), -np.asarray(camera.c)))
 
 
-def made_hazcam() -> Cahvore:
-    """A 124 deg camera like MER's hazcams, its pupil moving by millimetres; for machines without a label of one."""
+def make_hazcam() -> Cahvore:
+    """A 124 deg camera similar to the MER hazcams, with a moving entrance pupil, if no image label is available."""
     pinhole = Cahv.from_focal_length(
         focal_m=5.58e-3,
         pixel_pitch_m=12e-6,
@@ -58,20 +58,20 @@ def made_hazcam() -> Cahvore:
 
 
 def label_hazcam() -> CameraModel | None:
-    """Opportunity's front hazcam from a picture's label, at the origin of body axes that look ahead; None without."""
+    """Opportunity's front hazcam from an image label, at the origin of the body frame; None without the file."""
     if not HAZCAM_LABEL.exists():
         return None
-    # the rover's axes are x forward, y right, z down
+    # rover axes: x forward, y right, z down
     turned = rigid(Rotation.from_matrix(np.diag([1.0, -1.0, -1.0])), np.zeros(3))
-    return forward(read_camera(HAZCAM_LABEL).moved(turned))
+    return forward(read_camera(HAZCAM_LABEL).transform(turned))
 
 
 def cameras() -> dict[str, CameraModel]:
-    """Every type of camera, in body axes."""
+    """All types of cameras, in body axes."""
     made: dict[str, CameraModel | None] = {
         "MER descent camera, CAHVOR, 45 deg": preset("mer-descent-flown").cameras()[0],
         "MER navcam, CAHVOR, 45 deg": forward(preset("mer-navcam").cameras()[0]),
-        "hazcam, CAHVORE, 124 deg": made_hazcam(),
+        "hazcam, CAHVORE, 124 deg": make_hazcam(),
         "Opportunity's hazcam from its label, CAHVORE, 124 deg": label_hazcam(),
         "research pancam, 16 mm": forward(preset("research-pancam").cameras()[0]),
         "Sony XC-55": preset("xc-55").cameras()[0],
@@ -116,7 +116,7 @@ def rocks(
     above_m: float,
     albedo: float,
 ) -> Objects:
-    """The rocks around a place."""
+    """Rocks around a position."""
     if parameters is None:
         return Objects.none()
     field = RockField.on(surface, parameters, np.random.default_rng(SEED))
@@ -125,16 +125,16 @@ def rocks(
 
 
 def tile_view(height_m: float, size: tuple[int, int]) -> View | None:
-    """The middle of the descent camera's picture of the HiRISE tile in Gale with its ortho; None without the data."""
+    """Centre of the descent camera's image of the HiRISE tile in Gale with orthoimage; None without the data."""
     if not TILE.exists():
         return None
-    # its ortho lies about 2 m east and 1 m south of its heights; finer than its 1 m posts the ground is synthetic
+    # the orthoimage is shifted by about 2 m east and 1 m south; detail below the 1 m posts is synthetic
     source = RealTerrain(dtm=TILE, ortho_east_m=2.0, ortho_north_m=-1.0)
     terrain = TerrainParameters(samples=2048, spacing_m=0.25, craters_per_km2=0.0, source=source)
     surface = synthesise(terrain, np.random.default_rng(SEED))
     middle = (0.5 * 2048 * 0.25, 0.5 * 2048 * 0.25)
     whole = preset("mer-descent-flown").cameras()[0]
-    camera = whole.cropped((whole.size[0] - size[0]) // 2, (whole.size[1] - size[1]) // 2, size)
+    camera = whole.crop((whole.size[0] - size[0]) // 2, (whole.size[1] - size[1]) // 2, size)
     scene = Scene(
         surface,
         middle,
@@ -148,10 +148,10 @@ def tile_view(height_m: float, size: tuple[int, int]) -> View | None:
 
 
 def descent_view(name: str, height_m: float, size: tuple[int, int]) -> View:
-    """The middle of the descent camera's picture of a site from a height, tilted a little."""
+    """Centre of the descent camera's image of a site from a height, slightly tilted."""
     where, surface = site(name), descent_surface(name)
     whole = preset("mer-descent-flown").cameras()[0]
-    camera = whole.cropped((whole.size[0] - size[0]) // 2, (whole.size[1] - size[1]) // 2, size)
+    camera = whole.crop((whole.size[0] - size[0]) // 2, (whole.size[1] - size[1]) // 2, size)
     scene = Scene(
         surface,
         DESCENT_PLACE,
@@ -174,10 +174,10 @@ def descent_view(name: str, height_m: float, size: tuple[int, int]) -> View:
 
 
 def rock_view(name: str, distance_m: float, size: tuple[int, int] | None = None) -> View:
-    """A large rock among others, from a mast: `distance_m` from the camera to the rock's near side."""
+    """A large rock among others, from a mast; `distance_m` is the distance from the camera to the rock's near side."""
     where, surface = site(name), ground_surface(name)
     ground = float(surface.height(*ROCK_PLACE))
-    # half its diameter from its centre, seen from above at some angle
+    # the near side is about half a diameter from the centre
     away = np.sqrt(max(distance_m**2 - 0.5 * MAST_M**2, 0.0)) + 0.4 * ROCK_DIAMETER_M
     eye = np.array([ROCK_PLACE[0] - away, ROCK_PLACE[1], ground + MAST_M])
     target = PlacedRock(
@@ -188,7 +188,7 @@ def rock_view(name: str, distance_m: float, size: tuple[int, int] | None = None)
     whole = forward(preset("research-pancam").cameras()[0])
     if size is None:
         size = whole.size
-    camera = whole.cropped((whole.size[0] - size[0]) // 2, (whole.size[1] - size[1]) // 2, size)
+    camera = whole.crop((whole.size[0] - size[0]) // 2, (whole.size[1] - size[1]) // 2, size)
     scene = Scene(
         surface,
         (eye[0], eye[1]),
@@ -207,7 +207,7 @@ def rock_view(name: str, distance_m: float, size: tuple[int, int] | None = None)
 
 
 def ground_view(name: str) -> View:
-    """Ground without rocks, from a mast that looks down by 20 deg."""
+    """Ground without rocks, from a mast camera pitched down by 20 deg."""
     surface, where = ground_surface(name), site(name)
     eye = np.array([*ROCK_PLACE, float(surface.height(*ROCK_PLACE)) + MAST_M])
     scene = Scene(

@@ -1,4 +1,4 @@
-"""A campaign of cases that misbehave in every way, killed and resumed, against an undisturbed one of healthy cases."""
+"""Soak test: a campaign with misbehaving cases, killed and resumed, compared with an undisturbed campaign."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.validation.hostile import DEEDS, HostileParameters, deed
+from benchmarks.validation.hostile import DEEDS, HostileParameters, draw_fault
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.replay import differing_columns
@@ -41,34 +41,34 @@ confidence = 0.9
 population = "all"
 """
 
-#: Variable in the environment of the runner, by which the processes that it starts are found.
+#: Environment variable that marks the processes of the campaign.
 _MARK = "MARSYARD_SOAK"
 
-#: Seconds that the whole may take for each case; it takes a tenth of that where nothing waits for ever.
+#: Maximum time per case, seconds; normally it takes a tenth of this.
 _GUARD_S = 20.0
 
-#: Seconds for processes to go once their runner was killed.
+#: Maximum time until processes of a killed campaign have ended, seconds.
 _GOING_S = 10.0
 
 
 @dataclass(frozen=True)
 class Soak:
-    """What came of a soak.
+    """Result of a soak test.
 
     Attributes
     ----------
     kills
-        How often the runner was killed before it had ended.
+        Number of kills before the end of a run.
     ended
-        Whether the last runner ended by itself.
+        Whether the last run ended by itself.
     seconds
-        That the whole took.
+        Duration of all runs.
     deeds
-        What each case did; empty where it was healthy.
+        Fault of each case; empty for healthy cases.
     wrong_outcomes, changed
-        Cases with another outcome than their deed's; cases that answered with another row than the undisturbed ones.
+        Cases with an unexpected outcome; valid cases whose row differs from the undisturbed campaign.
     processes, files
-        Processes alive, and temporary files there, once the last runner had ended.
+        Remaining processes and temporary files after the last run.
     """
 
     kills: int
@@ -82,16 +82,16 @@ class Soak:
 
 
 def soak(folder: Path, cases: int, kills: int, misbehaving: float, killed_after_s: tuple[float, float]) -> Soak:
-    """Runs the campaign in a folder.
+    """Run the soak test in a folder.
 
     Parameters
     ----------
     folder
-        An empty one.
+        Empty folder.
     cases, misbehaving
-        How many cases, and the fraction of them that misbehave.
+        Number of cases, and fraction of misbehaving cases.
     kills, killed_after_s
-        How often the runner is killed, and after how long: drawn evenly between two times.
+        Number of kills, and minimum and maximum of the uniform time before each kill.
     """
     temporary = folder / "tmp"
     temporary.mkdir()
@@ -99,7 +99,7 @@ def soak(folder: Path, cases: int, kills: int, misbehaving: float, killed_after_
     (folder / "soak.toml").write_text(f"cases = {cases}\n{FILE}")
     healthy = _run(folder, "healthy", 0.0, environment, cases)
     began = time.monotonic()
-    killed = _killed(folder, misbehaving, kills, killed_after_s, environment)
+    killed = _run_with_kills(folder, misbehaving, kills, killed_after_s, environment)
     ended = _run(folder, "soaked", None, environment, cases) == 0 or (folder / "soaked" / "cases.parquet").exists()
     seconds = time.monotonic() - began
     deadline = time.monotonic() + _GOING_S
@@ -108,7 +108,7 @@ def soak(folder: Path, cases: int, kills: int, misbehaving: float, killed_after_
     assert healthy == 0, "the undisturbed campaign failed"
     rows = {name: read_rows(folder / name / "cases.parquet") for name in ("healthy", "soaked")}
     campaign = load_campaign(str(folder / "soak.toml"), [f"misbehaving={misbehaving}"])
-    deeds = tuple(_deed(campaign, case) for case in range(cases))
+    deeds = tuple(_draw_fault(campaign, case) for case in range(cases))
     pairs = list(zip(deeds, rows["soaked"], rows["healthy"], strict=True))
     return Soak(
         kills=killed,
@@ -139,7 +139,7 @@ def _command(folder: Path, name: str, misbehaving: float | None) -> list[str]:
 
 
 def _run(folder: Path, name: str, misbehaving: float | None, environment: Mapping[str, str], cases: int) -> int:
-    """Exit status of a runner that is left alone; it ends with 1 where cases did not come to their end."""
+    """Exit status of an uninterrupted run; 1 if cases did not finish."""
     silent = subprocess.DEVNULL
     command = _command(folder, name, misbehaving)
     return subprocess.run(
@@ -147,10 +147,10 @@ def _run(folder: Path, name: str, misbehaving: float | None, environment: Mappin
     ).returncode
 
 
-def _killed(
+def _run_with_kills(
     folder: Path, misbehaving: float, kills: int, after_s: tuple[float, float], environment: Mapping[str, str]
 ) -> int:
-    """Runs and resumes the campaign, killing each runner; returns how many had not ended by themselves."""
+    """Run and resume the campaign, killing each run; return the number of runs killed before their end."""
     rng = np.random.default_rng(21)
     killed = 0
     for number in range(kills):
@@ -166,37 +166,37 @@ def _killed(
 
 
 def _processes(folder: Path) -> list[int]:
-    """Processes that live and were started by a runner of the soak, or by one of those."""
+    """Ids of living processes that carry the mark of the soak test."""
     mark = f"{_MARK}={folder}".encode()
-    found = []
+    problems = []
     for process in Path("/proc").glob("[1-9]*"):
         with suppress(OSError):
             if mark in (process / "environ").read_bytes():
-                found.append(int(process.name))
-    return found
+                problems.append(int(process.name))
+    return problems
 
 
-def _deed(campaign: Any, case: int) -> str:
+def _draw_fault(campaign: Any, case: int) -> str:
     parameters = campaign.parameters(case)
     assert isinstance(parameters, HostileParameters)
-    return deed(parameters, campaign.streams(case))
+    return draw_fault(parameters, campaign.streams(case))
 
 
 def isolation(quick: bool) -> Iterator[Measure]:
-    """Cases that misbehave in every way among healthy ones; the runner killed three times, and resumed."""
+    """Run the soak test with misbehaving and healthy cases, and compare it with healthy cases."""
     cases, kills, share = (60, 1, 0.4) if quick else (300, 3, 0.4)
     with TemporaryDirectory() as name:
-        found = soak(Path(name), cases, kills, share, (5.0, 40.0))
-    healthy = found.deeds.count("")
-    kinds = len(set(found.deeds)) - 1
-    how = f"{cases} cases, {cases - healthy} of which misbehave in {kinds} ways; killed {found.kills} times"
-    yield Measure("soak: campaigns that did not end by themselves", float(not found.ended), "", 0, how)
-    yield Measure("soak: outcomes that are not those of the deed", len(found.wrong_outcomes), "", 0, how)
-    yield Measure("soak: rows of cases that answered, changed by others", len(found.changed), "", 0, how)
-    yield Measure("soak: processes left", found.processes, "", 0, how)
-    yield Measure("soak: temporary files left", found.files, "", 0, how)
-    yield Measure("soak: time of the campaign", found.seconds, "s", None, how)
-    for text in found.wrong_outcomes:
+        result = soak(Path(name), cases, kills, share, (5.0, 40.0))
+    healthy = result.deeds.count("")
+    kinds = len(set(result.deeds)) - 1
+    how = f"{cases} cases, {cases - healthy} of which misbehave in {kinds} ways; killed {result.kills} times"
+    yield Measure("soak: campaigns that did not end by themselves", float(not result.ended), "", 0, how)
+    yield Measure("soak: outcomes that are not those of the deed", len(result.wrong_outcomes), "", 0, how)
+    yield Measure("soak: rows of cases that answered, changed by others", len(result.changed), "", 0, how)
+    yield Measure("soak: processes left", result.processes, "", 0, how)
+    yield Measure("soak: temporary files left", result.files, "", 0, how)
+    yield Measure("soak: time of the campaign", result.seconds, "s", None, how)
+    for text in result.wrong_outcomes:
         print(text)
 
 

@@ -1,4 +1,4 @@
-"""The bars on statistics: coverage of every interval, error rates of the sequential stop, alarms of the nightly."""
+"""Checks of statistics: coverage of intervals, error rates of sequential stopping, false alarms of nightly runs."""
 
 from __future__ import annotations
 
@@ -11,18 +11,23 @@ from scipy import stats
 from benchmarks.validation.nights import BEFORE, CASES, KINDS, WORSE, planted_found, quiet_nights
 from benchmarks.validation.records import Check, Measure
 from marsyard.reports.history import WINDOW
-from marsyard.reports.statistics.clusters import clustered_evidence
-from marsyard.reports.statistics.proportions import Interval, proportion_lower, proportion_upper
+from marsyard.reports.statistics.proportions import (
+    Interval,
+    clustered_evidence,
+    confidence_at,
+    planned_looks,
+    proportion_lower,
+    proportion_upper,
+)
 from marsyard.reports.statistics.samples import error_ellipse, mean_interval, quantile_bounds, spread_interval
-from marsyard.reports.statistics.sequential import confidence_at, planned_looks
 
 CONFIDENCE = 0.9
-#: Cases on a terrain, and what is asked and risked in simulated campaigns.
+#: Cases per terrain.
 _ON_TERRAIN = 8
 
 
 def _min_coverage(nominal: float, trials: int) -> float:
-    """Bound on a simulated coverage: the nominal one less three standard deviations of the simulation."""
+    """Bound of a simulated coverage: nominal coverage minus three standard deviations of the simulation."""
     return nominal - 3.0 * math.sqrt(nominal * (1.0 - nominal) / trials)
 
 
@@ -45,8 +50,8 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
     for name, draw, mean, spread in draws:
         for what, interval in intervals:
             truth = mean if what == "mean" else spread
-            found = (interval(draw(30), 0.95) for _ in range(trials))
-            covered = _fraction((low <= truth <= high for low, high in found), trials)
+            interval_pairs = (interval(draw(30), 0.95) for _ in range(trials))
+            covered = _fraction((low <= truth <= high for low, high in interval_pairs), trials)
             how = f"{trials} samples of 30; BCa, widened; bar: nominal less three deviations of the simulation"
             yield Measure(
                 f"95 % interval of the {what}, {name}", covered, "", _min_coverage(0.95, trials), how, "at least"
@@ -67,17 +72,12 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
         inside += (along / ellipse.semi_major) ** 2 + (across / ellipse.semi_minor) ** 2 <= 1.0
     how = f"{4 * trials} samples of 20, and one error more each"
     yield Measure(
-        "95 % ellipse holds the next error",
-        inside / (4 * trials),
-        "",
-        _min_coverage(0.95, 4 * trials),
-        how,
-        "at least",
+        "95 % ellipse holds the next error", inside / (4 * trials), "", _min_coverage(0.95, 4 * trials), how, "at least"
     )
 
 
 def _cases(rng: np.random.Generator, rate: float, correlation: float, terrains: int) -> tuple[np.ndarray, np.ndarray]:
-    """Successes on terrains whose own rates are beta distributed."""
+    """Draw successes on terrains with beta-distributed rates."""
     weight = (1.0 - correlation) / correlation
     rates = rng.beta(rate * weight, (1.0 - rate) * weight, terrains)
     terrain = np.repeat(np.arange(terrains), _ON_TERRAIN)
@@ -108,9 +108,9 @@ def run_shared(quick: bool) -> Iterator[Measure]:
     truths = {"mean": 0.0, "standard deviation": 1.0, "95 % quantile": float(stats.norm.ppf(0.95))}
     for correlation in (0.05, 0.3, 0.9):
         for terrains in (12, 60, 250):
-            found = [_covered(*_errors(rng, correlation, terrains), truths) for _ in range(trials)]
+            coverage = [_check_coverage(*_errors(rng, correlation, terrains), truths) for _ in range(trials)]
             for what, nominal in (("mean", 0.95), ("standard deviation", 0.95), ("95 % quantile", CONFIDENCE)):
-                covered = float(np.min(np.mean([one[what] for one in found], axis=0)))
+                covered = float(np.min(np.mean([one[what] for one in coverage], axis=0)))
                 interval = "bounds" if what.endswith("quantile") else "interval"
                 claim = f"{100 * nominal:.0f} % {interval} of the {what}, "
                 claim += f"correlation {correlation}, {terrains} terrains"
@@ -119,14 +119,14 @@ def run_shared(quick: bool) -> Iterator[Measure]:
 
 
 def _errors(rng: np.random.Generator, correlation: float, terrains: int) -> tuple[np.ndarray, np.ndarray]:
-    """Standard normal errors, alike on a terrain, and the terrain of each."""
+    """Draw standard normal errors that are correlated within a terrain, and their terrains."""
     terrain = np.repeat(np.arange(terrains), rng.integers(1, 15, terrains))
     shared, own = rng.normal(size=terrains)[terrain], rng.normal(size=terrain.size)
     return math.sqrt(correlation) * shared + math.sqrt(1.0 - correlation) * own, terrain
 
 
-def _covered(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, float]) -> dict[str, tuple[bool, ...]]:
-    """Whether each interval holds the truth; of the quantile the lower and the upper bound apart."""
+def _check_coverage(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, float]) -> dict[str, tuple[bool, ...]]:
+    """Whether each interval contains the true value; the bounds of the quantile are separate."""
     lower, upper = quantile_bounds(errors, 0.95, CONFIDENCE, terrain)
     covered: dict[str, tuple[bool, ...]] = {
         "95 % quantile": (lower <= truths["95 % quantile"], upper >= truths["95 % quantile"])
@@ -138,12 +138,12 @@ def _covered(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, float]) 
 
 
 def run_sequential(quick: bool) -> Iterator[Measure]:
-    """Error rates of campaigns that stop themselves, at the rate asked, where every verdict is wrong one way."""
+    """Error rates of adaptive campaigns whose true rate equals the required rate, so that every verdict is false."""
     trials = 300 if quick else 2000
     rng = np.random.default_rng(3)
     for asked, max_cases in ((0.9, 512), (0.99, 1000)):
         for correlation in (None, 0.2):
-            wrong = np.mean([_decided(rng, asked, max_cases, correlation) for _ in range(trials)], axis=0)
+            wrong = np.mean([_simulate_decision(rng, asked, max_cases, correlation) for _ in range(trials)], axis=0)
             kind = "independent cases" if correlation is None else f"cases on terrains, correlation {correlation}"
             how = f"{trials} campaigns of up to {max_cases} cases at a true rate of {asked}; Monte Carlo error allowed"
             bar = 1.0 - _min_coverage(CONFIDENCE, trials)
@@ -151,8 +151,10 @@ def run_sequential(quick: bool) -> Iterator[Measure]:
                 yield Measure(f"false {word} of {asked} at 90 %, {kind}", share, "", bar, how)
 
 
-def _decided(rng: np.random.Generator, asked: float, max_cases: int, correlation: float | None) -> tuple[bool, bool]:
-    """Whether the first look at a campaign that decides its requirement finds it met, and whether not met."""
+def _simulate_decision(
+    rng: np.random.Generator, asked: float, max_cases: int, correlation: float | None
+) -> tuple[bool, bool]:
+    """Simulate a campaign; return whether its first deciding look gives PASS, and whether FAIL."""
     if correlation is None:
         success, terrain = rng.random(max_cases) < asked, np.arange(max_cases)
     else:
@@ -173,7 +175,7 @@ def _decided(rng: np.random.Generator, asked: float, max_cases: int, correlation
 
 
 def run_nights(quick: bool) -> Iterator[Measure]:
-    """False alarms of nights in which nothing changed, and regressions found where one was planted."""
+    """False alarms of nights without a change, and detection of planted regressions."""
     in_a_row, planted = (100, 100) if quick else (2000, 1000)
     alarms = quiet_nights(in_a_row, seed=4)
     what = f"three campaigns of {CASES} cases: {', '.join(KINDS)}"

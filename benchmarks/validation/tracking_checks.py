@@ -1,4 +1,4 @@
-"""The bars on target tracking over rendered rocks: drift without noise, and stereo's range error."""
+"""Checks of target tracking on rendered rocks: drift without noise, and range error of stereo."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from marsyard.sim.streams import Streams
 
 SEED = 20061108
 DRIFT_RMS_BAR_PX, DRIFT_WORST_BAR_PX, RANGE_BAR = 1.0, 2.5, 0.15
-#: Fraction of targets that may be lost: 2 of 100 were when it was set, and three deviations of that number are 4 more.
+#: Maximum fraction of lost targets: 2 of 100 measured, plus three standard deviations (4).
 LOST_BAR = 0.06
 CAMERAS = ("research-navcam", "research-pancam")
-#: No detector noise, calibrated cameras and mast as they are.
+#: Parameters without errors of cameras, mast and odometry.
 NO_ERRORS: dict[str, Any] = {
     "stereo": dict.fromkeys(
         ("disparity_error_px", "epipolar_error_px", "alignment_deg", "roll_deg", "focal_error"), 0.0
@@ -43,29 +43,29 @@ def exact(number: int, camera: str) -> RoverScenarioParameters:
     return RoverScenarioParameters.model_validate(
         stated
         | NO_ERRORS
-        # visual odometry without errors sees the slip; it takes no time, so that the sun moves as in the campaign
+        # error-free visual odometry measures the slip; it takes no time, so that the sun moves as in the campaign
         | {"legs": [leg | {"visual_odometry": True}], "timing": stated["timing"] | {"visual_odometry_s": 0.0}}
         | {"camera": stated["camera"] | {"detector_noise": False}}
     )
 
 
 def driven(number: int, camera: str) -> dict[str, Scalar]:
-    """Its row."""
+    """Row of a run without errors."""
     p = exact(number, camera)
     run = run_case(p, Streams(SEED, "validation tracking", number))
     return {**score(p, run), **fixed_conditions(p, run), **run_conditions(p, run)}
 
 
 def drift(quick: bool) -> Iterator[Measure]:
-    """Drift at 2 m of targets that operators would have chosen, designated at 10 m."""
+    """Drift at 2 m of selectable targets (unoccluded and lit) that are designated at 10 m."""
     wanted = 3 if quick else 50
-    found: list[dict[str, Scalar]] = []
+    all_rows: list[dict[str, Scalar]] = []
     for camera in CAMERAS:
         rows = (driven(number, camera) for number in count(1000))
         chosen = list(islice((row for row in rows if row["selectable"]), wanted))
         yield from _drifts(chosen, camera, judged=False)
-        found += chosen
-    yield from _drifts(found, "both cameras", judged=True)
+        all_rows += chosen
+    yield from _drifts(all_rows, "both cameras", judged=True)
 
 
 def _drifts(rows: list[dict[str, Scalar]], name: str, *, judged: bool) -> Iterator[Measure]:
@@ -76,7 +76,7 @@ def _drifts(rows: list[dict[str, Scalar]], name: str, *, judged: bool) -> Iterat
         f"{np.count_nonzero(np.isnan(px))} not tracked to the end"
     )
     if judged:
-        yield _lost(f"targets lost before 2 m: {name}", int(np.isnan(px).sum()), len(px), how)
+        yield _measure_losses(f"targets lost before 2 m: {name}", int(np.isnan(px).sum()), len(px), how)
     tracked = px[~np.isnan(px)]
     rms, worst = float(np.sqrt(np.mean(tracked**2))), float(tracked.max())
     yield Measure(f"drift of the tracked point, rms: {name}", rms, "px", DRIFT_RMS_BAR_PX if judged else None, how)
@@ -85,8 +85,8 @@ def _drifts(rows: list[dict[str, Scalar]], name: str, *, judged: bool) -> Iterat
     )
 
 
-def _lost(claim: str, lost: int, cases: int, how: str) -> Measure:
-    """A row on how many cases a check loses, which its other figures leave out; a single case may always be lost."""
+def _measure_losses(claim: str, lost: int, cases: int, how: str) -> Measure:
+    """Row of the fraction of lost cases, which other figures exclude; one lost case is always allowed."""
     return Measure(claim, lost / cases, "", max(LOST_BAR, 1.0 / cases), how)
 
 
@@ -95,28 +95,31 @@ def _sun_moved_deg(rows: list[dict[str, Scalar]]) -> float:
 
 
 def stereo(quick: bool) -> Iterator[Measure]:
-    """Range error of the first pair at 10 m over Eq. 1's, for the disparity errors that the pairs had."""
+    """Ratio of the range error of the first pair at 10 m to Eq. 1 with the true disparity errors."""
     for camera in CAMERAS:
-        rows = [_designated(number, camera) for number in range(10 if quick else 60)]
+        rows = [_designation_errors(number, camera) for number in range(10 if quick else 60)]
         pairs = [row for row in rows if row is not None]
-        found = [row for row in pairs if np.isfinite(row[0])]
-        errors, expected = np.array(found).reshape(-1, 2).T
+        measured = [row for row in pairs if np.isfinite(row[0])]
+        errors, expected = np.array(measured).reshape(-1, 2).T
         ratio = float(np.sqrt(np.mean(errors**2) / np.mean(expected**2)))
         how = f"first pairs of {len(errors)} runs of vtt-accuracy at rocks of 1.5 m, disparity wrong by 1/3 px rms"
         yield Measure(f"stereo range error at 10 m over Eq. 1, less 1: {camera}", abs(ratio - 1.0), "", RANGE_BAR, how)
         how = f"of {len(pairs)} selectable targets; the row above leaves them out"
-        yield _lost(
-            f"first stereo pairs in which the target is not found: {camera}", len(pairs) - len(found), len(pairs), how
+        yield _measure_losses(
+            f"first stereo pairs in which the target is not found: {camera}",
+            len(pairs) - len(measured),
+            len(pairs),
+            how,
         )
 
 
-def _designated(number: int, camera: str) -> tuple[float, float] | None:
-    """A first pair's range error (NaN where the target is not found) and Eq. 1's for its disparity error, metres.
+def _designation_errors(number: int, camera: str) -> tuple[float, float] | None:
+    """Range error of a first pair (NaN if the target is not found) and its value from Eq. 1, metres.
 
-    None where the target is not one that operators would have chosen.
+    None if the target is not selectable.
     """
     campaign = load_campaign("vtt-accuracy")
-    # the template shows the rock alone: over a small rock's edge it shows the ground a metre behind it too
+    # large rock: the template contains only the rock and no ground behind it
     rock = {"target.diameter_m": 1.5, "target.up": 0.5, "camera.preset": camera, "world.terrain": number % 8}
     drawn = campaign.with_values(campaign.draws(number) | rock)
     p = RoverScenarioParameters.model_validate(drawn.model_dump() | {"legs": [{"motion": "stay", "steps": 1}]})
@@ -129,7 +132,7 @@ def _designated(number: int, camera: str) -> tuple[float, float] | None:
 
 
 def _range_error_m(run: Run) -> float:
-    """The first reported position less the designated point along the line of sight."""
+    """First reported position minus the designated point, along the line of sight."""
     stop = run.stops[0]
     eye = stop.stance.world_from_rover.inv().apply(run.rig.eyes(stop.world_from_head)[0])
     sight = (stop.point_rover - eye) / np.linalg.norm(stop.point_rover - eye)

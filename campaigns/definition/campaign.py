@@ -22,7 +22,7 @@ from marsyard.campaigns.sampling.design import (
 from marsyard.campaigns.sampling.dispersion import Dispersion
 from marsyard.campaigns.sampling.dispersions import Derived, Fixed, Grid, InTurn, Normal
 from marsyard.scenarios.interface import Scenario
-from marsyard.sim.renamed import stream_name
+from marsyard.sim.parameters import stream_name
 from marsyard.sim.streams import Streams
 
 
@@ -74,10 +74,8 @@ class Campaign:
         grid_point, first, size, index = position
         if stated.design.kind == "random":
             streams = self.streams(case)
-            drawn = {
-                path: max(float(streams.generator(f"dispersion:{stream_name(path)}").random()), MIN_DRAW)
-                for path in paths
-            }
+            uniform = {path: streams.generator(f"dispersion:{stream_name(path)}").random() for path in paths}
+            drawn = {path: max(float(number), MIN_DRAW) for path, number in uniform.items()}
             for group in stated.correlations:
                 mixed = correlate_uniform(np.array([drawn[path] for path in group.parameters]), group.factor)
                 drawn.update(zip(group.parameters, mixed.tolist(), strict=True))
@@ -115,11 +113,9 @@ class Campaign:
         needs = {path: one.names for path, one in self.configuration.dispersions.items()}
         done: dict[str, None] = {}
         while len(done) < len(needs):
-            ready = [
-                path for path in needs if path not in done and all(one in done for one in needs[path] if one in needs)
-            ]
+            cycle = [path for path in needs if path not in done]
+            ready = [path for path in cycle if all(one in done for one in needs[path] if one in needs)]
             if not ready:
-                cycle = [path for path in needs if path not in done]
                 raise ValueError(f"formulas depend on one another in a circle: {', '.join(cycle)}")
             done.update(dict.fromkeys(ready))
         return tuple(done)

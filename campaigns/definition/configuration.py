@@ -1,12 +1,14 @@
-"""Contents of a campaign file: scenario, number of cases, parameters, dispersions, requirements, retention, limits."""
+"""Contents of a campaign file: scenario, cases, parameters, dispersions, requirements, limits; former names in it."""
 
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 import types
-from collections.abc import Iterable, Mapping
-from functools import reduce
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial, reduce
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
@@ -15,9 +17,10 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from marsyard.campaigns.errors import ConfigurationError, Problem, near_match
 from marsyard.campaigns.sampling.design import Correlation, Design
 from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, Grid, Normal
+from marsyard.scenarios.interface import Scenario
+from marsyard.scenarios.systems import UnknownScenarioError, row_columns, scenario
 from marsyard.sim.files import check_regular
-from marsyard.sim.parameters import Parameters
-from marsyard.sim.renamed import current_key
+from marsyard.sim.parameters import Parameters, RenamedWarning, current_column, current_key
 
 Model = TypeVar("Model", bound=BaseModel)
 #: A key in nested tables and lists, part by part.
@@ -221,11 +224,11 @@ def read_table(path: Path, model: type[Model]) -> Model:
     try:
         return model.model_validate(read_tables(path))
     except ValidationError as error:
-        problems = [Problem(str(path), key_text(key), message) for key, message in problems_of(error, model)]
+        problems = [Problem(str(path), key_text(key), message) for key, message in validation_problems(error, model)]
         raise ConfigurationError(problems) from error
 
 
-def problems_of(error: ValidationError, model: type[BaseModel]) -> list[tuple[Key, str]]:
+def validation_problems(error: ValidationError, model: type[BaseModel]) -> list[tuple[Key, str]]:
     """Problems of a validation: keys as written in the file, and messages with the allowed values."""
     problems: list[tuple[Key, str]] = []
     for detail in error.errors(include_url=False):
@@ -239,8 +242,8 @@ def problems_of(error: ValidationError, model: type[BaseModel]) -> list[tuple[Ke
         elif detail["type"] == "value_error":
             message = message.removeprefix("Value error, ")
         else:
-            shown = repr(given) if isinstance(given, str | int | float | bool) else type(given).__name__
-            message = f"{message[:1].lower()}{message[1:]}, got {shown}"
+            value_text = repr(given) if isinstance(given, str | int | float | bool) else type(given).__name__
+            message = f"{message[:1].lower()}{message[1:]}, got {value_text}"
         key: Key = ()
         node: Any = model
         for part in location:
@@ -313,3 +316,77 @@ def _list_alternatives(kind: Any) -> list[Any]:
     if origin in (Union, types.UnionType):
         return [inner for choice in get_args(kind) for inner in _list_alternatives(choice)]
     return [kind]
+
+
+_NAME = re.compile(r"[A-Za-z_]\w*(?:\.\w+)*")
+#: Keys of a dispersion whose texts are no formulas.
+_TEXTS = ("distribution", "source", "description", "unit")
+
+
+def use_current_names(tables: Mapping[str, Any], selected: Scenario) -> dict[str, Any]:
+    """Tables of a campaign file with the current names of dispersed parameters and columns; warns of former ones.
+
+    Keys of the parameters themselves are renamed by their model.
+    """
+    path = partial(current_path, selected.parameters_type)
+    column = _column_names(str(tables.get("scenario")))
+    current = dict(tables)
+    dispersions, correlations = tables.get("dispersions"), tables.get("correlations")
+    if isinstance(dispersions, Mapping):
+        current["dispersions"] = {
+            path(name): {key: _replace(value, path) if key not in _TEXTS else value for key, value in stated.items()}
+            if isinstance(stated, Mapping)
+            else stated
+            for name, stated in dispersions.items()
+        }
+    if isinstance(correlations, list):
+        current["correlations"] = [_rename_entries(group, ("parameters",), path) for group in correlations]
+    if isinstance(tables.get("requirements"), list):
+        keys = ("metric", "population")
+        current["requirements"] = [_rename_entries(stated, keys, column) for stated in tables["requirements"]]
+    return current
+
+
+def stored_configuration_now(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Configuration of a stored campaign by the current names, without a warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RenamedWarning)
+        stored = {current_key(key, CampaignConfiguration.model_fields): value for key, value in stored.items()}
+        try:
+            selected = scenario(str(stored.get("scenario")))
+            current = use_current_names(stored, selected)
+            parameters = selected.parameters_type.model_validate(stored.get("parameters", {}))
+        except (UnknownScenarioError, ValidationError, ImportError):
+            return dict(stored)
+        return {**current, "parameters": parameters.model_dump(mode="json", round_trip=True, exclude_unset=True)}
+
+
+def stored_columns_now(names: Iterable[str], scenario_name: str) -> dict[str, str]:
+    """Stored columns with a former name, each with its current one; without a warning."""
+    column = _column_names(scenario_name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RenamedWarning)
+        return {name: current for name in names if (current := column(name)) != name}
+
+
+def _column_names(scenario_name: str) -> Callable[[str], str]:
+    try:
+        columns = row_columns(scenario_name)
+    except ValueError:
+        columns = None
+    if columns is None:
+        return lambda name: name
+    return lambda name: current_column(name, lambda one: columns.has_flag(one) or columns.has_number(one))
+
+
+def _replace(value: Any, rename: Callable[[str], str]) -> Any:
+    """Value with the names in its formulas, or in its list of names, renamed."""
+    if isinstance(value, str):
+        return _NAME.sub(lambda match: rename(match[0]), value)
+    return [_replace(one, rename) for one in value] if isinstance(value, list) else value
+
+
+def _rename_entries(stated: Any, keys: Iterable[str], rename: Callable[[str], str]) -> Any:
+    if not isinstance(stated, Mapping):
+        return stated
+    return {key: _replace(value, rename) if key in keys else value for key, value in stated.items()}

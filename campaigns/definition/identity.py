@@ -24,12 +24,11 @@ from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves
 from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
-from marsyard.scenarios.estimators import algorithm_sources, installed
-from marsyard.scenarios.import_path import import_object, relative_to, source_files
+from marsyard.scenarios.estimators import algorithm_sources, list_installed
 from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
 from marsyard.scenarios.offline import answers_file, is_offline
 from marsyard.scenarios.systems import UnknownScenarioError, scenario, scenario_source
-from marsyard.scenarios.user_files import input_files
+from marsyard.scenarios.user_files import import_object, input_files, relative_to, source_files
 
 #: Packages on whose code rows depend; reports and commands change no row.
 _CODE = ("sim", "algorithms", "scenarios", "campaigns")
@@ -71,7 +70,7 @@ class Identity:
         return [f"{name} ({old}, now {new})" for name, (old, new) in pairs.items() if old != new]
 
 
-def identity_of(configuration: CampaignConfiguration) -> Identity:
+def create_identity(configuration: CampaignConfiguration) -> Identity:
     """Identity of a campaign if it were run now.
 
     Raises CampaignError where a file that the parameters name cannot be used any more.
@@ -109,7 +108,7 @@ def hash_inputs(configuration: CampaignConfiguration) -> dict[str, str]:
 
 def list_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
     """Algorithms under test that a configuration or its dispersions name."""
-    used = _scenario(configuration)
+    used = find_scenario(configuration.scenario)
     if not isinstance(used, HasAlgorithms):
         return ()
     judged, compared = (".".join((*used.algorithm_table, name)) for name in ("algorithm", "compared"))
@@ -121,7 +120,7 @@ def list_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
 
 def list_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
     """Import paths (``module:name``) of the custom parts that a configuration or its dispersions name."""
-    used = _scenario(configuration)
+    used = find_scenario(configuration.scenario)
     if not isinstance(used, HasParts):
         return ()
     trees = [configuration.parameters]
@@ -140,9 +139,10 @@ def list_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
     return tuple(paths)
 
 
-def _scenario(configuration: CampaignConfiguration) -> Scenario | None:
+def find_scenario(name: object) -> Scenario | None:
+    """Scenario of a name; None where it is no name, or unknown."""
     try:
-        return scenario(configuration.scenario)
+        return scenario(name) if isinstance(name, str) and name else None
     except UnknownScenarioError:
         return None
 
@@ -252,7 +252,7 @@ def _describe_custom(spec: str) -> tuple[str, str | None, dict[str, Any]]:
     command = parse_command(spec)
     if command is not None or is_offline(spec):
         return (spec.partition(":")[2] if command is None else command.words[0]), None, {}
-    point = installed().get(spec)
+    point = list_installed().get(spec)
     path, target = (spec, import_object(spec)) if point is None else (point.value, point.load())
     top = path.partition(":")[0].partition(".")[0]
     versions = map(_distribution_version, metadata.packages_distributions().get(top, []))

@@ -17,7 +17,6 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves, value_at
-from marsyard.campaigns.definition.catalogue import catalogue
 from marsyard.campaigns.definition.configuration import (
     POPULATIONS,
     CampaignConfiguration,
@@ -25,19 +24,25 @@ from marsyard.campaigns.definition.configuration import (
     Requirement,
     current_path,
     key_text,
-    problems_of,
     read_tables,
+    use_current_names,
+    validation_problems,
 )
-from marsyard.campaigns.definition.former_names import use_current_names
-from marsyard.campaigns.definition.identity import list_algorithms
+from marsyard.campaigns.definition.identity import find_scenario, list_algorithms
 from marsyard.campaigns.definition.requirements import fill_requirements
-from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
+from marsyard.campaigns.errors import ConfigurationError, Problem, unknown_name_message
 from marsyard.campaigns.sampling.design import MATRICES
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
 from marsyard.scenarios.estimators import labels
 from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
 from marsyard.scenarios.parts.named import SCORE
-from marsyard.scenarios.systems import RowColumns, UnknownScenarioError, row_columns, scenario
+from marsyard.scenarios.systems import RowColumns, UnknownScenarioError, row_columns, scenario, systems
+
+
+def catalogue() -> dict[str, Path]:
+    """The campaign files of all systems, by their campaigns' names in order."""
+    return dict(sorted((name, path) for system in systems() for name, path in system.campaigns.items()))
+
 
 #: Keys of the file that `--set` may name; any other key is one of the parameters.
 _FILE_KEYS = (
@@ -67,7 +72,7 @@ def find_campaign(name_or_path: str) -> Path:
         return path
     files = catalogue()
     if name_or_path not in files:
-        message = f"{not_allowed('campaign', name_or_path, files)}, or the path of a TOML file"
+        message = f"{unknown_name_message('campaign', name_or_path, files)}, or the path of a TOML file"
         raise ConfigurationError([Problem("", "", message)])
     return files[name_or_path]
 
@@ -90,7 +95,7 @@ def load_campaign(
     """
     path = find_campaign(name_or_path)
     tables = read_tables(path)
-    selected = _known_scenario(tables)
+    selected = find_scenario(tables.get("scenario"))
     if selected is not None:
         tables = use_current_names(tables, selected)
     overridden: dict[tuple[str, ...], str] = {}
@@ -131,7 +136,7 @@ def _select_algorithms(
 ) -> dict[str, Any]:
     """Tables with other algorithms; unchanged for an unknown scenario, which is reported later."""
     options = [f"--algorithm {spec}" for spec in algorithms]
-    selected = _known_scenario(tables)
+    selected = find_scenario(tables.get("scenario"))
     if selected is None:
         return tables
     if not isinstance(selected, HasAlgorithms):
@@ -148,20 +153,6 @@ def _select_algorithms(
     return tables
 
 
-def _find_scenario(tables: Mapping[str, Any]) -> Scenario | None:
-    """Scenario of a campaign's tables; None where they name none. Raises UnknownScenarioError."""
-    name = tables.get("scenario")
-    return scenario(name) if isinstance(name, str) and name else None
-
-
-def _known_scenario(tables: Mapping[str, Any]) -> Scenario | None:
-    """Scenario of a campaign's tables; None for an unknown one, which is reported later."""
-    try:
-        return _find_scenario(tables)
-    except UnknownScenarioError:
-        return None
-
-
 def _apply_option(
     tables: Mapping[str, Any], stated: Mapping[str, Any], option: str, overridden: dict[tuple[str, ...], str]
 ) -> dict[str, Any]:
@@ -172,10 +163,9 @@ def _apply_option(
     fixed = [".".join(path[1:]) for path in paths if path[0] == "parameters"]
     dispersions = merged.get("dispersions")
     if isinstance(dispersions, dict):
+        related = ((path, other) for path in dispersions for other in fixed)
         removed = {
-            path
-            for path in dispersions
-            if any(f"{path}.".startswith(f"{other}.") or other.startswith(f"{path}.") for other in fixed)
+            path for path, other in related if f"{path}.".startswith(f"{other}.") or other.startswith(f"{path}.")
         }
         merged["dispersions"] = {path: one for path, one in dispersions.items() if path not in removed}
         if removed and isinstance(merged.get("correlations"), list):
@@ -217,9 +207,9 @@ def _validate(where: str, tables: Mapping[str, Any], overridden: Mapping[tuple[s
     """Campaign of the tables of a file, its parameters completed with their defaults."""
     problems: list[Problem] = []
 
-    def note(found: Iterable[tuple[Key, str]], prefix: Key = ()) -> None:
+    def note(new_problems: Iterable[tuple[Key, str]], prefix: Key = ()) -> None:
         """Note problems at keys, located in the file or in the option of the command line that sets the key."""
-        for key, message in found:
+        for key, message in new_problems:
             key, location = (*prefix, *key), where
             for path, option in overridden.items():
                 shared = min(len(key), len(path))
@@ -228,25 +218,26 @@ def _validate(where: str, tables: Mapping[str, Any], overridden: Mapping[tuple[s
                     break
             problems.append(Problem(location, key_text(key), message))
 
-    def validated(model: type[Model], tables: Mapping[str, Any], prefix: Key = ()) -> Model | None:
+    def validate(model: type[Model], tables: Mapping[str, Any], prefix: Key = ()) -> Model | None:
         try:
             return model.model_validate(tables)
         except ValidationError as error:
-            note(problems_of(error, model), prefix)
+            note(validation_problems(error, model), prefix)
             return None
 
     tables, unresolved = fill_requirements(tables)
     note(unresolved)
     if problems:
         raise ConfigurationError(problems)
-    configuration, selected, parameters = validated(CampaignConfiguration, tables), None, None
+    configuration, selected, parameters = validate(CampaignConfiguration, tables), None, None
     try:
-        selected = _find_scenario(tables)
+        if isinstance(name := tables.get("scenario"), str) and name:
+            selected = scenario(name)
     except UnknownScenarioError as error:
         note([(("scenario",), str(error))])
     stated = tables.get("parameters", {})
     if selected is not None and isinstance(stated, Mapping):
-        parameters = validated(selected.parameters_type, stated, ("parameters",))
+        parameters = validate(selected.parameters_type, stated, ("parameters",))
     if configuration is None or selected is None or parameters is None:
         raise ConfigurationError(problems)
     complete = parameters.model_dump(mode="json", round_trip=True)
@@ -278,9 +269,8 @@ def _check_names(campaign: Campaign) -> list[tuple[Key, str]]:
     dispersions = campaign.configuration.dispersions
     problems: list[tuple[Key, str]] = []
     for path, dispersion in dispersions.items():
-        takes_tables = isinstance(dispersion, Choice | Fixed) or (
-            isinstance(dispersion, Grid) and dispersion.values is not None
-        )
+        listed = not isinstance(dispersion, Grid) or dispersion.values is not None
+        takes_tables = isinstance(dispersion, Choice | Fixed | Grid) and listed
         if path not in parameters and not any(leaf.startswith(f"{path}.") for leaf in parameters):
             problems.append((("dispersions", path), _describe_unknown(path, parameters)))
         elif path not in parameters and not takes_tables:
@@ -312,7 +302,7 @@ def _describe_unknown(path: str, parameters: Iterable[str]) -> str:
         if inside:
             allowed = list(dict.fromkeys(f"{prefix}{head}{'.*' if rest else ''}" for head, rest, _ in inside))
             break
-    return not_allowed("parameter", path, names, allowed)
+    return unknown_name_message("parameter", path, names, allowed)
 
 
 def _check_ranges(campaign: Campaign) -> list[tuple[Key, str]]:
@@ -365,7 +355,7 @@ def _find_refusal(campaign: Campaign, values: Mapping[str, Any]) -> str:
     try:
         campaign.with_values(values)
     except ValidationError as error:
-        problems = problems_of(error, campaign.scenario.parameters_type)
+        problems = validation_problems(error, campaign.scenario.parameters_type)
         return "; ".join(f"{key_text(key)}: {message}" if key else message for key, message in problems)
     return ""
 
@@ -411,7 +401,7 @@ def find_unknown_columns(
         named += [("population", name, FLAGS, (*POPULATIONS, *flags)) for name in requirement.population_columns]
         for key, name, wanted, listed in named:
             if not is_known(name, wanted):
-                problems.append((("requirements", index, key), not_allowed(wanted, name, listed)))
+                problems.append((("requirements", index, key), unknown_name_message(wanted, name, listed)))
     return problems
 
 

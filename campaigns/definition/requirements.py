@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from marsyard.campaigns.definition.configuration import Key, Requirement, read_table
-from marsyard.campaigns.errors import ConfigurationError, Problem, not_allowed
+from marsyard.campaigns.errors import ConfigurationError, Problem, unknown_name_message
 from marsyard.scenarios.systems import systems
 from marsyard.sim.parameters import Parameters
 
@@ -23,10 +23,6 @@ class StatedRequirement(Requirement):
     """A requirement in a file of requirements, with name patterns of the campaigns that verify it."""
 
     campaigns: Annotated[tuple[str, ...], Field(strict=False)] = ()
-
-    def applies_to(self, campaign: str) -> bool:
-        """Whether a campaign of that name verifies it."""
-        return any(fnmatchcase(campaign, pattern) for pattern in self.campaigns)
 
     def plain(self) -> dict[str, Any]:
         """As stated in a campaign."""
@@ -59,19 +55,19 @@ def shipped_requirements() -> Mapping[str, StatedRequirement]:
 @cache
 def _read_shipped() -> tuple[Mapping[str, StatedRequirement], tuple[str, ...]]:
     """Requirements of the systems' files, and the problems of unusable files."""
-    found: dict[str, StatedRequirement] = {}
+    by_id: dict[str, StatedRequirement] = {}
     problems: list[str] = []
     for path in dict.fromkeys(system.requirements for system in systems() if system.requirements):
         try:
-            found = {one.id: one for one in read_requirements(path)} | found
+            by_id = {one.id: one for one in read_requirements(path)} | by_id
         except ConfigurationError as error:
             problems.append(str(error))
-    return found, tuple(problems)
+    return by_id, tuple(problems)
 
 
 def select_applicable(stated: Sequence[StatedRequirement], campaign: str) -> list[dict[str, Any]]:
     """Requirements that a campaign of that name verifies, as campaigns state them."""
-    return [one.plain() for one in stated if one.applies_to(campaign)]
+    return [one.plain() for one in stated if any(fnmatchcase(campaign, pattern) for pattern in one.campaigns)]
 
 
 def fill_requirements(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[tuple[Key, str]]]:
@@ -92,7 +88,7 @@ def fill_requirements(tables: Mapping[str, Any]) -> tuple[dict[str, Any], list[t
         named = shipped.get(str(entry["id"]))
         wrong = [key for key in entry if key not in ("id", *_CHANGEABLE)]
         if named is None:
-            message = "; ".join((not_allowed("requirement", str(entry["id"]), shipped), *unusable))
+            message = "; ".join((unknown_name_message("requirement", str(entry["id"]), shipped), *unusable))
             problems.append((("requirements", index, "id"), f"{message}; or state a metric"))
         problems += [(("requirements", index, key), "is stated in requirements.toml already") for key in wrong]
         if named is not None and not wrong:

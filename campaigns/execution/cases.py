@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
-from marsyard.algorithms.faults import describe_error
+from marsyard.algorithms.answers import describe_error
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, Requirement
+from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, UNFINISHED, CaseEndedError
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.worker_process import Executor, TaskResult, Work, WorkLimits
-from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, UNFINISHED, CaseEndedError
 from marsyard.campaigns.store.products import Keep, PackedProducts, pack_products
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by
@@ -54,11 +54,11 @@ def _load_campaign(configuration: str) -> Campaign:
     """Campaign of a configuration, cached since loading takes time."""
     worker_process.start_clock(grace_s=worker_process.LOADING_S)
     stated = CampaignConfiguration.model_validate_json(configuration)
-    found = scenario(stated.scenario)
+    scenario_class = scenario(stated.scenario)
     worker_process.limit_threads()
     worker_process.accept_process_state()
     worker_process.start_clock()
-    return Campaign(stated, found)
+    return Campaign(stated, scenario_class)
 
 
 def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
@@ -120,9 +120,9 @@ def run_cases(
         completed = []
         for done in ended:
             times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}
-            one = done.result or CompletedCase({**_build_lost_row(done.item, done.error), **times})
-            note = "; ".join(filter(None, (one.note, *_describe_changes(done, noted))))
-            completed.append(replace(one, note=note))
+            case_result = done.result or CompletedCase({**_build_lost_row(done.item, done.error), **times})
+            note = "; ".join(filter(None, (case_result.note, *_describe_changes(done, noted))))
+            completed.append(replace(case_result, note=note))
         yield completed
 
 

@@ -20,10 +20,9 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from marsyard.campaigns.definition.identity import hash_code, read_versions
-from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.errors import CRASHED, CampaignError, CaseEndedError
 from marsyard.campaigns.execution.worker_process import TaskResult, Work
 from marsyard.campaigns.execution.workers import Batches, LocalExecutor
-from marsyard.campaigns.outcomes import CRASHED, CaseEndedError
 
 Result = TypeVar("Result")
 #: Seconds to wait for a scheduler, and for a first worker.
@@ -63,11 +62,11 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
                 raise CampaignError(f"--cluster {address}: no scheduler answers: {error}") from error
             try:
                 self._client.wait_for_workers(1, timeout=_REACH_S)
-                found = self._client.run(_identify_code)
+                identities = self._client.run(_identify_code)
             except TimeoutError as error:
                 raise CampaignError(f"--cluster {address}: the scheduler has no workers") from error
             own_code, own = _identify_code()
-            for worker, (code, versions) in found.items():
+            for worker, (code, versions) in identities.items():
                 if code != own_code:
                     raise CampaignError(f"worker {worker} has other code of Marsyard than this program")
                 differing = sorted(name for name in own if own[name] != versions.get(name))

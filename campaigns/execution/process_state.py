@@ -253,9 +253,9 @@ def generators_were_used(item: int) -> bool:
 def open_files() -> dict[int, FileIdentity]:
     """Descriptors that a worker needs: its output, and the pipes to its parent; without the standard streams."""
     numbers = [int(one.name) for one in Path("/proc/self/fd").glob("*")]
-    found = {number: file_identity(number) for number in numbers if number > 2}
+    identities = {number: file_identity(number) for number in numbers if number > 2}
     # without the listing itself
-    return {number: identity for number, identity in found.items() if identity is not None}
+    return {number: identity for number, identity in identities.items() if identity is not None}
 
 
 def file_identity(number: int) -> FileIdentity:

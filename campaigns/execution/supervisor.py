@@ -122,10 +122,10 @@ def marked_processes(mark: str) -> list[int]:
 
     Finds those that lost their supervisor, but none that was started with another environment.
     """
-    found = []
+    processes = []
     wanted = mark.encode() + b"\0"
     for process in Path("/proc").glob("[1-9]*"):
         with suppress(OSError):
             if wanted in (process / "environ").read_bytes():
-                found.append(int(process.name))
-    return found
+                processes.append(int(process.name))
+    return processes

@@ -16,14 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
-from marsyard.campaigns.execution.process_state import (
-    FileIdentity,
-    ProcessState,
-    file_identity,
-    generators_were_used,
-    open_files,
-    seed_generators,
-)
+from marsyard.campaigns.execution import process_state
 from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, become_supervised
 
 Result = TypeVar("Result")
@@ -158,9 +151,9 @@ class _WorkerContext:
     trace: Path
     output: int
     note: Path
-    files: Mapping[int, FileIdentity]
+    files: Mapping[int, process_state.FileIdentity]
     item: int | None = None
-    state: ProcessState = field(default_factory=ProcessState)
+    state: process_state.ProcessState = field(default_factory=process_state.ProcessState)
     checks_each: bool = False
     crashed: bool = False
 
@@ -193,7 +186,9 @@ def start_worker(parent: int, folder: str) -> None:
     faulthandler.register(DUMP_SIGNAL, written, all_threads=False, chain=False)
     # loky would end workers that grow by 300 MB: cached terrains take more, and the parent enforces limits
     process_executor._USE_PSUTIL = False
-    _context = _WorkerContext(StatusBoard(Path(folder, "board")), trace, output, Path(folder, "note"), open_files())
+    _context = _WorkerContext(
+        StatusBoard(Path(folder, "board")), trace, output, Path(folder, "note"), process_state.open_files()
+    )
     _context.board.write(None, math.inf)
 
 
@@ -208,7 +203,7 @@ def run_batch(task: Callable[[int], Result], items: Sequence[int]) -> BatchResul
     group: list[TaskResult[Result]] = []
     for index, item in enumerate(items):
         if not group:
-            seed_generators(item)
+            process_state.seed_generators(item)
         group.append(_run_item(task, item))
         must_check = _context is not None and (_context.checks_each or _context.crashed)
         if not must_check and index + 1 < len(items) and time.perf_counter() - checked <= _CHECKED_TOGETHER_S:
@@ -230,14 +225,14 @@ def _check_state(group: Sequence[int]) -> tuple[bool, tuple[str, ...] | None]:
     """Whether the process is spent after some items, and the changes; None where it is open which item made them."""
     if _context is None:
         return False, ()
-    if any(file_identity(number) != identity for number, identity in _context.files.items()):
+    if any(process_state.file_identity(number) != identity for number, identity in _context.files.items()):
         # no result can be delivered any more: the status board names the item
         _context.trace.write_text("Fatal: the files that the worker process needs were closed\n")
         os._exit(FILES_CLOSED)
     restored, lasting = _context.state.restore()
     spent = bool(lasting) or _context.crashed
     names = (*restored, *lasting)
-    if len(group) > 1 and (names or generators_were_used(group[0])):
+    if len(group) > 1 and (names or process_state.generators_were_used(group[0])):
         _context.checks_each = True
         return spent, None
     return spent, names
@@ -287,7 +282,7 @@ def accept_process_state() -> None:
     gc.collect()
     gc.freeze()
     if _context is not None:
-        _context.state = ProcessState()
+        _context.state = process_state.ProcessState()
 
 
 def limit_threads() -> None:

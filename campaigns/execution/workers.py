@@ -27,11 +27,10 @@ from joblib.externals.loky import ProcessPoolExecutor
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
 from marsyard.algorithms.processes import descendants, used_memory
-from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CampaignError, CaseEndedError
 from marsyard.campaigns.execution import supervisor, worker_process
 from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, END_SIGNAL, kill, marked_processes
 from marsyard.campaigns.execution.worker_process import BatchResult, Executor, TaskResult, Work, WorkLimits, run_batch
-from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CaseEndedError
 
 Result = TypeVar("Result")
 
@@ -189,7 +188,6 @@ class WatchedWorker:
                 os.kill(self._process.pid, number)
 
     def _kill(self) -> None:
-        """Kill the process and its descendants, and wait for their end."""
         self._signal(END_SIGNAL)
         if self._process is None or self._ends_within(_KILLING_S):
             return
@@ -350,7 +348,6 @@ class _Run:
         return [TaskResult(batch[0], None, error if isinstance(error, Exception) else RuntimeError(repr(error)))]
 
     def _handle_batch_result(self, worker: WatchedWorker, end: BatchResult[Any]) -> list[TaskResult[Any]]:
-        """Results of a delivered batch; a spent worker is replaced."""
         self._again.extend([item] for item in end.alone)
         if end.rest:
             self._again.append(list(end.rest))
@@ -395,7 +392,6 @@ class _Run:
 
 
 def _remove_abandoned_folders() -> None:
-    """Remove the temporary folders of killed executors."""
     for lock in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*/{_LOCK}"):
         with suppress(OSError):
             held = os.open(lock, os.O_RDWR)
@@ -412,8 +408,8 @@ def free_memory() -> float:
         text = Path("/proc/meminfo").read_text()
     except OSError:
         return math.inf
-    found = re.search(r"^MemAvailable:\s+(\d+) kB", text, re.MULTILINE)
-    return float(found[1]) * 1024.0 if found else math.inf
+    match = re.search(r"^MemAvailable:\s+(\d+) kB", text, re.MULTILINE)
+    return float(match[1]) * 1024.0 if match else math.inf
 
 
 @dataclass(frozen=True)

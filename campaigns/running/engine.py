@@ -14,13 +14,12 @@ from pydantic import ValidationError
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, key_text
-from marsyard.campaigns.definition.identity import Identity, describe_algorithms, identity_of
+from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
 from marsyard.campaigns.definition.loading import NUMBERS, find_unknown_columns
-from marsyard.campaigns.errors import CampaignError, ConfigurationError, Problem, StoreError
+from marsyard.campaigns.errors import RETRYABLE, UNFINISHED, CampaignError, ConfigurationError, Problem, StoreError
 from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
 from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
-from marsyard.campaigns.outcomes import RETRYABLE, UNFINISHED
 from marsyard.campaigns.running.preparation import plan_inputs, report_compilation
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_with
 from marsyard.campaigns.store import record
@@ -50,7 +49,6 @@ class _Run:
     campaign: Campaign
     directory: Path
     executor: ExecutorConfig
-    store: RowStore
     watch: Watch
 
 
@@ -64,13 +62,13 @@ def run_campaign(campaign: Campaign, directory: Path, executor: ExecutorConfig, 
     record.claim(directory)
     with folder_lock(directory):
         record.claim(directory)
-        identity = identity_of(campaign.configuration)
+        identity = create_identity(campaign.configuration)
         algorithms = describe_algorithms(campaign)
         create_store(directory / ROWS_FILE, {"identity": identity.configuration})
         words, stated = campaign.command, campaign.configuration
         record.begin(directory, stated, identity, executor.describe(), command=words, algorithms=algorithms)
         with RowStore(directory / ROWS_FILE) as store:
-            _execute(_Run(campaign, directory, executor, store, watch), ())
+            _execute(_Run(campaign, directory, executor, watch), store, ())
 
 
 def resume_campaign(
@@ -99,7 +97,7 @@ def resume_campaign(
                 raise CampaignError(f"--case-time {case_time_s}: {error.errors()[0]['msg'].lower()}") from error
             configuration = configuration.model_copy(update={"limits": limits})
         campaign = load_stored_campaign(directory, configuration)
-        _continue_campaign(campaign, directory, executor, watch, "resume", retry=retry, allow_changed=allow_changed)
+        _continue_campaign(_Run(campaign, directory, executor, watch), "resume", allow_changed, retry)
 
 
 def append_cases(
@@ -115,7 +113,7 @@ def append_cases(
         if state != "finished":
             raise CampaignError(f"{directory} is not finished ({state}): marsyard resume {directory}")
         campaign = campaign_with_block(directory, cases)
-        _continue_campaign(campaign, directory, executor, watch, "append", allow_changed=allow_changed)
+        _continue_campaign(_Run(campaign, directory, executor, watch), "append", allow_changed)
 
 
 def campaign_with_block(directory: Path, cases: int) -> Campaign:
@@ -128,23 +126,14 @@ def campaign_with_block(directory: Path, cases: int) -> Campaign:
     return load_stored_campaign(directory, appended)
 
 
-def _continue_campaign(
-    campaign: Campaign,
-    directory: Path,
-    executor: ExecutorConfig,
-    watch: Watch,
-    command: str,
-    *,
-    retry: Sequence[str] = (),
-    allow_changed: bool,
-) -> None:
+def _continue_campaign(run: _Run, command: str, allow_changed: bool, retry: Sequence[str] = ()) -> None:
     """Run the missing cases of a stored campaign, and those to be retried."""
+    campaign, directory, watch = run.campaign, run.directory, run.watch
     configuration, stored = campaign.configuration, record.read(directory)
     if "identity" not in stored:
-        raise StoreError(
-            f"{directory} was run by an earlier version, which stored no rows to continue from; run it again"
-        )
-    before, identity = Identity.read(stored["identity"]), identity_of(configuration)
+        what = "was run by an earlier version, which stored no rows to continue from"
+        raise StoreError(f"{directory} {what}; run it again")
+    before, identity = Identity.read(stored["identity"]), create_identity(configuration)
     changes = before.differences(identity)
     if changes and not allow_changed:
         listed = "\n  ".join(changes)
@@ -164,7 +153,7 @@ def _continue_campaign(
         if not again and ended and not store.missing(configuration.total_cases):
             watch.note(f"the campaign is finished: all {count} cases have rows; nothing is run")
             return
-        session = record.describe_session(command, executor.describe(), count)
+        session = record.describe_session(command, run.executor.describe(), count)
         updates: dict[str, Any] = {"state": "running", "exit_code": None, "finished_utc": None}
         updates["sessions"] = [*stored["sessions"], session]
         if changes:
@@ -178,26 +167,26 @@ def _continue_campaign(
         if any(old.get(key) != new[key] for key in ("machine", "processor", "processor_features")):
             name = f"the campaign began on another processor ({old.get('processor')})"
             watch.note(f"{name}: rows may differ from its rows in their last bits")
-        _execute(_Run(campaign, directory, executor, store, watch), again)
+        _execute(run, store, again)
 
 
-def _execute(run: _Run, again: Sequence[int]) -> None:
+def _execute(run: _Run, store: RowStore, again: Sequence[int]) -> None:
     """Run the missing cases and those of `again`; write the table, keep products, and record the progress."""
     configuration, table = run.campaign.configuration, run.directory / TABLE_FILE
 
     def record_end(state: str) -> None:
-        progress = {"cases_finished": run.store.count(), "cases_crashed": run.store.unfinished()}
+        progress = {"cases_finished": store.count(), "cases_crashed": store.count_unfinished()}
         record.update(run.directory, {"state": state, "finished_utc": record.utc_now(), **progress})
 
     try:
         with create_executor(run.executor) as executor:
-            missing = run.store.missing(configuration.total_cases)
+            missing = store.missing(configuration.total_cases)
             if missing or again:
                 with report_compilation(configuration.scenario, run.watch.note) as first_case_ended:
                     _prepare_inputs(run, executor, itertools.chain(*missing, again))
-                    _run_cases(run, executor, [*missing, again], first_case_ended)
-            write_table(table, run.store, [one.metric for one in configuration.requirements if one.bound is not None])
-            _keep_worst(run, executor)
+                    _run_cases(run, store, executor, [*missing, again], first_case_ended)
+            write_table(table, store, [one.metric for one in configuration.requirements if one.bound is not None])
+            _keep_worst(run, store, executor)
     except BaseException:
         # on a full disk the record keeps the state "running", and the released lock shows that no process runs
         with suppress(StoreError):
@@ -212,10 +201,9 @@ def _prepare_inputs(run: _Run, executor: Executor, cases: Iterable[int]) -> None
     plan = plan_inputs(run.campaign, cases)
     inputs = plan.to_prepare
     if plan.build_bytes > plan.limit_bytes:
-        watch.note(
-            f"the terrains to be built take {plan.build_bytes / 1e9:.1f} GB, more than the cache may "
-            f"({plan.limit_bytes / 1e9:.1f} GB): some are built more than once; MARSYARD_CACHE_GB sets the limit"
-        )
+        sizes = f"{plan.build_bytes / 1e9:.1f} GB, more than the cache may ({plan.limit_bytes / 1e9:.1f} GB)"
+        advice = "some are built more than once; MARSYARD_CACHE_GB sets the limit"
+        watch.note(f"the terrains to be built take {sizes}: {advice}")
     if not inputs:
         return
     watch.begin("preparing", len(inputs))
@@ -231,7 +219,7 @@ def _prepare_inputs(run: _Run, executor: Executor, cases: Iterable[int]) -> None
 
 
 def _run_cases(
-    run: _Run, executor: Executor, parts: Sequence[Sequence[int]], first_case_ended: Callable[[], None]
+    run: _Run, store: RowStore, executor: Executor, parts: Sequence[Sequence[int]], first_case_ended: Callable[[], None]
 ) -> None:
     """Run cases; store products before their rows, and the rows of one batch in one transaction."""
     configuration, watch = run.campaign.configuration, run.watch
@@ -243,7 +231,7 @@ def _run_cases(
     for ended in run_cases(executor, configuration, cases, keep=select_kept_cases(configuration), total=total):
         for completed in ended:
             _keep_products(products, completed, watch)
-        run.store.add(completed.row for completed in ended)
+        store.add(completed.row for completed in ended)
         finished = next((one.row for one in ended if one.row["outcome"] not in UNFINISHED), None)
         if not checked and finished is not None:
             check_metrics(configuration, finished, run.directory)
@@ -280,17 +268,17 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
         absent = name not in row and (stated.has_flag(name) or stated.has_number(name))
         return absent or name in (numbers if kind == NUMBERS else flags)
 
-    found = find_unknown_columns(configuration.requirements, flags, numbers, is_known)
-    problems = [Problem(configuration.name, key_text(key), message) for key, message in found]
+    unknown_columns = find_unknown_columns(configuration.requirements, flags, numbers, is_known)
+    problems = [Problem(configuration.name, key_text(key), message) for key, message in unknown_columns]
     if problems:
         stopped = Problem(str(directory), "", "the campaign was stopped; the rows so far are kept")
         raise ConfigurationError([*problems, stopped])
 
 
-def _keep_worst(run: _Run, executor: Executor) -> None:
+def _keep_worst(run: _Run, store: RowStore, executor: Executor) -> None:
     """Run the showcase, and the worst cases where they are kept, again for their products."""
     configuration, table = run.campaign.configuration, run.directory / TABLE_FILE
-    showcase = find_showcase(configuration, table, run.store)
+    showcase = find_showcase(configuration, table, store)
     cases = [] if showcase is None else [showcase]
     if configuration.retain.products == "worst":
         cases += find_worst_cases(configuration, table, configuration.retain.worst)
@@ -300,7 +288,7 @@ def _keep_worst(run: _Run, executor: Executor) -> None:
     run.watch.begin("showcase", len(cases))
     products = ProductStore(run.directory, configuration.retain.budget_gb)
     for case in cases:
-        replayed = replay_with(executor, configuration, case, run.store.row(case))
+        replayed = replay_with(executor, configuration, case, store.row(case))
         if replayed.differing:
             record.update(run.directory, {"showcase_differs": list(replayed.differing)})
             run.watch.note(f"case {case} run again came out differently in: {', '.join(replayed.differing)}")

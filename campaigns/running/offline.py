@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.campaign import Campaign, replace_value
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
 from marsyard.campaigns.definition.identity import configuration_hash
-from marsyard.campaigns.errors import CampaignError, StoreError, writing
+from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import Watch, resume_campaign, run_campaign
 from marsyard.campaigns.store import record
@@ -30,38 +29,29 @@ MANIFEST_FILE, README_FILE = "export.json", "README.md"
 SCHEMA = 1
 
 
-@dataclass(frozen=True)
-class Exported:
-    """Folders of exported cases and of their truth."""
-
-    directory: Path
-    truth: Path
-
-
 def truth_folder(directory: Path) -> Path:
     """Default folder of the truth: next to the exported folder."""
     return directory.with_name(f"{directory.name}-truth")
 
 
-def export_campaign(campaign: Campaign, exported: Exported, executor: ExecutorConfig, watch: Watch) -> None:
+def export_campaign(campaign: Campaign, directory: Path, truth: Path, executor: ExecutorConfig, watch: Watch) -> None:
     """Export a campaign's cases; continue where an earlier export of the same campaign was interrupted.
 
     The campaign's algorithm is `export:` with the folder. Raises CampaignError where the folders hold other contents,
     or cannot be written.
     """
-    if exported.truth.resolve().is_relative_to(exported.directory.resolve()):
-        raise CampaignError(f"--truth {exported.truth}: lies within {exported.directory}, which is handed away")
-    if (exported.truth / record.RECORD_FILE).is_file():
-        stored = record.stored_configuration(exported.truth)
+    if truth.resolve().is_relative_to(directory.resolve()):
+        raise CampaignError(f"--truth {truth}: lies within {directory}, which is handed away")
+    if (truth / record.RECORD_FILE).is_file():
+        stored = record.stored_configuration(truth)
         if configuration_hash(stored) != configuration_hash(campaign.configuration):
-            raise StoreError(f"{exported.truth} holds the truth of another export; choose other folders")
-        resume_campaign(exported.truth, executor, watch)
+            raise StoreError(f"{truth} holds the truth of another export; choose other folders")
+        resume_campaign(truth, executor, watch)
     else:
-        directory = exported.directory
         if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
             raise StoreError(f"{directory} is there already, and is not empty; name a new folder with --out")
-        run_campaign(campaign, exported.truth, executor, watch)
-    _write_manifest(campaign, exported.directory)
+        run_campaign(campaign, truth, executor, watch)
+    _write_manifest(campaign, directory)
 
 
 def _write_manifest(campaign: Campaign, directory: Path) -> None:
@@ -83,17 +73,17 @@ outcome and no numbers; outcomes: {", ".join(form.outcomes.__members__) if form 
 """
     if form and form.note:
         text += f"{form.note}\n"
-    with writing(directory):
+    with report_write_errors(directory):
         (directory / MANIFEST_FILE).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
         (directory / README_FILE).write_text(text, encoding="utf-8")
 
 
-def scored_campaign(exported: Exported, answers: Path) -> Campaign:
+def scored_campaign(directory: Path, truth: Path, answers: Path) -> Campaign:
     """Exported campaign with the answers of a table in place of its algorithm.
 
     Raises CampaignError where the folders hold no finished export, or the table does not answer each case once.
     """
-    path = exported.directory / MANIFEST_FILE
+    path = directory / MANIFEST_FILE
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
         if manifest["schema"] != SCHEMA:
@@ -101,14 +91,14 @@ def scored_campaign(exported: Exported, answers: Path) -> Campaign:
         stated = str(manifest["campaign"]), int(manifest["cases"])
     except OSError as error:
         reason = f"{path.name}: {error.strerror or error}"
-        raise StoreError(f"{exported.directory} holds no finished export: {reason}") from error
+        raise StoreError(f"{directory} holds no finished export: {reason}") from error
     except (KeyError, TypeError, ValueError) as error:
         raise StoreError(f"{path} is damaged: {error}") from error
-    stored = record.stored_configuration(exported.truth)
-    if record.read(exported.truth)["state"] != "finished":
-        raise CampaignError(f"{exported.truth} is not finished: export again to continue")
+    stored = record.stored_configuration(truth)
+    if record.read(truth)["state"] != "finished":
+        raise CampaignError(f"{truth} is not finished: export again to continue")
     if stated != (stored.name, stored.total_cases):
-        raise CampaignError(f"{exported.directory} and {exported.truth} belong to different exports")
+        raise CampaignError(f"{directory} and {truth} belong to different exports")
     exporting = Campaign(stored, scenario(stored.scenario))
     _check_answers(_find_task(exporting), stored, answers)
     table = exporting.scenario.algorithm_table if isinstance(exporting.scenario, HasAlgorithms) else ()
@@ -118,23 +108,22 @@ def scored_campaign(exported: Exported, answers: Path) -> Campaign:
 
 
 def _check_answers(task: Task[Any, Any], configuration: CampaignConfiguration, answers: Path) -> None:
-    """Refuse a table that cannot be read, lacks cases or has unknown ones."""
     if task.offline is None:
         raise CampaignError(f"{configuration.name} cannot be answered in a table")
     try:
-        found = read_answers(answers, task.offline)
+        answer = read_answers(answers, task.offline)
     except ValueError as error:
         raise CampaignError(str(error)) from error
     total = configuration.total_cases
-    unknown = sorted(case for case in found if case >= total)
+    unknown = sorted(case for case in answer if case >= total)
     if unknown:
         raise CampaignError(f"{answers}: there is no case {_list_first(unknown)}; allowed: 0 to {total - 1}")
-    missing = [case for case in range(total) if case not in found]
+    missing = [case for case in range(total) if case not in answer]
     if missing:
         failures = list(task.offline.outcomes.__members__)[1:]
+        advice = f"a case without one is stated with its outcome, such as {failures[0]}"
         raise CampaignError(
-            f"{answers}: no answer to {len(missing)} of {total} cases: {_list_first(missing)}; "
-            f"a case without one is stated with its outcome, such as {failures[0]}"
+            f"{answers}: no answer to {len(missing)} of {total} cases: {_list_first(missing)}; {advice}"
         )
 
 

@@ -12,15 +12,14 @@ from dataclasses import dataclass
 from functools import partial
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.errors import UNFINISHED, CampaignError
 from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
 from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
-from marsyard.campaigns.outcomes import UNFINISHED
 from marsyard.campaigns.store.products import KEEP_ALL
 from marsyard.scenarios.interface import SelectsInputs
 from marsyard.scenarios.systems import scenario_paths
-from marsyard.sim.cache import cache_directory, kept_bytes, limit_bytes
+from marsyard.sim.cache import cache_directory, cached_bytes, limit_bytes
 from marsyard.sim.kernel_cache import count_compiled_functions, kernels_are_ready
 
 #: Seconds between two reports on compilation.
@@ -78,7 +77,7 @@ def plan_inputs(campaign: Campaign, cases: Iterable[int]) -> InputPlan:
     selects = isinstance(scenario, SelectsInputs)
     try:
         folder = cache_directory("terrain")
-        limit = limit_bytes(folder, kept_bytes(folder))
+        limit = limit_bytes(folder, cached_bytes(folder))
         sizes = {n: scenario.missing_bytes(base, n) if isinstance(scenario, SelectsInputs) else 0 for n in numbers}
     except OSError as error:
         raise CampaignError(f"the cache cannot be used: {error}") from error

@@ -1,24 +1,33 @@
-"""Stored campaigns loaded again, and single cases of them run again and compared with their stored rows."""
+"""Stored campaigns loaded again, single cases compared with their stored rows, and checks of an algorithm."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, key_text, problems_of
-from marsyard.campaigns.definition.identity import Identity, identity_of
-from marsyard.campaigns.errors import CampaignError, ConfigurationError, Problem
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, key_text, validation_problems
+from marsyard.campaigns.definition.identity import Identity, create_identity
+from marsyard.campaigns.errors import UNFINISHED, CampaignError, CaseEndedError, ConfigurationError, Problem
 from marsyard.campaigns.execution.cases import run_cases
-from marsyard.campaigns.execution.worker_process import Executor
+from marsyard.campaigns.execution.worker_process import (
+    LOADING_S,
+    Executor,
+    Work,
+    WorkLimits,
+    accept_process_state,
+    start_clock,
+)
 from marsyard.campaigns.execution.workers import LocalExecutor
-from marsyard.campaigns.outcomes import UNFINISHED
 from marsyard.campaigns.store.products import KEEP_ALL, PackedProducts
 from marsyard.campaigns.store.record import read, stored_configuration
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.store.table import stored_row
+from marsyard.scenarios import conformance as suite
 from marsyard.scenarios.systems import UnknownScenarioError, scenario
 
 
@@ -60,7 +69,7 @@ def replay(directory: Path, case: int) -> Replay:
     load_stored_campaign(directory, configuration)
     stored = stored_row(directory, case)
     identity = read(directory).get("identity")
-    changed = Identity.read(identity).differences(identity_of(configuration)) if identity else []
+    changed = Identity.read(identity).differences(create_identity(configuration)) if identity else []
     with LocalExecutor(1) as workers:
         return replay_with(workers, configuration, case, stored, tuple(changed))
 
@@ -104,11 +113,62 @@ def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) 
     except (UnknownScenarioError, ValidationError) as error:
         problems = [("scenario", str(error))]
         if isinstance(error, ValidationError):
-            found = problems_of(error, campaign.scenario.parameters_type)
-            problems = [(key_text(("parameters", *key)), message) for key, message in found]
-        hint = (
-            "modules of your own are searched for in the current folder: start the command where the campaign was run"
-        )
-        problems.append(("", f"nothing was run or changed; {hint}"))
+            errors = validation_problems(error, campaign.scenario.parameters_type)
+            problems = [(key_text(("parameters", *key)), message) for key, message in errors]
+        hint = "modules of your own are searched for in the current folder"
+        problems.append(("", f"nothing was run or changed; {hint}: start the command where the campaign was run"))
         raise ConfigurationError([Problem(str(directory), *problem) for problem in problems]) from error
     return campaign
+
+
+#: Limits of output and memory of a check.
+_OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
+
+
+def create_subject(spec: str, task: str | None, limit_s: float) -> suite.Subject:
+    """Algorithm or part of a name, for a stated task, or the task that it states itself.
+
+    Raises CampaignError where the name or the task is unknown.
+    """
+    if task is not None and task not in suite.SUBJECT_KINDS:
+        raise CampaignError(f"--task {task}: unknown; allowed: {', '.join(suite.SUBJECT_KINDS)}")
+    try:
+        chosen = suite.determine_task(spec) if task is None else task
+        suite.check_subject(spec, chosen)
+    except ValueError as error:
+        raise CampaignError(str(error)) from error
+    return suite.Subject(spec, chosen, limit_s)
+
+
+def examine(subject: suite.Subject) -> Iterator[suite.Finding]:
+    """Run all checks in order; only the first, the ordinary case, if its worker process ends."""
+    # the time limit of an answer, and as much again for the rest of the check
+    limits = WorkLimits(2.0 * subject.limit_s + 5.0, _MEMORY_BYTES, _OUTPUT_BYTES)
+    with LocalExecutor(1) as workers:
+        for number, (name, asked) in enumerate(suite.check_names(subject)):
+            ((done,),) = workers.run(Work(partial(_run_check, subject), [number], limits))
+            finding, error = done.result, done.error
+            if finding is None and isinstance(error, CaseEndedError):
+                where = [line.strip() for line in error.trace.splitlines() if line.strip().startswith("File ")][:1]
+                problem = f"{error.outcome}: {error}{f' ({where[0]})' if where else ''}"
+                advice = "no picture may make it hang, end its process or take all memory"
+                finding = suite.Finding(name, asked, problem, advice)
+            elif finding is None:
+                problem = f"{type(error).__name__}: {error}"
+                finding = suite.Finding(name, asked, problem, "this is a defect of the suite or of the answer's types")
+            elif finding.passed and done.changed:
+                problem = f"it changed the state of its process: {'; '.join(done.changed)}"
+                advice = "set it back before returning, and end every thread and child process"
+                finding = replace(finding, problem=problem, next_step=f"{advice}: a case must leave no trace")
+            yield finding
+            if number == 0 and isinstance(error, CaseEndedError):
+                return
+
+
+def _run_check(subject: suite.Subject, number: int) -> suite.Finding:
+    """Run one check in a worker; its clock starts once everything is loaded, and again with every question."""
+    start_clock(grace_s=LOADING_S)
+    subject.prepare()
+    accept_process_state()
+    start_clock()
+    return suite.run_check(subject, number)

@@ -210,10 +210,8 @@ class Correlation(Parameters):
         normals = self.normal_correlation
         smallest = float(np.linalg.eigvalsh(normals)[0]) if np.isfinite(normals).all() else float("nan")
         if not smallest > _MIN_EIGENVALUE:
-            raise ValueError(
-                f"{self.kind} is not valid for a group: the normals' correlation is not positive definite, "
-                f"with the smallest eigenvalue {smallest:.3g}"
-            )
+            reason = "the normals' correlation is not positive definite, with the smallest eigenvalue"
+            raise ValueError(f"{self.kind} is not valid for a group: {reason} {smallest:.3g}")
         return self
 
     @property

@@ -1,14 +1,16 @@
-"""Base class of the dispersions, types of their fields, and quantiles of truncated distributions.
+"""Base class of the dispersions, types of their fields, formulas, and quantiles of truncated distributions.
 
 A dispersion is a parameter's distribution over the cases, as an inverse distribution function. It maps one uniform
 number to a value. The values of a case therefore depend on one number per dispersion, whether these numbers are
 independent, correlated or stratified. Numbers of a distribution may be formulas
-(`marsyard.campaigns.sampling.formulas`) of other parameters; `Dispersion.insert_values` inserts the values of a case.
+(`marsyard.campaigns.sampling.dispersion`) of other parameters; `Dispersion.insert_values` inserts the values of a case.
 """
 
 from __future__ import annotations
 
+import ast
 import math
+import operator
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -21,8 +23,126 @@ from pydantic import Field, PlainValidator
 from pydantic_core import PydanticKnownError
 from scipy.special import ndtr, ndtri
 
-from marsyard.campaigns.sampling.formulas import Formula, formula
+from marsyard.campaigns.errors import near_match
 from marsyard.sim.parameters import Parameters
+
+#: Maximum number of characters.
+MAX_LENGTH = 300
+_BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: math.pow,  # no complex numbers, no integers of a million digits
+}
+_UNARY: Mapping[type[ast.unaryop], Callable[[float], float]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
+#: Functions by name, with the minimum and maximum number of arguments.
+_FUNCTIONS: Mapping[str, tuple[Callable[..., float], int, int]] = {
+    **{name: (getattr(math, name), 1, 1) for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos")},
+    **{name: (getattr(math, name), 1, 1) for name in ("atan", "radians", "degrees", "floor", "ceil")},
+    "abs": (abs, 1, 1),
+    "atan2": (math.atan2, 2, 2),
+    "hypot": (math.hypot, 2, 8),
+    "min": (min, 2, 8),
+    "max": (max, 2, 8),
+}
+_CONSTANTS: Mapping[str, float] = {"pi": math.pi}
+
+
+@dataclass(frozen=True)
+class Formula:
+    """Text of a formula, and the paths of the parameters that it names, each once."""
+
+    text: str
+    names: tuple[str, ...]
+    _root: ast.expr
+
+    def value(self, values: Mapping[str, Any]) -> float:
+        """Evaluate the formula for parameter values by dotted path.
+
+        Raises ValueError where a parameter is not a number, or the result is not finite.
+        """
+        numbers: dict[str, float] = {}
+        for name in self.names:
+            value = values[name]
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise ValueError(f"'{self.text}' uses {name}, which is {value!r} and not a number")
+            numbers[name] = float(value)
+        given = ", ".join(f"{name} = {value:.6g}" for name, value in numbers.items())
+        failure = f"'{self.text}' has no value{' where ' if given else ''}{given}"
+        try:
+            result = float(_evaluate(self._root, numbers))
+        except (ArithmeticError, ValueError) as error:
+            raise ValueError(f"{failure}: {error}") from error
+        if not math.isfinite(result):
+            raise ValueError(f"{failure}: it comes to {result}")
+        return result
+
+
+@lru_cache(maxsize=1024)
+def formula(text: str) -> Formula:
+    """Parse a formula. Raises ValueError where its text is not one."""
+    if len(text) > MAX_LENGTH:
+        raise ValueError(f"a formula has at most {MAX_LENGTH} characters, not {len(text)}")
+    try:
+        with warnings.catch_warnings():  # the parser warns of unusual texts
+            warnings.simplefilter("ignore")
+            root = ast.parse(text.strip(), mode="eval").body
+        names = dict.fromkeys(_list_names(root))
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        reason = error.msg if isinstance(error, SyntaxError) else str(error)
+        raise ValueError(f"'{text}' is neither a number nor a formula: {reason}") from None
+    return Formula(text, tuple(names), root)
+
+
+def _list_names(node: ast.expr) -> list[str]:
+    """Paths of the parameters below a node. Raises ValueError for syntax that formulas do not have."""
+    match node:
+        case ast.Constant(value=value) if type(value) in (int, float):
+            return []
+        case ast.Name() | ast.Attribute() | ast.Subscript():
+            path = _format_path(node)
+            return [] if path in _CONSTANTS else [path]
+        case ast.UnaryOp(op=op, operand=inner) if type(op) in _UNARY:
+            return _list_names(inner)
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in _BINARY:
+            return _list_names(left) + _list_names(right)
+        case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
+            _, minimum, maximum = _FUNCTIONS.get(name, (None, 0, 0))
+            if not maximum:
+                known = sorted(_FUNCTIONS)
+                raise ValueError(f"unknown function '{name}'{near_match(name, known)}; allowed: {', '.join(known)}")
+            if not minimum <= len(arguments) <= maximum:
+                takes = str(minimum) if minimum == maximum else f"{minimum} to {maximum}"
+                raise ValueError(f"{name} takes {takes} arguments, not {len(arguments)}")
+            return [path for argument in arguments for path in _list_names(argument)]
+    raise ValueError("allowed: numbers, names of parameters, + - * / **, parentheses and functions")
+
+
+def _format_path(node: ast.expr) -> str:
+    match node:
+        case ast.Name(id=name):
+            return name
+        case ast.Attribute(value=table, attr=name):
+            return f"{_format_path(table)}.{name}"
+        case ast.Subscript(value=table, slice=ast.Constant(value=int(index))) if type(index) is int:
+            return f"{_format_path(table)}.{index}"
+    raise ValueError("a parameter is named as in wind.east_m_s or heights_m[1]")
+
+
+def _evaluate(node: ast.expr, numbers: Mapping[str, float]) -> float:
+    match node:
+        case ast.Constant(value=value):
+            return float(value)  # type: ignore[arg-type]  # `_list_names` accepts numbers only
+        case ast.UnaryOp(op=op, operand=inner):
+            return _UNARY[type(op)](_evaluate(inner, numbers))
+        case ast.BinOp(left=left, op=op, right=right):
+            return _BINARY[type(op)](_evaluate(left, numbers), _evaluate(right, numbers))
+        case ast.Call(func=ast.Name(id=name), args=arguments):
+            return float(_FUNCTIONS[name][0](*(_evaluate(argument, numbers) for argument in arguments)))
+    path = _format_path(node)
+    return _CONSTANTS[path] if path in _CONSTANTS else numbers[path]
+
 
 #: Tail probability left out on either side when a distribution is checked against the range that a parameter allows.
 TAIL = 1e-12
@@ -38,9 +158,7 @@ class Dispersion(Parameters, ABC):
     #: Whether the distribution has a density, so that ranks can be correlated.
     continuous: ClassVar[bool] = False
     #: Fields that hold texts or literal values, never formulas.
-    _literals: ClassVar[frozenset[str]] = frozenset(
-        {"distribution", "unit", "description", "source", "values", "value"}
-    )
+    _literals: ClassVar[set[str]] = {"distribution", "unit", "description", "source", "values", "value"}
 
     unit: str | None = None
     description: str | None = None
@@ -61,7 +179,7 @@ class Dispersion(Parameters, ABC):
     @cached_property
     def formulas(self) -> Mapping[tuple[str | int, ...], Formula]:
         """Formulas in place of numbers, by their keys."""
-        return dict(_find_formulas(self.model_dump(mode="json", exclude=set(self._literals))))
+        return dict(_find_formulas(self.model_dump(mode="json", exclude=self._literals)))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -13,22 +13,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 from pydantic import ConfigDict, Discriminator, Field, Tag, field_validator, model_validator
 
 from marsyard.campaigns.errors import near_match
-from marsyard.campaigns.sampling.dispersion import (
-    STANDARD_NORMAL,
-    Dispersion,
-    Limits,
-    Literally,
-    Number,
-    PositiveNumber,
-    Shape,
-    Weight,
-    WholeNumber,
-    read_interval,
-    scipy_distributions,
-    scipy_parameters,
-    scipy_shape,
-    truncated_quantile,
-)
+from marsyard.campaigns.sampling import dispersion as base
 
 #: Maximum number of levels of one grid.
 MAX_LEVELS = 100_000
@@ -42,7 +27,7 @@ def _check_range(low: float, high: float) -> None:
         raise ValueError(f"from low = {low} to high = {high} is too far")
 
 
-class _Levels(Dispersion):
+class _Levels(base.Dispersion):
     """A dispersion over listed values, its `points`, in order."""
 
     @property
@@ -69,8 +54,8 @@ class Choice(_Levels):
     """
 
     distribution: Literal["choice"]
-    values: Annotated[list[Literally], Field(min_length=1)]
-    weights: list[Weight] | None = None
+    values: Annotated[list[base.Literally], Field(min_length=1)]
+    weights: list[base.Weight] | None = None
 
     @model_validator(mode="after")
     def _check_weights(self) -> Self:
@@ -97,7 +82,7 @@ class Fixed(_Levels):
     """The same value in every case: a parameter that is listed with its source next to the dispersed ones."""
 
     distribution: Literal["fixed"]
-    value: Literally
+    value: base.Literally
 
     @property
     def points(self) -> Sequence[Any]:
@@ -107,17 +92,17 @@ class Fixed(_Levels):
         return self.value
 
 
-class Derived(Dispersion):
+class Derived(base.Dispersion):
     """A value computed by a formula from other parameters of the case."""
 
     distribution: Literal["derived"]
-    formula: Number
+    formula: base.Number
 
     def quantile(self, probability: float) -> float:
         return float(self.formula)
 
     def bounds(self) -> tuple[float, float] | None:
-        return read_interval(self.formula, self.formula)
+        return base.read_interval(self.formula, self.formula)
 
 
 class Grid(_Levels):
@@ -127,7 +112,7 @@ class Grid(_Levels):
     """
 
     distribution: Literal["grid"]
-    values: Annotated[list[Literally], Field(min_length=1, max_length=MAX_LEVELS)] | None = None
+    values: Annotated[list[base.Literally], Field(min_length=1, max_length=MAX_LEVELS)] | None = None
     low: _Bound | None = None
     high: _Bound | None = None
     levels: Annotated[int, Field(strict=True, ge=2, le=MAX_LEVELS)] | None = None
@@ -144,10 +129,8 @@ class Grid(_Levels):
         if self.step is not None:
             steps = (self.high - self.low) / self.step  # type: ignore[operator]  # both are given, see above
             if not 0.5 <= steps < MAX_LEVELS or abs(steps - round(steps)) > 1e-6:
-                raise ValueError(
-                    f"step = {self.step} does not divide the range from {self.low} to {self.high} "
-                    f"into 1 to {MAX_LEVELS - 1} whole steps"
-                )
+                divided = f"the range from {self.low} to {self.high} into 1 to {MAX_LEVELS - 1} whole steps"
+                raise ValueError(f"step = {self.step} does not divide {divided}")
         return self
 
     @cached_property
@@ -163,14 +146,14 @@ class Grid(_Levels):
         return self.points[min(int(len(self.points) * probability), len(self.points) - 1)]
 
 
-class Uniform(Dispersion):
+class Uniform(base.Dispersion):
     """Uniform distribution between `low` and `high`."""
 
     continuous = True
 
     distribution: Literal["uniform"]
-    low: Number
-    high: Number
+    low: base.Number
+    high: base.Number
 
     @model_validator(mode="after")
     def _check_limits(self) -> Self:
@@ -183,10 +166,10 @@ class Uniform(Dispersion):
         return min(low + (high - low) * probability, high)
 
     def bounds(self) -> tuple[float, float] | None:
-        return read_interval(self.low, self.high)
+        return base.read_interval(self.low, self.high)
 
 
-class Normal(Dispersion):
+class Normal(base.Dispersion):
     """Normal distribution with mean `mean` and standard deviation `sd`, truncated to `truncate` where given.
 
     `sd` is omitted where a group states a covariance (`marsyard.campaigns.sampling.design`), and nowhere else.
@@ -195,14 +178,14 @@ class Normal(Dispersion):
     continuous = True
 
     distribution: Literal["normal"]
-    mean: Number
-    sd: PositiveNumber | None = None
-    truncate: Limits | None = None
+    mean: base.Number
+    sd: base.PositiveNumber | None = None
+    truncate: base.Limits | None = None
 
     @model_validator(mode="after")
     def _check_limits(self) -> Self:
         if self.sd is not None and not self.formulas:
-            truncated_quantile(STANDARD_NORMAL, self._standard_limits, 0.5)
+            base.truncated_quantile(base.STANDARD_NORMAL, self._standard_limits, 0.5)
         return self
 
     @cached_property
@@ -219,21 +202,21 @@ class Normal(Dispersion):
         return float(self.sd)
 
     def quantile(self, probability: float) -> float:
-        standard = truncated_quantile(STANDARD_NORMAL, self._standard_limits, probability)
+        standard = base.truncated_quantile(base.STANDARD_NORMAL, self._standard_limits, probability)
         value = float(self.mean) + self._sd * standard
         if self.truncate is None:
             return value
         return min(max(value, float(self.truncate[0])), float(self.truncate[1]))
 
     def bounds(self) -> tuple[float, float] | None:
-        return (-math.inf, math.inf) if self.truncate is None else read_interval(*self.truncate)
+        return (-math.inf, math.inf) if self.truncate is None else base.read_interval(*self.truncate)
 
 
-class _WholeNumbers(Dispersion):
+class _WholeNumbers(base.Dispersion):
     """Whole numbers from `low` to `high`, both included."""
 
-    low: WholeNumber
-    high: WholeNumber
+    low: base.WholeNumber
+    high: base.WholeNumber
 
     @model_validator(mode="before")
     @classmethod
@@ -254,7 +237,7 @@ class _WholeNumbers(Dispersion):
         return min(low + int((high - low + 1) * probability), high)
 
     def bounds(self) -> tuple[float, float] | None:
-        return read_interval(self.low, self.high)
+        return base.read_interval(self.low, self.high)
 
 
 class Integer(_WholeNumbers):
@@ -278,34 +261,32 @@ class InTurn(_WholeNumbers):
         return low + case % (high - low + 1)
 
 
-class Scipy(Dispersion):
+class Scipy(base.Dispersion):
     """A distribution of `scipy.stats` by its name, with its parameters, truncated to `truncate` where given.
 
     Discrete distributions (`poisson`, `binom`, ...) give whole numbers; their limits are included.
     """
 
     model_config = ConfigDict(extra="allow", frozen=True)
-    __pydantic_extra__: dict[str, Number] = Field(init=False)
+    __pydantic_extra__: dict[str, base.Number] = Field(init=False)
 
     distribution: str
-    truncate: Limits | None = None
+    truncate: base.Limits | None = None
 
     @field_validator("distribution")
     @classmethod
     def _check_name(cls, name: str) -> str:
-        names = scipy_distributions()
+        names = base.scipy_distributions()
         if name not in names:
             hint = near_match(name, [*BUILT_IN, *names])
-            raise ValueError(
-                f"unknown distribution '{name}'{hint}; allowed: {', '.join(BUILT_IN)}, "
-                "or a distribution of one variable of scipy.stats by its name there (norm, beta, poisson, ...)"
-            )
+            others = "a distribution of one variable of scipy.stats by its name there (norm, beta, poisson, ...)"
+            raise ValueError(f"unknown distribution '{name}'{hint}; allowed: {', '.join(BUILT_IN)}, or {others}")
         return name
 
     @model_validator(mode="after")
     def _check_parameters(self) -> Self:
         given = self.__pydantic_extra__ or {}
-        required, allowed = scipy_parameters(self.distribution)
+        required, allowed = base.scipy_parameters(self.distribution)
         problems = [f"unknown parameter '{name}'{near_match(name, allowed)}" for name in given if name not in allowed]
         problems += [f"parameter '{name}' is missing" for name in required if name not in given]
         if problems:
@@ -317,16 +298,16 @@ class Scipy(Dispersion):
     @property
     def continuous(self) -> bool:  # type: ignore[override]  # depends on the distribution's name
         """Whether the distribution has a density."""
-        return not scipy_distributions()[self.distribution]
+        return not base.scipy_distributions()[self.distribution]
 
     @cached_property
-    def _shape(self) -> Shape:
+    def _shape(self) -> base.Shape:
         parameters = {name: float(value) for name, value in (self.__pydantic_extra__ or {}).items()}
-        return scipy_shape(self.distribution, parameters)
+        return base.scipy_shape(self.distribution, parameters)
 
     def quantile(self, probability: float) -> float | int:
         limits = None if self.truncate is None else (float(self.truncate[0]), float(self.truncate[1]))
-        return truncated_quantile(self._shape, limits, probability)
+        return base.truncated_quantile(self._shape, limits, probability)
 
     def bounds(self) -> tuple[float, float] | None:
         if self.formulas:
@@ -348,7 +329,7 @@ _Dispersion = (
     | Annotated[Scipy, Tag("scipy")]
 )
 #: Distributions with names and parameters of their own; any other name is looked up in `scipy.stats`.
-BUILT_IN: Mapping[str, type[Dispersion]] = {
+BUILT_IN: Mapping[str, type[base.Dispersion]] = {
     tag.tag: kind for kind, tag in map(get_args, get_args(_Dispersion)) if kind is not Scipy
 }
 

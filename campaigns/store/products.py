@@ -16,8 +16,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Requirement
-from marsyard.campaigns.errors import StoreError, writing
-from marsyard.campaigns.outcomes import UNFINISHED
+from marsyard.campaigns.errors import UNFINISHED, StoreError, report_write_errors
 
 #: Key in `products.json` that replaces an array by its name in `products.npz`.
 _ARRAY = "__array__"
@@ -55,7 +54,7 @@ def save_packed(directory: Path, packed: PackedProducts, row: Mapping[str, Any])
 
     Raises StoreError where the folder cannot be written; its files then stay as they are.
     """
-    with replaced_files(directory) as folder:
+    with replace_files(directory) as folder:
         write_packed(folder, packed, row)
 
 
@@ -67,12 +66,12 @@ def write_packed(folder: Path, packed: PackedProducts, row: Mapping[str, Any]) -
 
 
 @contextmanager
-def replaced_files(directory: Path) -> Iterator[Path]:
+def replace_files(directory: Path) -> Iterator[Path]:
     """Temporary folder whose files replace those in `directory` at the end; after an exception nothing is replaced.
 
     Raises StoreError where the folder cannot be written.
     """
-    with writing(directory):
+    with report_write_errors(directory):
         directory.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=directory, prefix=".partial-") as name:
             folder = Path(name)

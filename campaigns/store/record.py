@@ -17,10 +17,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.configuration import CampaignConfiguration
-from marsyard.campaigns.definition.former_names import stored_configuration_now
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, stored_configuration_now
 from marsyard.campaigns.definition.identity import Identity
-from marsyard.campaigns.errors import StoreError, writing
+from marsyard.campaigns.errors import StoreError, report_write_errors
 from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
 
 #: Version of the layout of a campaign's folder.
@@ -47,7 +46,7 @@ def claim(directory: Path) -> None:
 
     Raises StoreError where it holds a campaign, or cannot be written.
     """
-    with writing(directory):
+    with report_write_errors(directory):
         try:
             directory.mkdir(parents=True, exist_ok=True)
         except FileExistsError as error:
@@ -124,7 +123,7 @@ def write(directory: Path, record: Mapping[str, Any]) -> None:
     """
     path = directory / RECORD_FILE
     partial = path.with_suffix(".partial")
-    with writing(path):
+    with report_write_errors(path):
         with partial.open("w", encoding="utf-8") as file:
             file.write(json.dumps(record, indent=2, ensure_ascii=False) + "\n")
             file.flush()
@@ -226,7 +225,7 @@ _LOCK_FILE = "campaign.lock"
 def folder_lock(directory: Path) -> Iterator[None]:
     """Lock a campaign's folder. Raises StoreError where another process holds it, or the folder cannot be written."""
     path = directory / _LOCK_FILE
-    with writing(directory):
+    with report_write_errors(directory):
         file = path.open("a+", encoding="utf-8")
     with file:
         try:

@@ -21,8 +21,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.errors import StoreError
-from marsyard.campaigns.outcomes import UNFINISHED
+from marsyard.campaigns.errors import UNFINISHED, StoreError
 from marsyard.scenarios.interface import Scalar
 
 ROWS_FILE = "cases.sqlite"
@@ -86,9 +85,9 @@ class RowStore(AbstractContextManager["RowStore"]):
                 raise StoreError(f"{path} is damaged, or no store of this version: it does not say that it is one")
             if version != STORE_VERSION:
                 raise StoreError(f"{path} has version {version}; this version of Marsyard reads {STORE_VERSION}")
-            found = [text for (text,) in execute("PRAGMA quick_check(1)")] if thorough else ["ok"]
-            if found != ["ok"]:
-                raise StoreError(f"{path} is damaged: {' '.join(found)}; nothing was written to it")
+            problems = [text for (text,) in execute("PRAGMA quick_check(1)")] if thorough else ["ok"]
+            if problems != ["ok"]:
+                raise StoreError(f"{path} is damaged: {' '.join(problems)}; nothing was written to it")
             execute("PRAGMA journal_mode = WAL")
             execute("PRAGMA synchronous = FULL")
             self._layouts: dict[tuple[str, ...], int] = {}
@@ -159,7 +158,7 @@ class RowStore(AbstractContextManager["RowStore"]):
         (number,) = self._ask("SELECT count(*) FROM cases").fetchone()
         return int(number)
 
-    def unfinished(self) -> int:
+    def count_unfinished(self) -> int:
         """Number of unfinished cases."""
         return len(self.with_outcomes(UNFINISHED))
 
@@ -184,9 +183,9 @@ class RowStore(AbstractContextManager["RowStore"]):
 
     def row(self, case: int) -> Row | None:
         """Row of a case; None where it has none."""
-        found = self._ask("SELECT layout, row FROM cases WHERE case_number = ?", [case]).fetchone()
+        record = self._ask("SELECT layout, row FROM cases WHERE case_number = ?", [case]).fetchone()
         try:
-            return None if found is None else dict(zip(self.names()[found[0]], json.loads(found[1]), strict=True))
+            return None if record is None else dict(zip(self.names()[record[0]], json.loads(record[1]), strict=True))
         except (ValueError, TypeError) as error:
             raise StoreError(f"{self._path} is damaged: a row cannot be read: {error}") from error
 
@@ -201,10 +200,10 @@ class RowStore(AbstractContextManager["RowStore"]):
 
     def kinds(self) -> dict[str, set[str]]:
         """Types of each column's values: any of `bool`, `int`, `big` (beyond 64 bits), `float`, `str`."""
-        found: dict[str, set[str]] = {}
+        values: dict[str, set[str]] = {}
         for name, kind in self._kinds:
-            found.setdefault(name, set()).add(kind)
-        return found
+            values.setdefault(name, set()).add(kind)
+        return values
 
     def chunks(self, size: int) -> Iterator[list[tuple[int, list[Any]]]]:
         """Layouts and values of all rows in the order of their cases, `size` at a time."""

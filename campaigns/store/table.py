@@ -34,8 +34,8 @@ def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> No
     import pyarrow.parquet as pq
 
     layouts, kinds = store.names(), store.kinds()
-    found = dict.fromkeys((*itertools.chain.from_iterable(layouts.values()), *measures))
-    own = [name for name in found if name not in LEADING_COLUMNS and name not in TRAILING_COLUMNS]
+    columns = dict.fromkeys((*itertools.chain.from_iterable(layouts.values()), *measures))
+    own = [name for name in columns if name not in LEADING_COLUMNS and name not in TRAILING_COLUMNS]
     forms = {name: _choose_type(kinds.get(name, set())) for name in (*LEADING_COLUMNS, *own, *TRAILING_COLUMNS)}
     schema = pa.schema([(name, kind) for name, (kind, _) in forms.items()])
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
@@ -67,7 +67,6 @@ def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> No
 def _columns(
     chunk: Sequence[tuple[int, list[Any]]], layouts: Mapping[int, Sequence[str]], columns: Sequence[str]
 ) -> Iterator[Sequence[Any]]:
-    """Values of each column in a chunk of rows; None where a row lacks it."""
     indices: dict[int, list[int]] = {}
     for index, (layout, _) in enumerate(chunk):
         indices.setdefault(layout, []).append(index)

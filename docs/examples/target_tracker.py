@@ -84,7 +84,7 @@ class WholePixelTracker:
         world_from_head = stop.world_from_rover * stop.mast.geometry.rover_from_head(
             stop.azimuth_rad, stop.elevation_rad
         )
-        left, right = stop.mast.left.moved(world_from_head), stop.mast.right.moved(world_from_head)
+        left, right = stop.mast.left.transform(world_from_head), stop.mast.right.transform(world_from_head)
         place = self.expected(left)
         if place is None or (self.template is None and patch(stop.left, place) is None):
             return self.lost("OUT_OF_VIEW", stop)

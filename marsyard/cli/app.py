@@ -16,15 +16,13 @@ from typer import Option
 from typer.core import TyperCommand, TyperGroup
 
 from marsyard.cli.campaign import append, replay, resume, run
-from marsyard.cli.conformance import conformance
 from marsyard.cli.housekeeping import clean, compile_kernels
 from marsyard.cli.new import ingest, new
-from marsyard.cli.nightly import nightly
-from marsyard.cli.offline import dataset, export, score
+from marsyard.cli.offline import conformance, dataset, export, score
 from marsyard.cli.options import CampaignArgument, Exit, JsonOption, SetOption, console, handle_user_errors
-from marsyard.cli.render import gallery, render
-from marsyard.cli.report import compare, dashboard, report
+from marsyard.cli.report import compare, dashboard, nightly, report
 from marsyard.cli.terrain import app as terrain
+from marsyard.cli.terrain import gallery, render
 
 
 class _PlainFlags:
@@ -64,7 +62,7 @@ def list_campaigns(as_json: JsonOption = False) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from marsyard.campaigns.definition.catalogue import catalogue
+    from marsyard.campaigns.definition.loading import catalogue
     from marsyard.scenarios.systems import problems
 
     for problem in problems():
@@ -90,16 +88,16 @@ def list_campaigns(as_json: JsonOption = False) -> None:
 def show(
     campaign: CampaignArgument,
     override: SetOption = None,
-    draw: Annotated[int | None, Option("--draw", metavar="N", help="Show the draws of the first N cases.")] = None,
+    draw: Annotated[int | None, Option(metavar="N", help="Show the draws of the first N cases.")] = None,
     figure: Annotated[
-        Path | None, Option("--figure", metavar="FILE", help="With --draw: write marginals and pairs as .svg or .png.")
+        Path | None, Option(metavar="FILE", help="With --draw: write marginals and pairs as .svg or .png.")
     ] = None,
     as_json: Annotated[bool, Option("--json", help="Print JSON, with all draws.")] = False,
 ) -> None:
     """Show a campaign: parameters, dispersions with their sources, requirements; or the draws of its cases."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.errors import CampaignError
-    from marsyard.cli.showing import described, show_campaign, show_draws, write_draws_figure
+    from marsyard.cli.showing import describe_campaign, show_campaign, show_draws, write_draws_figure
 
     if figure is not None and draw is None:
         raise CampaignError("--figure shows draws: give the number of cases with --draw N")
@@ -107,7 +105,7 @@ def show(
     if figure is not None and draw is not None:
         write_draws_figure(loaded, draw, figure)
     if as_json:
-        typer.echo(json.dumps(described(loaded, draw), indent=2))
+        typer.echo(json.dumps(describe_campaign(loaded, draw), indent=2))
     elif draw is None:
         show_campaign(loaded, console())
     else:
@@ -140,31 +138,17 @@ def _marsyard(
     pass
 
 
-#: Commands by the panels of the help.
-PANELS: dict[str, dict[str, Callable[..., None]]] = {
-    "Run campaigns": {
-        "list": list_campaigns,
-        "show": show,
-        "run": run,
-        "resume": resume,
-        "append": append,
-        "replay": replay,
-        "nightly": nightly,
-    },
-    "Results": {"report": report, "compare": compare, "dashboard": dashboard},
-    "Worlds and pictures": {"render": render, "gallery": gallery, "dataset": dataset},
-    "Your own campaigns and algorithms": {
-        "new": new,
-        "ingest": ingest,
-        "conformance": conformance,
-        "export": export,
-        "score": score,
-    },
-    "Housekeeping": {"doctor": doctor, "compile": compile_kernels, "clean": clean},
+#: Commands by the panels of the help; the first word of a function's name is that of its command.
+PANELS: dict[str, tuple[Callable[..., None], ...]] = {
+    "Run campaigns": (list_campaigns, show, run, resume, append, replay, nightly),
+    "Results": (report, compare, dashboard),
+    "Worlds and pictures": (render, gallery, dataset),
+    "Your own campaigns and algorithms": (new, ingest, conformance, export, score),
+    "Housekeeping": (doctor, compile_kernels, clean),
 }
 for panel, commands in PANELS.items():
-    for name, command in commands.items():
-        app.command(name=name, cls=_Command, rich_help_panel=panel)(command)
+    for command in commands:
+        app.command(name=command.__name__.partition("_")[0], cls=_Command, rich_help_panel=panel)(command)
     if panel == "Worlds and pictures":
         app.add_typer(terrain, name="terrain", cls=_Group, rich_help_panel=panel)
 
@@ -175,13 +159,11 @@ _format_usual = warnings.formatwarning
 def _format_warning(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
 ) -> str:
-    from marsyard.sim.renamed import RenamedWarning
+    from marsyard.sim.parameters import RenamedWarning
 
-    return (
-        f"warning: {message}\n"
-        if issubclass(category, RenamedWarning)
-        else _format_usual(message, category, filename, lineno, line)
-    )
+    if issubclass(category, RenamedWarning):
+        return f"warning: {message}\n"
+    return _format_usual(message, category, filename, lineno, line)
 
 
 def main() -> None:
@@ -190,7 +172,7 @@ def main() -> None:
     warnings.filterwarnings("ignore", message="Failed to kill subprocesses")
     warnings.formatwarning = _format_warning
     if not {"--help", "--version"}.issuperset(sys.argv[1:]):  # these answer before NumPy is imported
-        from marsyard.sim.renamed import current_options
+        from marsyard.sim.parameters import current_options
 
         sys.argv[1:] = current_options(sys.argv[1:])
     try:

@@ -14,23 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from marsyard.cli.options import (
-    AlgorithmOption,
-    CampaignArgument,
-    CasesOption,
-    CaseTimeOption,
-    ChangedOption,
-    ClusterOption,
-    DirectoryArgument,
-    Exit,
-    JobsOption,
-    OutOption,
-    SeedOption,
-    SetOption,
-    console,
-    handle_user_errors,
-    with_options,
-)
+from marsyard.cli import options
 
 if TYPE_CHECKING:
     from marsyard.campaigns.execution.workers import ExecutorConfig
@@ -41,13 +25,13 @@ if TYPE_CHECKING:
 class RunOptions:
     """Arguments and options of `marsyard run`."""
 
-    campaign: CampaignArgument
-    cases: CasesOption = None
-    seed: SeedOption = None
-    jobs: JobsOption = None
-    cluster: ClusterOption = None
-    case_time: CaseTimeOption = None
-    out: OutOption = None
+    campaign: options.CampaignArgument
+    cases: options.CasesOption = None
+    seed: options.SeedOption = None
+    jobs: options.JobsOption = None
+    cluster: options.ClusterOption = None
+    case_time: options.CaseTimeOption = None
+    out: options.OutOption = None
     dry_run: Annotated[bool, Option("--dry-run", help="Only estimate time and disk space from a few trial cases.")] = (
         False
     )
@@ -55,12 +39,12 @@ class RunOptions:
         bool,
         Option("--until-decided", help="Stop early once the verdicts are decided; the number of cases is the maximum."),
     ] = False
-    override: SetOption = None
-    algorithm: AlgorithmOption = None
+    override: options.SetOption = None
+    algorithm: options.AlgorithmOption = None
 
 
-@handle_user_errors
-@with_options(RunOptions)
+@options.handle_user_errors
+@options.with_options(RunOptions)
 def run(given: RunOptions) -> None:
     """Run a campaign, judge its requirements, and write its report."""
     from marsyard.campaigns.definition.loading import load_campaign
@@ -71,21 +55,21 @@ def run(given: RunOptions) -> None:
     loaded = load_campaign(given.campaign, changes, given.cases, given.seed, given.algorithm or [])
     # imported after loading, so that an error in the file is reported at once
     from marsyard.campaigns.running.engine import run_campaign
-    from marsyard.cli import evidence
+    from marsyard.cli import outcome
 
     executor = make_executor(given.jobs, given.cluster)
     if given.dry_run:
-        evidence.print_estimate(loaded, executor)
-        evidence.print_limits(loaded)
+        outcome.print_estimate(loaded, executor)
+        outcome.print_limits(loaded)
         return
     directory = given.out if given.out is not None else default_directory(loaded.configuration.name)
-    start = evidence.run_until_decided if given.until_decided else run_campaign
+    start = outcome.run_until_decided if given.until_decided else run_campaign
     run_and_judge(directory, lambda watch: start(loaded, directory, executor, watch))
 
 
-@handle_user_errors
+@options.handle_user_errors
 def resume(
-    directory: DirectoryArgument,
+    directory: options.DirectoryArgument,
     retry: Annotated[
         list[str] | None,
         Option(
@@ -95,21 +79,20 @@ def resume(
             "all of them.",
         ),
     ] = None,
-    jobs: JobsOption = None,
-    cluster: ClusterOption = None,
-    case_time: CaseTimeOption = None,
-    allow_changed: ChangedOption = False,
+    jobs: options.JobsOption = None,
+    cluster: options.ClusterOption = None,
+    case_time: options.CaseTimeOption = None,
+    allow_changed: options.ChangedOption = False,
 ) -> None:
     """Run the remaining cases of an interrupted or killed campaign, and judge it."""
-    from marsyard.campaigns.errors import CampaignError, not_allowed
-    from marsyard.campaigns.outcomes import RETRYABLE
+    from marsyard.campaigns.errors import RETRYABLE, CampaignError, unknown_name_message
     from marsyard.campaigns.running.engine import resume_campaign
-    from marsyard.cli.evidence import continue_until_decided
+    from marsyard.cli.outcome import continue_until_decided
 
     executor, allowed = make_executor(jobs, cluster), [*RETRYABLE, "all"]
     for word in retry or []:
         if word not in allowed:
-            raise CampaignError(f"--retry: {not_allowed('outcome', word, allowed)}")
+            raise CampaignError(f"--retry: {unknown_name_message('outcome', word, allowed)}")
     outcomes = list(RETRYABLE) if "all" in (retry or []) else retry or []
 
     def continue_campaign(watch: Watch) -> None:
@@ -119,33 +102,33 @@ def resume(
     run_and_judge(directory, continue_campaign)
 
 
-@handle_user_errors
+@options.handle_user_errors
 def append(
-    directory: DirectoryArgument,
+    directory: options.DirectoryArgument,
     cases: Annotated[int, Argument(metavar="N", help="Number of cases to add.", min=1)],
-    jobs: JobsOption = None,
-    cluster: ClusterOption = None,
-    allow_changed: ChangedOption = False,
+    jobs: options.JobsOption = None,
+    cluster: options.ClusterOption = None,
+    allow_changed: options.ChangedOption = False,
 ) -> None:
     """Add cases to a finished campaign, run them, and judge all."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.running.engine import append_cases, campaign_with_block
     from marsyard.campaigns.store.record import stored_configuration
-    from marsyard.cli import evidence
+    from marsyard.cli import outcome
 
     if stored_configuration(directory).max_cases is not None:
         raise CampaignError(f"{directory} stopped itself (--until-decided): more cases would buy a second chance")
-    evidence.print_limits(campaign_with_block(directory, cases))
+    outcome.print_limits(campaign_with_block(directory, cases))
     executor = make_executor(jobs, cluster)
     run_and_judge(directory, lambda watch: append_cases(directory, cases, executor, watch, allow_changed=allow_changed))
 
 
-@handle_user_errors
+@options.handle_user_errors
 def replay(
-    directory: DirectoryArgument,
+    directory: options.DirectoryArgument,
     case: Annotated[int, Argument(metavar="CASE", help="Number of the case, from 0.")],
     out: Annotated[
-        Path | None, Option("--out", metavar="DIR", help="Folder of its products; by default DIR/cases/CASE.")
+        Path | None, Option(metavar="DIR", help="Folder of its products; by default DIR/cases/CASE.")
     ] = None,
     save_stages: Annotated[bool, Option("--save-stages", help="Also write each stage's product into stages/.")] = False,
 ) -> None:
@@ -154,12 +137,12 @@ def replay(
     from marsyard.campaigns.store.products import (
         case_directory,
         pack_products,
-        replaced_files,
+        replace_files,
         unpack_products,
         write_packed,
     )
-    from marsyard.cli.stages import write_stages
-    from marsyard.reports.cases import write_case_figures
+    from marsyard.cli.showing import write_stages
+    from marsyard.reports.presentation import write_case_figures
 
     replayed = run_again(directory, case)
     target = out if out is not None else case_directory(directory, case)
@@ -168,7 +151,7 @@ def replay(
     else:  # the products, stages and figures, all or none
         packed = replayed.products or pack_products({})
         products = unpack_products(packed)
-        with replaced_files(target) as folder:
+        with replace_files(target) as folder:
             write_packed(folder, packed, replayed.row)
             stages = write_stages(folder / "stages", products) if save_stages else 0
             figures = [target / path.relative_to(folder) for path in write_case_figures(folder, products)]
@@ -187,7 +170,7 @@ def replay(
         typer.echo(f"the row differs from the stored one in: {', '.join(replayed.differing)}")
         for column in replayed.differing:
             typer.echo(f"  {column}: {replayed.stored.get(column)!r} stored, {replayed.row.get(column)!r} now")
-        raise typer.Exit(Exit.FAILED)
+        raise typer.Exit(options.Exit.FAILED)
     else:
         typer.echo("the row equals the stored one")
 
@@ -211,7 +194,7 @@ def run_and_judge(directory: Path, work: Callable[[Watch], None]) -> None:
 
     with shown_progress(directory, f"marsyard resume {directory}") as progress, RunLog(directory, progress) as log:
         work(log)
-    raise typer.Exit(conclude(directory, console()))
+    raise typer.Exit(conclude(directory, options.console()))
 
 
 @contextmanager
@@ -222,7 +205,7 @@ def shown_progress(directory: Path, next_command: str) -> Iterator[Watch]:
     from marsyard.cli.progress import campaign_progress
 
     try:
-        with stopped_by_signals(), campaign_progress(console(stderr=True)) as progress:
+        with stop_on_signals(), campaign_progress(options.console(stderr=True)) as progress:
             yield progress
     except KeyboardInterrupt:
         try:
@@ -231,11 +214,11 @@ def shown_progress(directory: Path, next_command: str) -> Iterator[Watch]:
             typer.echo(f"interrupted; {rows}. To continue: {next_command}", err=True)
         except CampaignError:
             pass
-        raise typer.Exit(Exit.INTERRUPTED) from None
+        raise typer.Exit(options.Exit.INTERRUPTED) from None
 
 
 @contextmanager
-def stopped_by_signals() -> Iterator[None]:
+def stop_on_signals() -> Iterator[None]:
     """The first Ctrl-C or SIGTERM stops the work in good order, the second ends the program at once."""
 
     def stop(number: int, _frame: object) -> None:
@@ -246,7 +229,7 @@ def stopped_by_signals() -> Iterator[None]:
     def end_at_once(_number: int, _frame: object) -> None:
         # the workers' supervisors detect the end of this process, kill their children and remove temporary files
         os.write(2, b"\x1b[?25hkilled\n" if os.isatty(2) else b"killed\n")
-        os._exit(Exit.INTERRUPTED)
+        os._exit(options.Exit.INTERRUPTED)
 
     before = {kind: signal.signal(kind, stop) for kind in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import typer
 from jaxtyping import Bool, Float64, UInt8
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from marsyard.cli.pictures import Shot, take
+from marsyard.reports.campaign import page_environment
 from marsyard.sim.terrain import sites
 
 Grey: TypeAlias = UInt8[np.ndarray, "rows columns"]
@@ -93,11 +93,11 @@ def plate(number: int, shot: Shot) -> SvgFigure:
     if picture.exposed is None or picture.counts is None:
         raise ValueError("only what a detector delivered can be displayed")
     signal = np.clip(picture.counts - picture.exposed.detector.parameters.offset_dn, 0.0, None)
-    grey = displayed(signal, np.isfinite(picture.frame.range_m))
+    grey = map_to_grey(signal, np.isfinite(picture.frame.range_m))
     return SvgFigure(shot, grey, f"{number:02d}-{shot.site}-{shot.camera}.jpg")
 
 
-def displayed(signal: Float64[np.ndarray, "rows columns"], ground: Bool[np.ndarray, "rows columns"]) -> Grey:
+def map_to_grey(signal: Float64[np.ndarray, "rows columns"], ground: Bool[np.ndarray, "rows columns"]) -> Grey:
     """Map counts above the offset to greys for the eye; `ground` marks the pixels that see the ground.
 
     White is the brightest ground; a brighter sky is compressed into the upper greys (Reinhard et al. 2002, eq. 4).
@@ -132,16 +132,8 @@ def write_gallery(plates: Sequence[SvgFigure], folder: Path) -> Path:
         source = f"data:image/jpeg;base64,{base64.b64encode(inline).decode()}"
         groups.setdefault(s.site, []).append({"source": source, **values})
     (folder / SHEET).write_bytes(contact_sheet(plates))
-    environment = Environment(
-        loader=PackageLoader("marsyard.reports"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = environment.get_template("gallery.html.j2").render(
-        groups=[(sites()[name], shown) for name, shown in groups.items()], version=version("marsyard")
-    )
+    shown = [(sites()[name], plates_of_site) for name, plates_of_site in groups.items()]
+    page = page_environment().get_template("gallery.html.j2").render(groups=shown, version=version("marsyard"))
     (folder / PAGE).write_text(page, encoding="utf-8")
     return folder / PAGE
 

@@ -35,15 +35,15 @@ def clean(
     from rich import box
     from rich.table import Table
 
-    from marsyard.campaigns.errors import CampaignError, not_allowed
+    from marsyard.campaigns.errors import CampaignError, unknown_name_message
     from marsyard.sim.cache import UNFINISHED
 
     for kind in kinds or []:
         if kind not in KINDS:
-            raise CampaignError(not_allowed("kind", kind, KINDS))
-    found = [cache_usage(kind) for kind in kinds or KINDS]
+            raise CampaignError(unknown_name_message("kind", kind, KINDS))
+    usages = [cache_usage(kind) for kind in kinds or KINDS]
     freed = 0
-    paths = [path for one in found for path in sorted(one["folder"].rglob("*"), reverse=True)] if yes else []
+    paths = [path for one in usages for path in sorted(one["folder"].rglob("*"), reverse=True)] if yes else []
     for path in paths:
         try:
             if path.is_dir() and not path.is_symlink():
@@ -55,13 +55,13 @@ def clean(
         except OSError:  # not empty, in use, or gone already
             continue
     if as_json:
-        typer.echo(json.dumps({"kept": found, "removed_bytes": freed}, indent=2, default=str))
+        typer.echo(json.dumps({"kept": usages, "removed_bytes": freed}, indent=2, default=str))
         return
     table = Table(box=box.SIMPLE_HEAD)
     for heading in ("kind", "files", "size", "limit", "folder", "what it is"):
         right = heading in ("files", "size", "limit")
         table.add_column(heading, justify="right" if right else "left", overflow="fold")
-    for one in found:
+    for one in usages:
         limit = "none" if one["limit_bytes"] is None else size_text(one["limit_bytes"])
         kind, size = one["kind"], size_text(one["bytes"])
         table.add_row(kind, str(one["files"]), size, limit, str(one["folder"]), KINDS[kind])

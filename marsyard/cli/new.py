@@ -19,7 +19,7 @@ from marsyard.cli.options import OverwriteOption, handle_user_errors, with_optio
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
-    from marsyard.scenarios.system import Ingested
+    from marsyard.scenarios.systems import Ingested
     from marsyard.scenarios.template import CampaignTemplate, Choices
 
 CAMPAIGN_FILE = "campaign.toml"
@@ -30,25 +30,15 @@ class NewOptions:
     """Arguments and options of `marsyard new`."""
 
     name: Annotated[str, Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")]
-    system: Annotated[
-        str | None, Option("--system", help="System under test, such as velocity; a wrong name lists all.")
-    ] = None
-    site: Annotated[str | None, Option("--site", help="One of `marsyard terrain list`.")] = None
-    camera: Annotated[
-        str | None, Option("--camera", metavar="FILE", help="Custom camera file (docs/custom-worlds.md).")
-    ] = None
-    detector: Annotated[str | None, Option("--detector", metavar="FILE", help="Custom detector datasheet in TOML.")] = (
-        None
-    )
-    flight: Annotated[
-        str | None, Option("--flight", metavar="FILE", help="Trajectory file in place of the dynamics.")
-    ] = None
-    axes: Annotated[str, Option("--axes", help="World axes of the trajectory: enu or ned.")] = "enu"
-    bound: Annotated[
-        float | None, Option("--bound", metavar="X", help="Requirement: maximum error or minimum fraction.")
-    ] = None
+    system: Annotated[str | None, Option(help="System under test, such as velocity; a wrong name lists all.")] = None
+    site: Annotated[str | None, Option(help="One of `marsyard terrain list`.")] = None
+    camera: Annotated[str | None, Option(metavar="FILE", help="Custom camera file (docs/custom-worlds.md).")] = None
+    detector: Annotated[str | None, Option(metavar="FILE", help="Custom detector datasheet in TOML.")] = None
+    flight: Annotated[str | None, Option(metavar="FILE", help="Trajectory file in place of the dynamics.")] = None
+    axes: Annotated[str, Option(help="World axes of the trajectory: enu or ned.")] = "enu"
+    bound: Annotated[float | None, Option(metavar="X", help="Requirement: maximum error or minimum fraction.")] = None
     cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24
-    out: Annotated[Path | None, Option("--out", metavar="FILE", help="Instead of NAME.toml.")] = None
+    out: Annotated[Path | None, Option(metavar="FILE", help="Instead of NAME.toml.")] = None
     overwrite: OverwriteOption = False
 
 
@@ -56,12 +46,12 @@ class NewOptions:
 @with_options(NewOptions)
 def new(given: NewOptions) -> None:
     """Write a commented campaign of your own; at a terminal asks for what is not given."""
-    from marsyard.campaigns.errors import CampaignError, not_allowed
-    from marsyard.cli.evidence import evidence_limits
+    from marsyard.campaigns.errors import CampaignError, unknown_name_message
+    from marsyard.cli.outcome import evidence_limits
     from marsyard.reports.wording import count
-    from marsyard.scenarios.import_path import import_object
     from marsyard.scenarios.systems import template_paths
     from marsyard.scenarios.template import Choices
+    from marsyard.scenarios.user_files import import_object
     from marsyard.sim.terrain import sites
 
     name = given.name
@@ -73,7 +63,7 @@ def new(given: NewOptions) -> None:
     asked, known = given.system is None and _is_terminal(), template_paths()
     chosen = given.system or _answer("System", next(iter(known)), asked, partial(_find_word_problem, list(known)))
     if chosen not in known:
-        raise CampaignError(f"--system: {not_allowed('system', chosen, known)}")
+        raise CampaignError(f"--system: {unknown_name_message('system', chosen, known)}")
     template: CampaignTemplate = import_object(known[chosen])
     asks_camera, asks_flight = (asked and option not in template.refused for option in ("camera", "flight"))
     with_terrain = [name for name, one in sites().items() if getattr(one, template.scale) is not None]
@@ -99,15 +89,14 @@ def _is_terminal() -> bool:
 def _write_and_load(path: Path, template: CampaignTemplate, choices: Choices) -> Campaign:
     """Write the campaign and load it; where it cannot be loaded, restore what the path held before."""
     from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.campaigns.errors import CampaignError
+    from marsyard.campaigns.errors import CampaignError, report_write_errors
 
     before = path.read_text(encoding="utf-8") if path.exists() else None
     try:
-        path.write_text(template.text(choices), encoding="utf-8")
+        with report_write_errors(f"{path}:"):
+            path.write_text(template.text(choices), encoding="utf-8")
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    except OSError as error:
-        raise CampaignError(f"{path}: cannot be written: {error.strerror or error}") from error
     try:
         return load_campaign(str(path))
     except CampaignError:
@@ -123,15 +112,15 @@ def _answer(question: str, default: str, asked: bool, find_problem: Callable[[st
             raise typer.BadParameter(problem)
         return answer
 
-    return str(
-        typer.prompt(question, default=default, show_default=bool(default), value_proc=check) if asked else default
-    )
+    if not asked:
+        return default
+    return str(typer.prompt(question, default=default, show_default=bool(default), value_proc=check))
 
 
 def _find_word_problem(allowed: Sequence[str], answer: str) -> str:
-    from marsyard.campaigns.errors import not_allowed
+    from marsyard.campaigns.errors import unknown_name_message
 
-    return "" if answer in allowed else not_allowed("answer", answer, allowed)
+    return "" if answer in allowed else unknown_name_message("answer", answer, allowed)
 
 
 def _find_file_problem(answer: str) -> str:
@@ -164,34 +153,33 @@ def ingest(
     folder: Annotated[
         Path, Argument(metavar="FOLDER", help="ingest.toml, pictures.csv and pictures (docs/real-pictures.md).")
     ],
-    out: Annotated[Path, Option("--out", metavar="DIR", help="New folder of the cases and their campaign.")],
-    system: Annotated[str | None, Option("--system", help="System of the cases; by default real pictures.")] = None,
+    out: Annotated[Path, Option(metavar="DIR", help="New folder of the cases and their campaign.")],
+    system: Annotated[str | None, Option(help="System of the cases; by default real pictures.")] = None,
 ) -> None:
     """Make a campaign of real cases from pictures with measured attitude and altitude."""
     from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.campaigns.errors import CampaignError, StoreError, not_allowed
+    from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors, unknown_name_message
     from marsyard.reports.wording import count
-    from marsyard.scenarios.import_path import import_object
     from marsyard.scenarios.systems import systems
+    from marsyard.scenarios.user_files import import_object
 
     known = {one.name: one.ingest for one in systems() if one.ingest}
     chosen = system or next(iter(known))
     if chosen not in known:
-        raise CampaignError(f"--system: {not_allowed('system', chosen, known)}")
+        raise CampaignError(f"--system: {unknown_name_message('system', chosen, known)}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise StoreError(f"{out} is there already, and is not empty; name a new folder with --out")
     unfinished = out.with_name(f"{out.name}.part{os.getpid()}")
     try:
-        unfinished.mkdir(parents=True)
-        made: Ingested = import_object(known[chosen])(folder, unfinished, out.resolve())
-        (unfinished / CAMPAIGN_FILE).write_text(made.campaign, encoding="utf-8")
-        if out.exists():
-            out.rmdir()
-        unfinished.rename(out)
+        with report_write_errors(f"{out}:"):
+            unfinished.mkdir(parents=True)
+            made: Ingested = import_object(known[chosen])(folder, unfinished, out.resolve())
+            (unfinished / CAMPAIGN_FILE).write_text(made.campaign, encoding="utf-8")
+            if out.exists():
+                out.rmdir()
+            unfinished.rename(out)
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    except OSError as error:
-        raise StoreError(f"{out}: cannot be written: {error.strerror or error}") from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
     try:

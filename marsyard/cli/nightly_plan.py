@@ -22,7 +22,7 @@ from marsyard.campaigns.running.engine import Watch, run_campaign
 from marsyard.cli.options import Exit
 from marsyard.cli.outcome import settle
 from marsyard.reports.campaign import write_whole
-from marsyard.reports.comparison import figures_of, sample_of
+from marsyard.reports.comparison import build_sample, list_figures
 from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.history import Change, History, NightCampaign, NightFigure, compare_night, night_text
 from marsyard.sim.parameters import Parameters
@@ -80,7 +80,7 @@ def night_seed(seed: int, night: int) -> int:
     return int.from_bytes(digest[:7], "little")
 
 
-def definition_of(campaign: Campaign) -> str:
+def campaign_definition(campaign: Campaign) -> str:
     """Hash a campaign's definition without seed and texts: nights are compared where it is the same."""
     excluded = {"seed", "description", "retain", "limits", "cases"}
     stated = campaign.configuration.model_dump(mode="json", exclude=excluded)
@@ -107,9 +107,9 @@ def run_planned(now: Night, planned: PlannedCampaign, folder: Path, watch: Watch
         directory = now.out / RUNS / f"night-{now.number:05d}-{name}"
         run_campaign(campaign, directory, now.executor, watch)
         found, _ = settle(directory)
-        frame, compared = figures_of(found.run)
-        figures = [NightFigure(one.name, one.larger_is_better, one.level, sample_of(frame, one)) for one in compared]
-        verdict, definition = found.whole, definition_of(campaign)
+        frame, compared = list_figures(found.run)
+        figures = [NightFigure(one.name, one.larger_is_better, one.level, build_sample(frame, one)) for one in compared]
+        verdict, definition = found.whole, campaign_definition(campaign)
         result = NightCampaign(name, definition, directory.name, verdict.word, found.exit_code, verdict.sentence)
     except Exception as error:  # a defect in one campaign must not stop the others
         figures = []

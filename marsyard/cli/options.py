@@ -34,11 +34,10 @@ SiteArgument = Annotated[
     str, Argument(metavar="SITE", help="A site from `marsyard terrain list`, or a DTM: .tif or .npz.")
 ]
 MaxHolesOption = Annotated[
-    float | None,
-    Option("--max-holes", metavar="F", min=0.0, max=0.99, help="Of a DTM: maximum fraction of missing posts."),
+    float | None, Option(metavar="F", min=0.0, max=0.99, help="Of a DTM: maximum fraction of missing posts.")
 ]
 CasesOption = Annotated[int | None, Option("-n", "--cases", metavar="N", help="Number of cases.")]
-SeedOption = Annotated[int | None, Option("--seed", metavar="S", help="Root seed.")]
+SeedOption = Annotated[int | None, Option(metavar="S", help="Root seed.")]
 JsonOption = Annotated[bool, Option("--json", help="Print JSON.")]
 DirectoryArgument = Annotated[Path, Argument(metavar="DIR", help="Folder of a campaign that was run.")]
 SetOption = Annotated[
@@ -52,29 +51,23 @@ SetOption = Annotated[
 AlgorithmOption = Annotated[
     list[str] | None,
     Option(
-        "--algorithm",
         metavar="NAME",
         help="The algorithm under test: a name, module:Class, exec:PROGRAM or serve:PROGRAM. Given several times, all "
         "run on the same cases and are compared; the first is judged.",
     ),
 ]
-JobsOption = Annotated[int | None, Option("--jobs", metavar="J", help="Worker processes; by default one per core.")]
+JobsOption = Annotated[int | None, Option(metavar="J", help="Worker processes; by default one per core.")]
 ClusterOption = Annotated[
-    str | None,
-    Option(
-        "--cluster", metavar="ADDRESS", help="Run on Dask: a scheduler at tcp://HOST:PORT, or local:N to start one."
-    ),
+    str | None, Option(metavar="ADDRESS", help="Run on Dask: a scheduler at tcp://HOST:PORT, or local:N to start one.")
 ]
 CaseTimeOption = Annotated[
-    float | None, Option("--case-time", metavar="S", help="Time limit of a case in seconds (limits.case_time_s).")
+    float | None, Option(metavar="S", help="Time limit of a case in seconds (limits.case_time_s).")
 ]
 ChangedOption = Annotated[
     bool, Option("--allow-changed", help="Continue with changed code or versions; the record notes it.")
 ]
 
-OutOption = Annotated[
-    Path | None, Option("--out", metavar="DIR", help="Folder; by default runs/<campaign>-<UTC time>.")
-]
+OutOption = Annotated[Path | None, Option(metavar="DIR", help="Folder; by default runs/<campaign>-<UTC time>.")]
 OverwriteOption = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
 
 Parameters = ParamSpec("Parameters")
@@ -87,13 +80,13 @@ def with_options(kind: type[Options]) -> Callable[[Callable[[Options], None]], C
     fields = [one.replace(annotation=hints[name]) for name, one in inspect.signature(kind).parameters.items()]
 
     def decorate(command: Callable[[Options], None]) -> Callable[..., None]:
-        def wrapped(**given: Any) -> None:
+        def call(**given: Any) -> None:
             command(kind(**given))
 
-        wrapped.__name__, wrapped.__doc__ = command.__name__, command.__doc__
-        wrapped.__annotations__ = hints
-        wrapped.__signature__ = inspect.Signature(fields)  # type: ignore[attr-defined]
-        return wrapped
+        call.__name__, call.__doc__ = command.__name__, command.__doc__
+        call.__annotations__ = hints
+        call.__signature__ = inspect.Signature(fields)  # type: ignore[attr-defined]
+        return call
 
     return decorate
 
@@ -102,7 +95,7 @@ def handle_user_errors(command: Callable[Parameters, None]) -> Callable[Paramete
     """Wrap a command: a user error, a full disk or a read-only one ends it with one message and status 2."""
 
     @functools.wraps(command)
-    def wrapped(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
         # imported here, so that `doctor` can report a foreign package in place of ours
         from marsyard.campaigns.errors import CampaignError
 
@@ -113,7 +106,7 @@ def handle_user_errors(command: Callable[Parameters, None]) -> Callable[Paramete
                 raise
             fail(error)
 
-    return wrapped
+    return call
 
 
 def fail(error: object) -> NoReturn:

@@ -1,12 +1,17 @@
-"""A campaign's verdict, exit status, report, table and pictures from its stored rows."""
+"""A campaign's verdict, exit status, report, table and pictures from its stored rows; server of a site."""
 
 from __future__ import annotations
 
+import ipaddress
 import math
+import os
 import shutil
+import socket
 import subprocess
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -17,25 +22,29 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from marsyard.campaigns.definition.former_names import stored_columns_now
-from marsyard.campaigns.errors import CampaignError, StoreError, writing
-from marsyard.campaigns.execution.workers import LocalExecutor
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.configuration import stored_columns_now
+from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
+from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
+from marsyard.campaigns.running.engine import Watch, append_cases, run_campaign
+from marsyard.campaigns.running.preparation import estimate
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_with
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.products import case_directory, save_packed
 from marsyard.campaigns.store.record import is_locked, stored_configuration
 from marsyard.campaigns.store.table import TABLE_FILE, refresh_table, stored_row
-from marsyard.cli.options import Exit
+from marsyard.cli.options import Exit, size_text
 from marsyard.cli.showing import grid_table
 from marsyard.reports.campaign import write_evaluation
-from marsyard.reports.cases import notable_cases
-from marsyard.reports.columns import primary_metric
 from marsyard.reports.comparison import comparison, comparison_grids
-from marsyard.reports.evaluation import Judged, judged
+from marsyard.reports.evaluation import Judged, evaluate_run, next_look
+from marsyard.reports.presentation import notable_cases
+from marsyard.reports.sampling_design import read_sampling_design
+from marsyard.reports.statistics.proportions import minimum_sample_size, planned_looks
 from marsyard.reports.stored import read_run
 from marsyard.reports.tables import verdict_table
-from marsyard.reports.verdicts import Verdict
-from marsyard.reports.wording import count
+from marsyard.reports.verdicts import ESTIMATE, Verdict, judge_campaign
+from marsyard.reports.wording import count, format_fraction, primary_metric
 
 #: Browsers that can print pages, in order of preference.
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -56,14 +65,13 @@ def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[s
         refresh_table(directory)
     found, page = settle(directory, requirements)
     console.print(verdict_table(found.verdicts))
-    for table in _comparison_tables(found.how.drawn(found.run.frame), found.run.requirements, found.verdicts):
+    for table in _comparison_tables(found.how.draw(found.run.frame), found.run.requirements, found.verdicts):
         console.print(table)
     lines = [f"verdict: {found.whole.word}", found.whole.sentence, f"report: {page}"]
     if not finished:
         state = "killed" if stored["state"] == "running" else stored["state"]
-        reason = (
-            "it is running" if is_locked(directory) else f"it was {state}; to continue: marsyard resume {directory}"
-        )
+        reason = f"it was {state}; to continue: marsyard resume {directory}"
+        reason = "it is running" if is_locked(directory) else reason
         lines.insert(0, f"INCOMPLETE: {len(found.run.whole)} of {count(stored['cases'], 'case')}; {reason}")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
@@ -78,11 +86,11 @@ def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
 
     Raises StoreError where the folder holds no campaign with rows, or the report cannot be written.
     """
-    found = judged(directory, requirements)
-    if requirements is None and found.run.recorded("state") == "finished":
-        record.update(directory, {"exit_code": found.exit_code})
-    with writing("the report"):
-        return found, write_evaluation(found)
+    evaluation = evaluate_run(directory, requirements)
+    if requirements is None and evaluation.run.recorded("state") == "finished":
+        record.update(directory, {"exit_code": evaluation.exit_code})
+    with report_write_errors("the report"):
+        return evaluation, write_evaluation(evaluation)
 
 
 def _comparison_tables(
@@ -115,7 +123,7 @@ def write_csv(directory: Path) -> Path:
     """Write all rows as CSV in batches, atomically."""
     path = directory / "cases.csv"
     partial = path.with_name(f"{path.name}.partial")
-    with writing(path):
+    with report_write_errors(path):
         table = pq.ParquetFile(directory / TABLE_FILE)
         with pa_csv.CSVWriter(partial, table.schema_arrow) as writer:
             for batch in table.iter_batches():
@@ -160,3 +168,165 @@ def rerun_notable_cases(directory: Path) -> None:
             save_packed(case_directory(directory, case), replayed.products, replayed.row)
             differs = f", and differs from its row in: {', '.join(replayed.differing)}" if replayed.differing else ""
             typer.echo(f"case {case}: ran again for its pictures{differs}")
+
+
+#: Terrains are counted of at most this many cases; a draw takes milliseconds.
+_MAX_DRAWS = 5000
+
+
+def evidence_limits(campaign: Campaign) -> list[str]:
+    """Why requirements cannot be PASS even without a failure, with the remedy; empty where they can.
+
+    Covers requirements that are decided at a confidence, each as of all cases: a smaller population needs more.
+    """
+    configuration = campaign.configuration
+    asked = [one for one in configuration.requirements if one.decide_by != ESTIMATE]
+    how = read_sampling_design(configuration.model_dump(mode="json"))
+    if not asked:
+        return []
+    if not how.independent:
+        return [how.no_probability]
+    hardest = max(asked, key=lambda one: minimum_sample_size(one.probability, one.confidence))
+    fewest = minimum_sample_size(hardest.probability, hardest.confidence)
+    cases = configuration.total_cases
+    what = f"{hardest.id}: {format_fraction(hardest.probability)} at {format_fraction(hardest.confidence)} confidence"
+    limits = []
+    if cases < fewest:
+        limits.append(f"{what} takes at least {count(fewest, 'case')} without a failure, and {cases} are asked for.")
+    supply = how.terrains
+    if supply is None:
+        return limits
+    # the distinct terrains of the cases: in turn, or as drawn
+    terrains = min(cases, supply.terrains) if supply.in_turn else cases
+    path = next((path for path in ("location.terrain", "world.terrain") if path in configuration.dispersions), None)
+    if not supply.in_turn and path is not None and cases <= _MAX_DRAWS:
+        terrains = len({campaign.draws(case)[path] for case in range(int(configuration.design.nominal), cases)})
+    # cases with a terrain each are limited by their number alone; others are counted by terrains
+    if terrains < min(cases, fewest):
+        limits.append(supply.advice(fewest, hardest.probability, hardest.confidence))
+    return limits
+
+
+def print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:
+    """Print the estimated time and disk space of a campaign."""
+    workers = executor.jobs if executor.cluster is None else os.cpu_count() or 1
+    estimated = estimate(campaign, workers)
+    total = campaign.configuration.total_cases
+    low, high = estimated.case_range_s
+    time_s = estimated.time_s
+    duration = f"{time_s / 60.0:.0f} min" if time_s < 7200.0 else f"{time_s / 3600.0:.1f} h"
+    duration = f"{time_s:.0f} s" if time_s < 120.0 else duration
+    typer.echo(f"{count(total, 'case')} on {count(workers, 'worker')}: about {duration}")
+    if estimated.inputs:
+        typer.echo(f"  {count(estimated.inputs, 'terrain')} (shared inputs) to build, {estimated.input_s:.3g} s each")
+    trials = count(estimated.trials, "trial case")
+    typer.echo(f"  {estimated.case_s:.3g} s a case ({low:.3g} to {high:.3g} s in {trials})")
+    if estimated.unfinished:
+        typer.echo(f"  {estimated.unfinished} of the trial cases did not come to their end")
+    rows, products = size_text(estimated.rows_bytes), size_text(estimated.products_bytes)
+    typer.echo(f"disk: {rows} of rows, up to {products} of products")
+    if estimated.inputs_bytes:
+        limit = size_text(estimated.cache_limit_bytes)
+        typer.echo(f"  {size_text(estimated.inputs_bytes)} of terrains in the cache, which keeps at most {limit}")
+
+
+def print_limits(campaign: Campaign) -> None:
+    """Print why the campaign's requirements cannot be PASS, and the remedy."""
+    for limit in evidence_limits(campaign):
+        typer.echo(f"note: {limit}")
+
+
+def run_until_decided(campaign: Campaign, directory: Path, executor: ExecutorConfig, watch: Watch) -> None:
+    """Run a campaign of at most its number of cases; see `marsyard.reports.statistics.proportions`.
+
+    Raises CampaignError for dependent draws, or without a requirement to decide; and as `run_campaign`.
+    """
+    configuration = campaign.configuration
+    how = read_sampling_design(configuration.model_dump(mode="json"))
+    if not how.independent:
+        raise CampaignError(f"--until-decided: {how.no_probability}")
+    if all(asked.decide_by == ESTIMATE for asked in configuration.requirements):
+        raise CampaignError("--until-decided: the campaign has no requirement that is decided at a confidence")
+    limit = configuration.total_cases
+    first = configuration.model_copy(
+        update={"cases": planned_looks(limit)[0].cases, "appended": (), "max_cases": limit}
+    )
+    command = (*campaign.command, "--until-decided")
+    run_campaign(Campaign(first, campaign.scenario, command), directory, executor, watch)
+    continue_until_decided(directory, executor, watch)
+
+
+def continue_until_decided(directory: Path, executor: ExecutorConfig, watch: Watch) -> None:
+    """Add cases to a finished campaign with looks until it is decided."""
+    from marsyard.cli.outcome import read_frame  # the reports, which `new` does not need
+
+    while True:
+        configuration = record.stored_configuration(directory)
+        if configuration.max_cases is None:
+            return
+        plain = configuration.model_dump(mode="json")
+        how, cases = read_sampling_design(plain), configuration.total_cases
+        look = next_look(judge_campaign(read_frame(directory), plain["requirements"], how), how, cases)
+        if look is None:
+            watch.note(f"stopped after {cases} of at most {count(configuration.max_cases, 'case')}")
+            return
+        append_cases(directory, look - cases, executor, watch)
+
+
+class _Handler(SimpleHTTPRequestHandler):
+    """Serves the site's files; lists no folders, follows nothing out of it, and keeps quiet.
+
+    `names` are the host names by which the server may be addressed.
+    """
+
+    def __init__(self, *args: Any, names: Collection[str], **kwargs: Any) -> None:
+        self._names = names
+        super().__init__(*args, **kwargs)
+
+    def parse_request(self) -> bool:
+        """Refuse a request for another host: a foreign page whose name was bound to this address may not read."""
+        if not super().parse_request():
+            return False
+        if not is_own_host(self.headers.get("Host", ""), self._names):
+            self.send_error(403, "this server is not known by that host name")
+            return False
+        return True
+
+    def translate_path(self, path: str) -> str:
+        """The file that a path of the address means; one that is not there where it leads out of the site."""
+        root = Path(self.directory).resolve()
+        try:
+            target = Path(super().translate_path(path)).resolve()
+        except (OSError, ValueError):  # such as a name with a zero byte
+            return str(root / "no such file")
+        return str(target if target.is_relative_to(root) else root / "no such file")
+
+    def list_directory(self, path: object) -> None:
+        """Refuses."""
+        self.send_error(404, "no such file")
+
+    def log_message(self, *_: object) -> None:
+        """Keeps quiet."""
+
+
+def is_own_host(header: str, names: Collection[str]) -> bool:
+    """Whether a Host header names this server: by an address, which no name server can redirect, or by a known name.
+
+    >>> [is_own_host(text, ["localhost"]) for text in ("127.0.0.1:80", "[::1]", "LOCALHOST:8", "evil.example", "")]
+    [True, True, True, False, False]
+    """
+    host = header.strip().lower()
+    host = host[1:].partition("]")[0] if host.startswith("[") else host.partition(":")[0]
+    if host in names:
+        return True
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def server(directory: Path, host: str, port: int) -> ThreadingHTTPServer:
+    """A server of a site's folder; port 0 takes one that is free."""
+    names = {"localhost", host.lower(), socket.gethostname().lower()}
+    return ThreadingHTTPServer((host, port), partial(_Handler, directory=str(directory), names=names))

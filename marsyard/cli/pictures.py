@@ -18,19 +18,11 @@ from jaxtyping import Bool, UInt16
 
 from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, is_terrain_file, site_or_file
 from marsyard.scenarios.views import STANCES, Eye, SiteGround, camera_pose, site_scene
+from marsyard.sim import sensor
 from marsyard.sim.camera import BODY_FRAME, CameraModel, write_cahvor
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Frame, PixelRays, Scene, Sun, process_renderer
 from marsyard.sim.render.backend import default_backend
-from marsyard.sim.sensor import (
-    PRESETS,
-    AutoExposure,
-    AutoExposureParameters,
-    Detector,
-    auto_expose,
-    natural_fall_off,
-    preset,
-)
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Site, sites
 from marsyard.sim.terrain.imported import embed
@@ -64,16 +56,11 @@ class Shot:
         """A picture from the camera's usual pose with these settings. Raises ValueError for an invalid one."""
         if not is_terrain_file(site):
             _check_name("site", site, sites())
-        _check_name("camera", camera, PRESETS)
+        _check_name("camera", camera, sensor.PRESETS)
         stance = STANCES[camera]
         usual = {"scale": stance.scale, "altitude_m": stance.height_m, "elevation_deg": stance.elevation_deg}
-        usual |= {
-            "east_m": 0.0,
-            "north_m": 0.0,
-            "azimuth_deg": 0.0,
-            "sun_azimuth_deg": 250.0,
-            "sun_elevation_deg": 35.0,
-        }
+        usual |= dict.fromkeys(("east_m", "north_m", "azimuth_deg"), 0.0)
+        usual |= {"sun_azimuth_deg": 250.0, "sun_elevation_deg": 35.0}
         usual |= {"seed": 1, "max_hole_fraction": MAX_HOLE_FRACTION}
         given = {name: value for name, value in settings.items() if value is not None}
         if is_terrain_file(site):  # it lies in the middle of the periodic terrain
@@ -120,7 +107,7 @@ class Picture:
     mounted: CameraModel  #: in the body frame, as written to the file
     frame: Frame  #: radiance and truth
     scene: Scene
-    exposed: AutoExposure | None  #: the detector at its automatic exposure time; None without detector
+    exposed: sensor.AutoExposure | None  #: the detector at its automatic exposure time; None without detector
     counts: UInt16[np.ndarray, "rows columns"] | None  #: None without detector
     #: whether a pixel sees a filled hole of a terrain model; None on a preset's ground
     filled: Bool[np.ndarray, "rows columns"] | None
@@ -141,52 +128,54 @@ class Picture:
 def take(shot: Shot, *, detector: bool = True, both: bool = True) -> list[Picture]:
     """Take the picture; of a stereo pair both, or the left one alone."""
     ground = SiteGround.of(shot.site_definition, "descent" if shot.scale == "descent" else "ground", seed=shot.seed)
-    of_camera = preset(shot.camera)
+    of_camera = sensor.preset(shot.camera)
     cameras = of_camera.cameras()
     position = (shot.east_m, shot.north_m, shot.altitude_m)
     pose = camera_pose(ground.surface, of_camera.design, *position, shot.azimuth_deg, shot.elevation_deg)
     towards_sun = direction(np.radians(shot.sun_azimuth_deg), np.radians(shot.sun_elevation_deg))
     sun = Sun(towards_sun, ground.site.environment.sun_radius_rad)
-    taken = cameras if both else cameras[:1]
-    rays = [PixelRays.of(camera) for camera in taken]
+    selected = cameras if both else cameras[:1]
+    rays = [PixelRays.of(camera) for camera in selected]
     # The cameras of a pair are so close together that one scene serves both.
     scene = site_scene(ground, Eye.of(rays[0], pose, ground.surface), sun)
     pictures = []
-    for number, camera in enumerate(taken):
+    for number, camera in enumerate(selected):
         frame = process_renderer(default_backend()).render(scene, rays[number], pose)
-        exposed, counts = _exposed(shot, ground, camera, number, frame) if detector else (None, None)
+        exposed, counts = _expose(shot, ground, camera, number, frame) if detector else (None, None)
         suffix = "" if len(cameras) == 1 else ("-left", "-right")[number]
-        filled = _filled(ground, frame)
-        pictures.append(Picture(suffix, camera.moved(pose), camera, frame, scene, exposed, counts, filled))
+        filled = _mark_filled(ground, frame)
+        pictures.append(Picture(suffix, camera.transform(pose), camera, frame, scene, exposed, counts, filled))
     return pictures
 
 
-def _filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows columns"] | None:
+def _mark_filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows columns"] | None:
     """Mark the pixels that see ground in holes of a terrain model; None for the ground of a preset."""
     terrain = ground.terrain
     if terrain.source is None:
         return None
     holes = embed(terrain.source, terrain.samples, terrain.spacing_m).filled_samples(terrain.samples)
-    seen = np.isfinite(frame.range_m)
-    points = np.where(seen[..., None], frame.points_world(), 0.0)
+    visible = np.isfinite(frame.range_m)
+    points = np.where(visible[..., None], frame.points_world(), 0.0)
     column, row = (np.rint(points[..., axis] / terrain.spacing_m).astype(int) % terrain.samples for axis in (0, 1))
-    return np.asarray(seen & holes[row, column])
+    return np.asarray(visible & holes[row, column])
 
 
-def _exposed(
+def _expose(
     shot: Shot, ground: SiteGround, camera: CameraModel, number: int, frame: Frame
-) -> tuple[AutoExposure, UInt16[np.ndarray, "rows columns"]]:
+) -> tuple[sensor.AutoExposure, UInt16[np.ndarray, "rows columns"]]:
     """Expose the camera's detector at the site automatically; its rows are not summed."""
     streams = Streams(shot.seed, "render", number)
-    of_camera, air = preset(shot.camera), ground.site.environment
+    of_camera, air = sensor.preset(shot.camera), ground.site.environment
     # The preset's light may be another planet's.
     sun_au = 1.0 / math.sqrt(air.solar_irradiance)
     lit = {"responsivity_e_s": of_camera.light.responsivity_e_s(sun_au), "sun_au": sun_au}
     parameters = of_camera.detector.model_copy(update={**lit, "rows_summed": 1})
-    detector = Detector.drawn(natural_fall_off(camera), parameters, streams.generator("detector response"))
+    detector = sensor.Detector.draw(sensor.natural_fall_off(camera), parameters, streams.generator("detector response"))
     # the frame's radiance factor is over the sunlight at the ground; the detector's is over that above the air
     radiance = frame.radiance * np.float32(air.direct_share(math.radians(shot.sun_elevation_deg)))
-    exposed = auto_expose(detector, radiance, AutoExposureParameters(), streams.generator("test pictures"))
+    exposed = sensor.auto_expose(
+        detector, radiance, sensor.AutoExposureParameters(), streams.generator("test pictures")
+    )
     return exposed, exposed.detector.expose(radiance, streams.generator("detector noise"))
 
 
@@ -283,7 +272,7 @@ def check_files(prefix: Path, camera: str, overwrite: bool) -> None:
         raise ValueError(f"--out {prefix}: there is no folder {folder}")
     if not os.access(folder, os.W_OK):
         raise ValueError(f"--out {prefix}: the folder {folder} cannot be written to")
-    suffixes = ("",) if preset(camera).design.baseline_m is None else ("-left", "-right")
+    suffixes = ("",) if sensor.preset(camera).design.baseline_m is None else ("-left", "-right")
     paths = [_path(prefix, suffix, ending) for suffix in suffixes for ending in ENDINGS]
     existing = [str(path) for path in paths if path.exists()]
     if existing and not overwrite:

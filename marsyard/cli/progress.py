@@ -130,7 +130,7 @@ class RunLog:
     def __init__(self, directory: Path, watch: Watch) -> None:
         self._path, self._watch = directory / LOG_FILE, watch
         self._stage, self._total, self._done = "", 0, 0
-        self._started, self._written, self._begun = time.monotonic(), 0.0, False
+        self._started, self._write_campaign, self._begun = time.monotonic(), 0.0, False
 
     def __enter__(self) -> Self:
         return self
@@ -153,7 +153,7 @@ class RunLog:
     def step(self) -> None:
         """Count a step; log the progress at intervals."""
         self._done += 1
-        if self._done == self._total or time.monotonic() - self._written > LOG_INTERVAL_S:
+        if self._done == self._total or time.monotonic() - self._write_campaign > LOG_INTERVAL_S:
             self._line(f"{self._stage}: {self._done}/{self._total}")
         self._watch.step()
 
@@ -163,7 +163,7 @@ class RunLog:
         self._watch.note(text)
 
     def _line(self, text: str) -> None:
-        self._written, lines = time.monotonic(), [text]
+        self._write_campaign, lines = time.monotonic(), [text]
         if not self._begun:
             self._begun = True
             versions = f"marsyard {version('marsyard')}, Python {platform.python_version()}, {platform.platform()}"

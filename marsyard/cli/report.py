@@ -1,4 +1,4 @@
-"""`marsyard report`, `compare` and `dashboard`: verdicts, differences and a static site from stored rows."""
+"""`marsyard report`, `compare`, `dashboard` and `nightly`: verdicts, differences, a static site, and planned runs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from marsyard.cli.options import DirectoryArgument, JsonOption, console, handle_user_errors
+from marsyard.cli.campaign import make_executor, stop_on_signals
+from marsyard.cli.options import DirectoryArgument, Exit, JobsOption, JsonOption, console, handle_user_errors
 
 LOOPBACK = "127.0.0.1"
 
@@ -18,10 +19,7 @@ LOOPBACK = "127.0.0.1"
 def report(
     directory: DirectoryArgument,
     requirements: Annotated[
-        Path | None,
-        Option(
-            "--requirements", metavar="FILE", help="Judge by this file's requirements for the campaign, not by its own."
-        ),
+        Path | None, Option(metavar="FILE", help="Judge by this file's requirements for the campaign, not by its own.")
     ] = None,
     pdf: Annotated[bool, Option("--pdf", help="Also print the page to report.pdf (needs Chromium).")] = False,
     csv: Annotated[bool, Option("--csv", help="Also write all rows to cases.csv.")] = False,
@@ -70,14 +68,14 @@ def compare(
     from marsyard.reports.stored import read_run
 
     runs = [read_run(directory) for directory in (first, second)]
-    paired, found = comparison.compare_campaigns(*runs)
+    paired, differences = comparison.compare_campaigns(*runs)
     names, same_terrains = [str(run.directory) for run in runs], comparison.have_same_terrains(*runs)
     if as_json:
         data = {"first": names[0], "second": names[1], "paired": paired, "same_terrains": same_terrains}
-        typer.echo(json.dumps({**data, "figures": comparison.campaign_diff_data(found)}, indent=2))
+        typer.echo(json.dumps({**data, "figures": comparison.campaign_diff_data(differences)}, indent=2))
         return
     out = console()
-    out.print(grid_table("Side by side", comparison.campaign_diff_grid(["first", "second"], found)))
+    out.print(grid_table("Side by side", comparison.campaign_diff_grid(["first", "second"], differences)))
     out.print(f"first: {names[0]}\nsecond: {names[1]}", markup=False, highlight=False, soft_wrap=True)
     grounds = "terrain by terrain" if same_terrains else "terrains of their own against one another"
     how = "the same draws, compared in pairs" if paired else f"draws of their own, compared {grounds}"
@@ -89,25 +87,21 @@ def dashboard(
     directories: Annotated[
         list[Path], Argument(metavar="DIR...", help="Folders of campaigns, or their parent folders.")
     ],
-    out: Annotated[Path, Option("--out", metavar="DIR", help="The site's folder.")] = Path("site"),
-    requirements: Annotated[
-        Path | None, Option("--requirements", metavar="FILE", help="Requirements to show in place of ours.")
-    ] = None,
-    serve: Annotated[
-        int | None, Option("--serve", metavar="PORT", help="Serve the site on this machine only.", min=0)
-    ] = None,
-    host: Annotated[str, Option("--host", metavar="ADDRESS", help="With --serve: address to listen on.")] = LOOPBACK,
+    out: Annotated[Path, Option(metavar="DIR", help="The site's folder.")] = Path("site"),
+    requirements: Annotated[Path | None, Option(metavar="FILE", help="Requirements to show in place of ours.")] = None,
+    serve: Annotated[int | None, Option(metavar="PORT", help="Serve the site on this machine only.", min=0)] = None,
+    host: Annotated[str, Option(metavar="ADDRESS", help="With --serve: address to listen on.")] = LOOPBACK,
 ) -> None:
     """Write a dashboard over stored campaigns: requirements, latest verdicts, trends, pages of campaigns and cases."""
     from marsyard.campaigns.definition.requirements import read_requirements
-    from marsyard.campaigns.errors import CampaignError, writing
+    from marsyard.campaigns.errors import CampaignError, report_write_errors
     from marsyard.reports.dashboard.site import write_site
 
     missing = [str(one) for one in directories if not one.is_dir()]
     if missing:
         raise CampaignError(f"no such folder: {', '.join(missing)}")
     stated = None if requirements is None else {one.id: one for one in read_requirements(requirements)}
-    with writing(out):
+    with report_write_errors(out):
         site = write_site(out, directories, stated)
     for problem in site.problems:
         typer.echo(f"not shown: {problem}", err=True)
@@ -115,7 +109,7 @@ def dashboard(
     typer.echo(f"dashboard: {site.index}")
     if serve is None:
         return
-    from marsyard.cli.site_server import server
+    from marsyard.cli.outcome import server
 
     try:
         serving = server(out, host, serve)
@@ -127,3 +121,43 @@ def dashboard(
             serving.serve_forever()
         except KeyboardInterrupt:
             typer.echo("ended")
+
+
+@handle_user_errors
+def nightly(
+    plan: Annotated[Path | None, Argument(metavar="[PLAN.toml]", help="The plan; by default the built-in one.")] = None,
+    out: Annotated[Path, Option(metavar="DIR", help="Folder of history, runs, page and dashboard.")] = Path("nightly"),
+    jobs: JobsOption = None,
+) -> None:
+    """Run the plan's campaigns, compare each figure with the nights before, write nightly.md and the dashboard.
+
+    Exit status: as of the campaigns, the worst; 1 also for a regression, or a campaign that could not be run.
+    """
+    from marsyard.campaigns.errors import report_write_errors
+    from marsyard.campaigns.store.record import folder_lock, git_commit
+    from marsyard.cli import nightly_plan as plans
+    from marsyard.cli.progress import campaign_progress
+    from marsyard.reports.history import FINISHED, INTERRUPTED, History, changes, compare_night
+
+    path = plan or plans.PLAN_FILE
+    stated, executor = plans.read_plan(path), make_executor(jobs, None)
+    with report_write_errors(out):
+        (out / plans.RUNS).mkdir(parents=True, exist_ok=True)
+    with folder_lock(out), History(out / plans.HISTORY_FILE) as history:
+        night = history.begin(git_commit())
+        # the page of a night that is killed
+        plans.write_page(history, night, out, ())
+        try:
+            with stop_on_signals(), campaign_progress(console(stderr=True)) as watch:
+                for one in stated.campaigns:
+                    plans.run_planned(plans.Night(history, night, out, executor, stated), one, path.parent, watch)
+        except KeyboardInterrupt:
+            history.finish(night, INTERRUPTED)
+            plans.publish(history, night, out, ())
+            raise typer.Exit(Exit.INTERRUPTED) from None
+        flagged = changes(compare_night(history, night))
+        history.finish(night, FINISHED, [(one.campaign, one.figure, one.p_value, one.worse) for one in flagged])
+        plans.publish(history, night, out, flagged)
+        statuses = {one.exit_code for one in history.campaigns(night)}
+    statuses |= {int(Exit.FAILED) for one in flagged if one.worse}
+    raise typer.Exit(next((one for one in (Exit.FAILED, Exit.INSUFFICIENT) if one in statuses), Exit.MET))

@@ -1,4 +1,4 @@
-"""A campaign on the terminal: its definition, and the draws of its dispersions."""
+"""A campaign on the terminal: its definition and draws; the stages of a case as files."""
 
 from __future__ import annotations
 
@@ -14,13 +14,16 @@ from rich.text import Text
 
 from marsyard.campaigns.definition.campaign import Campaign, leaves, value_at
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, description_at
-from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.errors import CampaignError, report_write_errors
 from marsyard.campaigns.sampling.design import describe_design
-from marsyard.reports.columns import split_unit
-from marsyard.reports.wording import asked_text, count
+from marsyard.reports.wording import count, requirement_text, split_unit
 
 if TYPE_CHECKING:
     from marsyard.reports.section import Grid
+import re
+from collections.abc import Mapping
+
+import numpy as np
 
 #: Width of a column of drawn values with its margin.
 _VALUE_WIDTH = 12
@@ -62,7 +65,7 @@ def show_campaign(campaign: Campaign, console: Console) -> None:
         console.print(table)
     table = _table("Requirements", "id", "statement", "asked")
     for asked in configuration.requirements:
-        table.add_row(Text(asked.id), Text(asked.statement), Text(asked_text(asked, asked.metric)))
+        table.add_row(Text(asked.id), Text(asked.statement), Text(requirement_text(asked, asked.metric)))
     console.print(table)
 
 
@@ -71,7 +74,7 @@ def show_draws(campaign: Campaign, cases: int, console: Console) -> None:
 
     A row begins with minimum, mean and maximum over all cases; of values other than numbers, the number of kinds.
     """
-    drawn, nominal = drawn_values(campaign, cases), int(campaign.configuration.design.nominal)
+    drawn, nominal = list_drawn_values(campaign, cases), int(campaign.configuration.design.nominal)
     _print_head(campaign.configuration, console)
     cases = cases if drawn else 0
     units = {path: campaign.marginals[path].unit for path in drawn}
@@ -95,14 +98,14 @@ def show_draws(campaign: Campaign, cases: int, console: Console) -> None:
     console.print(table)
 
 
-def described(campaign: Campaign, cases: int | None) -> dict[str, Any]:
+def describe_campaign(campaign: Campaign, cases: int | None) -> dict[str, Any]:
     """A campaign as plain data, optionally with the draws of its first cases; infinite bounds are None."""
     configuration = campaign.configuration
     data: dict[str, Any] = configuration.model_dump(mode="json")
     data["design"]["text"] = _sampling_text(configuration)
     data["dispersions"] = [_dispersion_data(campaign, path) for path in configuration.dispersions]
     if cases is not None:
-        drawn = drawn_values(campaign, cases)
+        drawn = list_drawn_values(campaign, cases)
         data["draws"] = [
             {"case": case, "values": {path: values[case] for path, values in drawn.items()}} for case in range(cases)
         ]
@@ -119,7 +122,7 @@ def write_draws_figure(campaign: Campaign, cases: int, path: Path) -> None:
     if path.suffix not in _FIGURES:
         raise CampaignError(f"--figure {path}: unknown kind of picture; allowed: {', '.join(_FIGURES)}")
     nominal = int(campaign.configuration.design.nominal)
-    drawn = {name: values[nominal:] for name, values in drawn_values(campaign, cases).items()}
+    drawn = {name: values[nominal:] for name, values in list_drawn_values(campaign, cases).items()}
     if not any(drawn.values()):
         raise CampaignError(f"--figure {path}: nothing is drawn in {count(cases, 'case')}")
     of_each = []
@@ -128,13 +131,11 @@ def write_draws_figure(campaign: Campaign, cases: int, path: Path) -> None:
         if not dispersion.formulas:
             quantiles = [dispersion.quantile((index + 0.5) / _QUANTILES) for index in range(_QUANTILES)]
         of_each.append(Drawn(name, values, quantiles))
-    try:
+    with report_write_errors(f"--figure {path}:"):
         save_figure(draws_figure(campaign.configuration.name, of_each), path)
-    except OSError as error:
-        raise CampaignError(f"--figure {path}: cannot be written: {error.strerror or error}") from error
 
 
-def drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
+def list_drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
     """The draws of each dispersion in the first cases, by parameter.
 
     Raises CampaignError where the campaign has fewer cases, or a case cannot be drawn.
@@ -187,7 +188,6 @@ def _dispersion_data(campaign: Campaign, path: str) -> dict[str, Any]:
 
 
 def _value(value: Any) -> str:
-    """A drawn value, numbers with five digits."""
     if isinstance(value, float):
         return f"{value:.5g}"
     return value if isinstance(value, str) else json.dumps(value, default=str)
@@ -208,3 +208,44 @@ def grid_table(title: str, grid: Grid) -> Table:
     for row in grid.rows:
         table.add_row(*map(Text, row))
     return table
+
+
+_PIXELS = (np.uint8, np.uint16)
+
+
+def write_stages(directory: Path, products: Mapping[str, Any]) -> int:
+    """Write each product to its own file, numbered in the order of the stages; return the number of files.
+
+    A picture (8 or 16 bits, two dimensions, or three with three bands) is a PNG with unchanged counts; any other array
+    is `.npy`; all else is JSON. A table or list of products is a folder. Raises StoreError.
+    """
+    with report_write_errors(directory):
+        return _write(directory, products)
+
+
+def _write(directory: Path, products: Mapping[str, Any]) -> int:
+    directory.mkdir(parents=True, exist_ok=True)
+    written = 0
+    for position, (name, value) in enumerate(products.items(), start=1):
+        path = directory / f"{position:02d}-{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}"
+        if isinstance(value, list) and any(isinstance(inner, np.ndarray | Mapping) for inner in value):
+            value = {str(number): inner for number, inner in enumerate(value)}
+        if isinstance(value, Mapping) and _holds_arrays(value):
+            written += _write(path, value)
+            continue
+        written += 1
+        if not isinstance(value, np.ndarray):
+            path.with_name(f"{path.name}.json").write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
+        elif (value.ndim == 2 or value.shape[2:] == (3,)) and value.dtype in _PIXELS and min(value.shape[:2]) > 1:
+            import cv2
+
+            cv2.imwrite(f"{path}.png", value)
+        else:
+            np.save(path.with_name(f"{path.name}.npy"), value, allow_pickle=False)
+    return written
+
+
+def _holds_arrays(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        return any(_holds_arrays(inner) for inner in value.values())
+    return isinstance(value, np.ndarray) or (isinstance(value, list) and any(_holds_arrays(inner) for inner in value))

@@ -1,4 +1,4 @@
-"""`marsyard terrain`: the sites, and figures of their terrain next to the field test paper's."""
+"""`marsyard render`, `gallery` and `terrain`: pictures of sites, and statistics of their terrain."""
 
 from __future__ import annotations
 
@@ -17,7 +17,12 @@ if TYPE_CHECKING:
     from marsyard.sim.terrain import Surface
     from marsyard.sim.terrain.imported import Embedded, RealExtent
     from marsyard.sim.terrain.parameters import TerrainParameters
-    from marsyard.sim.terrain.statistics import TerrainStatistics
+    from marsyard.sim.terrain.surface import TerrainStatistics
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from marsyard.cli.options import OverwriteOption, with_options
 
 #: Longest side of a picture; colours are blue, green, red.
 MAX_PIXELS = 2048
@@ -37,10 +42,8 @@ def list_sites(as_json: JsonOption = False) -> None:
     for heading in ("site", "planet", "terrain", "description"):
         table.add_column(heading)
     for one in sites().values():
-        planet, scales = (
-            one.environment.planet,
-            [name for name in ("descent", "ground") if getattr(one, name) is not None],
-        )
+        planet = one.environment.planet
+        scales = [name for name in ("descent", "ground") if getattr(one, name) is not None]
         rows.append({"name": one.name, "planet": planet, "terrain": scales, "description": one.description})
         table.add_row(one.name, planet, ", ".join(scales), one.description)
     if as_json:
@@ -52,15 +55,11 @@ def list_sites(as_json: JsonOption = False) -> None:
 @app.command()
 def stats(
     site: SiteArgument,
-    scale: Annotated[
-        str | None, Option("--scale", metavar="SCALE", help="descent or ground; by default the coarser one.")
-    ] = None,
-    seed: Annotated[int, Option("--seed", metavar="S", min=0, help="Seed of the terrain.")] = 1,
+    scale: Annotated[str | None, Option(metavar="SCALE", help="descent or ground; by default the coarser one.")] = None,
+    seed: Annotated[int, Option(metavar="S", min=0, help="Seed of the terrain.")] = 1,
     as_json: JsonOption = False,
     max_holes: MaxHolesOption = None,
-    picture: Annotated[
-        Path | None, Option("--picture", metavar="PNG", help="Write a nadir picture; filled holes are red.")
-    ] = None,
+    picture: Annotated[Path | None, Option(metavar="PNG", help="Write a nadir picture; filled holes are red.")] = None,
 ) -> None:
     """Print albedo, slopes, relief and image contrast of a site's terrain next to the paper's figures."""
     import numpy as np
@@ -69,7 +68,7 @@ def stats(
     from marsyard.sim.terrain.bank import synthesise
     from marsyard.sim.terrain.imported import embed
     from marsyard.sim.terrain.sites import PAPER
-    from marsyard.sim.terrain.statistics import terrain_statistics
+    from marsyard.sim.terrain.surface import terrain_statistics
 
     try:
         known = site_or_file(site, MAX_HOLE_FRACTION if max_holes is None else max_holes)
@@ -116,7 +115,7 @@ def _print_statistics(
     from rich.table import Table
 
     from marsyard.sim.terrain.sites import PAPER
-    from marsyard.sim.terrain.statistics import CONTRAST_PIXEL_M, CONTRAST_SUN_ELEVATION_DEG
+    from marsyard.sim.terrain.surface import CONTRAST_PIXEL_M, CONTRAST_SUN_ELEVATION_DEG
 
     side, paper = parameters.samples * parameters.spacing_m, PAPER.get(name)
     albedo, slope, relief, contrast = "", "", "", ""
@@ -170,7 +169,7 @@ def write_terrain_picture(path: Path, surface: Surface, real: Embedded | None) -
     import cv2
     import numpy as np
 
-    from marsyard.sim.terrain.statistics import CONTRAST_SUN_ELEVATION_DEG, nadir_picture
+    from marsyard.sim.terrain.surface import CONTRAST_SUN_ELEVATION_DEG, nadir_picture
 
     if path.suffix.lower() != ".png":
         raise ValueError(f"--picture {path}: a file that ends in .png is needed")
@@ -194,3 +193,69 @@ def write_terrain_picture(path: Path, surface: Surface, real: Embedded | None) -
         raise ValueError(f"--picture {path}: cannot be written ({fault})") from fault
     if not written:
         raise ValueError(f"--picture {path}: cannot be written")
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """Arguments and options of `marsyard render`."""
+
+    site: SiteArgument
+    camera: Annotated[str, Option(metavar="NAME", help="Such as mer-navcam; a wrong name lists all.")]
+    out: Annotated[Path, Option(metavar="PREFIX", help="Path of the files without extension.")]
+    scale: Annotated[str | None, Option(metavar="SCALE", help="descent or ground; by default the camera's.")] = None
+    altitude: Annotated[float | None, Option(metavar="M", help="Height above the ground; by default the camera's.")] = (
+        None
+    )
+    east: Annotated[float | None, Option(metavar="M", help="By default 0, or the middle of a DTM; periodic.")] = None
+    north: Annotated[float | None, Option(metavar="M", help="By default 0, or the middle of a DTM; periodic.")] = None
+    azimuth: Annotated[float, Option(metavar="DEG", help="Viewing direction, clockwise from north.")] = 0.0
+    elevation: Annotated[float | None, Option(metavar="DEG", help="Of the optical axis; -90: down.")] = None
+    sun_azimuth: Annotated[float, Option(metavar="DEG", help="Clockwise from north.")] = 250.0
+    sun_elevation: Annotated[float, Option(metavar="DEG", help="Above the horizon.")] = 35.0
+    detector: Annotated[bool, Option("--detector/--radiance", help="Detector counts, or radiance factor.")] = True
+    seed: Annotated[int, Option(metavar="S", min=0, help="Of the terrain and the noise.")] = 1
+    overwrite: OverwriteOption = False
+    max_holes: MaxHolesOption = None
+
+
+@with_options(RenderOptions)
+def render(given: RenderOptions) -> None:
+    """Render a site or DTM: PREFIX.png (16 bits), .npz (truth), .cahvor (camera), .json; -left, -right of a pair."""
+    from marsyard.cli.pictures import Shot, check_files, take, write
+
+    with report_picture_errors(given.out):
+        settings = {"scale": given.scale, "seed": given.seed, "max_hole_fraction": given.max_holes}
+        settings |= {f"{name}_m": getattr(given, name) for name in ("altitude", "east", "north")}
+        angles = ("azimuth", "elevation", "sun_azimuth", "sun_elevation")
+        settings |= {f"{name}_deg": getattr(given, name) for name in angles}
+        shot = Shot.usual(given.site, given.camera, **settings)
+        check_files(given.out, given.camera, given.overwrite)
+        for picture in take(shot, detector=given.detector):
+            if picture.filled is not None and picture.filled.any():
+                part = f"{picture.filled.mean():.1%} of the pixels{picture.suffix and f' ({picture.suffix[1:]})'}"
+                typer.echo(f"note: {part} see filled holes of the DTM (`filled` in the .npz)", err=True)
+            typer.echo(", ".join(str(path) for path in write(picture, shot, given.out)))
+
+
+@contextmanager
+def report_picture_errors(out: Path) -> Iterator[None]:
+    """End the command with status 2 where pictures cannot be rendered or written."""
+    from marsyard.sim.render.backend import RenderingError
+
+    try:
+        yield
+    except (ValueError, RenderingError) as error:
+        fail(error)
+    except OSError as error:
+        fail(f"cannot write to {out}: {error}")
+
+
+def gallery(
+    out: Annotated[Path, Option(metavar="DIR", help="Folder of the page and pictures.")] = Path("gallery"),
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Render every site through the cameras that fit it: one page, and a contact sheet. Takes about a minute."""
+    from marsyard.cli.gallery import render_gallery
+
+    with report_picture_errors(out):
+        typer.echo(render_gallery(out, overwrite))

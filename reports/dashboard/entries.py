@@ -16,10 +16,10 @@ from marsyard.campaigns.definition.requirements import StatedRequirement
 from marsyard.campaigns.errors import CampaignError
 from marsyard.reports.campaign import SCHEMA, TWIN_FILE, write_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
-from marsyard.reports.traceability import Algorithm, algorithms_of, format_judged_algorithms
+from marsyard.reports.traceability import Algorithm, format_judged_algorithms, judged_algorithms
 from marsyard.reports.verdicts import ESTIMATE
 from marsyard.reports.wording import NOTHING, percent
-from marsyard.scenarios.systems import system_of
+from marsyard.scenarios.systems import find_system
 
 #: Maximum depth of campaigns below a folder.
 _DEPTH = 3
@@ -84,10 +84,10 @@ class Entry:
 
 def find_campaigns(directories: Sequence[Path]) -> list[Path]:
     """Campaigns in or below folders, each once, ordered by path."""
-    found: dict[Path, Path] = {}
+    reports: dict[Path, Path] = {}
     for one in (below for directory in directories for below in _below(directory, _DEPTH)):
-        found.setdefault(one.resolve(), one)
-    return sorted(found.values())
+        reports.setdefault(one.resolve(), one)
+    return sorted(reports.values())
 
 
 def _below(directory: Path, depth: int) -> Iterator[Path]:
@@ -122,16 +122,16 @@ def _read_entry(path: Path) -> Entry:
         twin = table(json.loads(file.read_text(encoding="utf-8")))
     record = table(json.loads((path / RECORD_FILE).read_text(encoding="utf-8")))
     parameters = table(table(record.get("configuration")).get("parameters"))
-    system = system_of(str(table(record.get("configuration")).get("scenario")))
+    system = find_system(str(table(record.get("configuration")).get("scenario")))
     name = str(twin.get("campaign") or path.name)
     return Entry(
-        slug=slug_of(path, name),
+        slug=make_slug(path, name),
         directory=path,
         name=name,
         system="other" if system is None else system.name,
         sites=_named(twin, "sites", parameters, "site"),
         algorithms=_named(twin, "algorithms", parameters, "algorithm"),
-        tested=tuple(algorithms_of(record)),
+        tested=tuple(judged_algorithms(record)),
         commit=str(twin.get("git_commit") or "")[:10],
         started=str(twin.get("started_utc") or ""),
         state=str(twin.get("state") or ""),
@@ -139,14 +139,14 @@ def _read_entry(path: Path) -> Entry:
         crashed=int(twin.get("crashed") or 0),
         verdict=str(twin.get("verdict") or ""),
         sentence=str(twin.get("sentence") or ""),
-        shown=tuple(_shown(table(one)) for one in twin.get("verdicts") or ()),
+        shown=tuple(_shown_requirement(table(one)) for one in twin.get("verdicts") or ()),
         kept=tuple(int(case) for case in twin.get("showcases") or ()),
         worst=tuple(str(case) for case in twin.get("worst_cases") or ()),
         outcomes={str(key): int(value) for key, value in table(twin.get("outcomes")).items()},
     )
 
 
-def _shown(verdict: Mapping[str, Any]) -> ShownRequirement:
+def _shown_requirement(verdict: Mapping[str, Any]) -> ShownRequirement:
     values: dict[str, Any] = {
         name: str(verdict.get(name) or "") for name in ("statement", "status", "decide_by", "note")
     }
@@ -157,7 +157,7 @@ def _shown(verdict: Mapping[str, Any]) -> ShownRequirement:
     return ShownRequirement(requirement=str(verdict.get("requirement_id") or "?"), **values)
 
 
-def slug_of(path: Path, name: str) -> str:
+def make_slug(path: Path, name: str) -> str:
     """Folder name that is unique and cannot lead out of the site."""
     plain = re.sub(r"[^A-Za-z0-9-]+", "-", name)[:60].strip("-") or "campaign"
     return f"{plain}-{hashlib.sha256(str(path.resolve()).encode('utf-8', 'replace')).hexdigest()[:10]}"
@@ -165,9 +165,9 @@ def slug_of(path: Path, name: str) -> str:
 
 def _named(twin: Mapping[str, Any], key: str, parameters: Mapping[str, Any], stated: str) -> tuple[str, ...]:
     """Names in the rows, or that of the parameters where the rows have none."""
-    found = tuple(str(one) for one in twin.get(key) or () if str(one))
+    names = tuple(str(one) for one in twin.get(key) or () if str(one))
     one = _first(parameters, stated)
-    return found or ((one,) if one else ())
+    return names or ((one,) if one else ())
 
 
 def _first(parameters: Mapping[str, Any], key: str) -> str:
@@ -253,29 +253,29 @@ def requirement_rows(entries: Sequence[Entry], stated: Mapping[str, StatedRequir
 
 def sparkline(shown: Sequence[ShownRequirement]) -> Sparkline | None:
     """Observed rates over time against the required rate; None for fewer than two campaigns."""
-    known = [one for one in shown if math.isfinite(one.estimate) and math.isfinite(one.probability)][-_TREND:]
-    if len(known) < 2:
+    finite = [one for one in shown if math.isfinite(one.estimate) and math.isfinite(one.probability)][-_TREND:]
+    if len(finite) < 2:
         return None
-    rates = [one.estimate for one in known]
-    low = min(*rates, *(one.probability for one in known))
+    rates = [one.estimate for one in finite]
+    low = min(*rates, *(one.probability for one in finite))
     low -= 0.15 * (1.0 - low) + 1e-9
-    step = (_WIDTH - 8.0) / (len(known) - 1)
+    step = (_WIDTH - 8.0) / (len(finite) - 1)
 
     def height(rate: float) -> float:
         return round(3.0 + (_HEIGHT - 6.0) * (1.0 - rate) / (1.0 - low), 2)
 
     places = [(round(4.0 + step * k, 2), height(rate)) for k, rate in enumerate(rates)]
-    text = f"{len(known)} campaigns, rates {percent(rates[0])} to {percent(rates[-1])}"
-    return Sparkline(" ".join(f"{x},{y}" for x, y in places), places[-1], height(known[-1].probability), text)
+    text = f"{len(finite)} campaigns, rates {percent(rates[0])} to {percent(rates[-1])}"
+    return Sparkline(" ".join(f"{x},{y}" for x, y in places), places[-1], height(finite[-1].probability), text)
 
 
 def coverage(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
     """Number of requirements of each latest verdict, those without a campaign last."""
     words = [row.latest.shown.status for row in rows if row.latest is not None]
     known = [word for word in dict.fromkeys(("FAIL", "INSUFFICIENT", "MET BY RATE", "PASS", *words)) if word in words]
-    found = [(word, words.count(word)) for word in known]
+    counts = [(word, words.count(word)) for word in known]
     missing = sum(row.latest is None for row in rows)
-    return [*found, ("NO CAMPAIGN", missing)] if missing else found
+    return [*counts, ("NO CAMPAIGN", missing)] if missing else counts
 
 
 def evidence_text(shown: ShownRequirement) -> str:

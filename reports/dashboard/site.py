@@ -16,20 +16,10 @@ from typing import Any
 
 from marsyard.campaigns.definition.requirements import StatedRequirement, shipped_requirements
 from marsyard.reports.campaign import PAGE_FILE, TWIN_FILE, VERIFICATION_FILE, page_environment, write_whole
-from marsyard.reports.cases import shown_case
-from marsyard.reports.dashboard.entries import (
-    MAX_FURTHER_VERDICTS,
-    Entry,
-    RequirementRow,
-    basis_text,
-    coverage,
-    evidence_text,
-    find_campaigns,
-    margin_text,
-    read_entries,
-    requirement_rows,
-)
-from marsyard.reports.sections import embedded, replay_command, script_hash
+from marsyard.reports.dashboard import entries as stored
+from marsyard.reports.dashboard.entries import Entry, RequirementRow, basis_text, evidence_text, margin_text
+from marsyard.reports.presentation import shown_case
+from marsyard.reports.sections import embed_json, replay_command, script_hash
 from marsyard.reports.stored import read_run
 from marsyard.reports.traceability import algorithm_cells, verification_csv
 from marsyard.reports.wording import percent
@@ -56,8 +46,8 @@ def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, St
 
     `stated` are the requirements to be shown, by id; the shipped ones by default.
     """
-    entries, problems = read_entries(find_campaigns(sources))
-    rows = requirement_rows(entries, shipped_requirements() if stated is None else stated)
+    entries, problems = stored.read_entries(stored.find_campaigns(sources))
+    rows = stored.requirement_rows(entries, shipped_requirements() if stated is None else stated)
     (directory / "c").mkdir(parents=True, exist_ok=True)
     for entry in entries:
         _write_campaign(directory / "c" / entry.slug, entry)
@@ -74,9 +64,9 @@ def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, St
         entries=entries,
         problems=problems,
         filters=[(name.lower(), name, sorted(found - {""})) for name, found in values.items()],
-        most=MAX_FURTHER_VERDICTS,
-        coverage=coverage(rows),
-        data=embedded(_data(rows)),
+        most=stored.MAX_FURTHER_VERDICTS,
+        coverage=stored.coverage(rows),
+        data=embed_json(_data(rows)),
         script=script,
         hash=script_hash(script),
         **_FORMATS,
@@ -87,7 +77,6 @@ def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, St
 
 
 def _write_campaign(folder: Path, entry: Entry) -> None:
-    """Write a campaign's page, its report, and pages of its kept cases."""
     page, report = folder / INDEX, entry.directory / PAGE_FILE
     if page.is_file() and page.stat().st_mtime > (entry.directory / TWIN_FILE).stat().st_mtime:
         return
@@ -106,7 +95,6 @@ def _write_campaign(folder: Path, entry: Entry) -> None:
 
 
 def _write_cases(folder: Path, entry: Entry) -> list[dict[str, str]]:
-    """Write pages of the kept cases; return their entries for the campaign's page."""
     if not entry.kept:
         return []
     run, listed = read_run(entry.directory), []
@@ -158,7 +146,7 @@ def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
 
 def _matrix(rows: Sequence[RequirementRow]) -> str:
     """Traceability matrix as CSV: the latest verdict of each campaign, also requirements without a campaign."""
-    found: list[dict[str, Any]] = []
+    exported: list[dict[str, Any]] = []
     shown_as = {
         "verdict": "status",
         "decided_by": "decide_by",
@@ -170,11 +158,11 @@ def _matrix(rows: Sequence[RequirementRow]) -> str:
     for row in rows:
         about = {"requirement": row.requirement, "statement": row.statement, "kind": row.kind, "source": row.source}
         if not row.cells:
-            found.append({**about, "verdict": "NO CAMPAIGN"})
+            exported.append({**about, "verdict": "NO CAMPAIGN"})
         for cell in row.cells:
             shown = {column: getattr(cell.shown, name) for column, name in shown_as.items()}
-            found.append({**about, "campaign": cell.entry.name, **algorithm_cells(cell.entry.tested), **shown})
-    return verification_csv(found)
+            exported.append({**about, "campaign": cell.entry.name, **algorithm_cells(cell.entry.tested), **shown})
+    return verification_csv(exported)
 
 
 def _render(template: str, **context: Any) -> str:

@@ -19,8 +19,8 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import Polygon, Rectangle
 from scipy import ndimage
 
-from marsyard.reports.presentation import numbers, plane, save_figures
-from marsyard.reports.svg import INK, draw_pictures, in_page_style, show_subframe
+from marsyard.reports.presentation import numeric_product, plane, save_figures
+from marsyard.reports.section import INK, draw_pictures, in_page_style, show_subframe
 
 Picture = Float[np.ndarray, "_ _"]
 TEMPLATE, MATCH, WINDOW = "#ff4b3e", "#35d46b", "#4aa3ff"
@@ -72,16 +72,16 @@ def tracks(products: Mapping[str, Any]) -> list[Track]:
         return []
     if table.size == 0 or table.shape[1] != len(names):
         return []
-    found = []
+    panels = []
     for row in (dict(zip(names, (float(value) for value in values), strict=True)) for values in table):
         if row.get("pair") not in _PAIRS or row.get("template") not in _TEMPLATES:
             continue
         pair, template = int(row["pair"]), int(row["template"])
         patch, window = (plane(products.get(f"{part}_{pair}_{template}")) for part in ("template", "window"))
-        match = numbers(products.get(f"match_{pair}_{template}"))
+        match = numeric_product(products.get(f"match_{pair}_{template}"))
         position = (float(match[0]), float(match[1])) if match is not None and match.size == 2 else None
-        found.append(Track(pair, template, row.get("valid", 0.0) == 1.0, row, patch, window, position))
-    return found
+        panels.append(Track(pair, template, row.get("valid", 0.0) == 1.0, row, patch, window, position))
+    return panels
 
 
 @in_page_style
@@ -117,7 +117,7 @@ def write_dimes_figures(directory: Path, products: Mapping[str, Any]) -> list[Pa
 def _row_heights(products: Mapping[str, Any], pair: int) -> dict[str, float]:
     """Relative heights of the rows that a pair has something to show in, from above."""
     shown = {
-        "rectified": any(numbers(products.get(f"rectified_{pair}_{side}")) is not None for side in (0, 1)),
+        "rectified": any(numeric_product(products.get(f"rectified_{pair}_{side}")) is not None for side in (0, 1)),
         "templates": any(one.pair == pair and one.patch is not None for one in tracks(products)),
         "delivered": True,
     }
@@ -162,9 +162,8 @@ def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> No
 def _draw_rectified(
     axes: Axes, products: Mapping[str, Any], picture: Picture, ours: Sequence[Track], pair: int, side: int
 ) -> None:
-    """One picture of a pair in the virtual nadir camera."""
-    lattice = numbers(products.get(f"rectified_{pair}_{side}"))
-    frame, gsd = numbers(products.get(f"rectified_frame_{pair}")), numbers(products.get(f"gsd_{pair}"))
+    lattice = numeric_product(products.get(f"rectified_{pair}_{side}"))
+    frame, gsd = numeric_product(products.get(f"rectified_frame_{pair}")), numeric_product(products.get(f"gsd_{pair}"))
     if lattice is None or lattice.ndim != 3 or lattice.shape[2] != 2 or frame is None or frame.size != 3:
         axes.set_axis_off()
         return
@@ -206,7 +205,6 @@ def _rectify(picture: Picture, lattice: Float[np.ndarray, "n n 2"]) -> Float[np.
 
 
 def _draw_template_window(axes: Sequence[Axes], track: Track) -> None:
-    """Draw a template and its search window with the match; nothing for what is missing."""
     line = "-" if track.valid else _DASHES
     parts = ((track.patch, f"Template {track.template + 1}", TEMPLATE, line), (track.window, "Window", WINDOW, "-"))
     for one, (picture, title, colour, style) in zip(axes, parts, strict=True):
@@ -222,7 +220,6 @@ def _draw_template_window(axes: Sequence[Axes], track: Track) -> None:
 
 
 def _mark_tracks(axes: Axes, ours: Sequence[Track], stem: str, colour: str) -> None:
-    """Numbered squares at the tracks' positions in a delivered picture."""
     box = {"facecolor": "#000000", "alpha": 0.55, "pad": 1.0, "linewidth": 0.0}
     for track in ours:
         u, v = track.values.get(f"{stem}_u", np.nan), track.values.get(f"{stem}_v", np.nan)
@@ -254,7 +251,6 @@ def _draw_square(axes: Axes, centre: tuple[float, float], side: float, colour: s
 
 
 def _picture(products: Mapping[str, Any], key: str) -> Picture:
-    """A delivered picture with columns binned to square pixels, as in DIMES."""
     counts = plane(products.get(key))
     if counts is None:
         raise ValueError(f"the products hold no picture '{key}'")

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from marsyard.reports.columns import label
+from marsyard.reports import presentation
 from marsyard.reports.dimes import case_figures as figures
 from marsyard.reports.dimes.sections import FIRING, LANDING, field_test_section, sensitivity_section
 from marsyard.reports.presentation import (
@@ -18,14 +18,12 @@ from marsyard.reports.presentation import (
     CaseView,
     Presentation,
     TableRow,
-    numbers,
+    numeric_product,
     plane,
     read_arrays,
-    save_figures,
 )
-from marsyard.reports.section import plate
-from marsyard.reports.svg import INK, MARKERS, MUTED, SERIES, in_page_style
-from marsyard.reports.wording import note_text, number
+from marsyard.reports.section import INK, MARKERS, MUTED, SERIES, in_page_style, plate
+from marsyard.reports.wording import label, note_text, number
 
 #: Columns of the tracks that the page shows elsewhere or has no width for.
 _NOT_SHOWN = ("pair", "template", "valid", "ground_east_m", "ground_north_m")
@@ -59,7 +57,7 @@ def _velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Estimated and true velocity, if the products hold them."""
     facts = []
     for key, name in (("velocity_estimated_m_s", "Estimated velocity"), ("velocity_true_m_s", "True velocity")):
-        velocity = numbers(products.get(key))
+        velocity = numeric_product(products.get(key))
         if velocity is not None and velocity.size >= 2 and np.isfinite(velocity.ravel()[:2]).all():
             east, north = velocity.ravel()[:2]
             facts.append((name, f"{east:+.2f} m/s east, {north:+.2f} m/s north"))
@@ -91,16 +89,8 @@ def view_stream(products: Mapping[str, Any], key: str) -> CaseView:
         answered = bool(np.isfinite(row[2]))
         values = [number(float(value)) for value in (*row, np.hypot(row[2] - row[4], row[3] - row[5]))]
         rows.append(TableRow([str(place), *(values if answered else ["" for _ in values])], answered))
-    head = [
-        "After picture",
-        "From (s)",
-        "To (s)",
-        "East (m/s)",
-        "North (m/s)",
-        "True east",
-        "True north",
-        "Error (m/s)",
-    ]
+    head = ["After picture", "From (s)", "To (s)", "East (m/s)", "North (m/s)"]
+    head += ["True east", "True north", "Error (m/s)"]
     drawn = plate(draw_stream_case(products), f"{key}stream", "Pictures, and the estimate after each.", wide=True)
     return CaseView([], [drawn], head, rows)
 
@@ -145,7 +135,7 @@ def draw_stream_case(products: Mapping[str, Any]) -> Figure:
 
 
 def _write_stream(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    return save_figures(directory, {"stream": draw_stream_case(products)})
+    return presentation.save_figures(directory, {"stream": draw_stream_case(products)})
 
 
 STREAM_CASE = CaseKind(is_stream_case, view_stream, _write_stream, note_text("dimes.stream_legend"))

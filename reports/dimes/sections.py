@@ -16,13 +16,37 @@ from matplotlib.patches import Circle
 from scipy import stats
 
 from marsyard.reports import kinds, rates
-from marsyard.reports.columns import axis_columns, label, magnitude_label, numbers, split_unit
 from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Section, Subject, SvgFigure, grid_of, plate
+from marsyard.reports.section import (
+    MARKERS,
+    MUTED,
+    REQUIREMENT,
+    SERIES,
+    Block,
+    Grid,
+    Section,
+    Subject,
+    SvgFigure,
+    build_grid,
+    in_page_style,
+    new_axes,
+    plate,
+)
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.svg import MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
-from marsyard.reports.wording import NOTHING, count, note_text, number, percent, stated
+from marsyard.reports.wording import (
+    NOTHING,
+    axis_columns,
+    count,
+    format_fraction,
+    label,
+    magnitude_label,
+    note_text,
+    number,
+    numbers,
+    percent,
+    split_unit,
+)
 
 #: Rows of the paper's Fig. 11 by (category, run).
 FIG_11: Mapping[tuple[str, str], Mapping[str, Any]] = {
@@ -39,15 +63,17 @@ def field_test_section(subject: Subject) -> Section | None:
     frame, bound = subject.frame, subject.bound
     if not {"run", "category"}.issubset(frame.columns) or not rates.is_flag(frame, "answered"):
         return None
-    found = field_cells(subject)
-    grid = grid_of(
-        found,
+    cells = field_cells(subject)
+    grid = build_grid(
+        cells,
         {
             "Category and run": lambda one: f"{one['category']}: {one['run']}",
             "Triples": lambda one: f"{one['valid'].n:,}",
             "Valid": lambda one: f"{one['valid'].hits:,}",
             "% valid": lambda one: percent(one["valid"].share),
-            f"{stated(CONFIDENCE)} interval": lambda one: rates.range_text(one["valid"].lower, one["valid"].upper),
+            f"{format_fraction(CONFIDENCE)} interval": lambda one: rates.range_text(
+                one["valid"].lower, one["valid"].upper
+            ),
             "Paper": lambda one: NOTHING if one["paper_percent"] is None else f"{one['paper_percent']} %",
             "Difference": lambda one: _difference_text(one["difference_points"]),
             "Beyond the bound" if bound is None else f"Beyond {bound:g}": lambda one: (
@@ -56,20 +82,20 @@ def field_test_section(subject: Subject) -> Section | None:
             "Largest error": lambda one: number(one["largest"]),
         },
     )
-    blocks = [Block(grid=grid, note=_field_note(found))]
+    blocks = [Block(grid=grid, note=_field_note(cells))]
     plates = scatter_plates(subject)
     if plates:
         note = ""
         if bound is not None and subject.metric is not None:
             note = note_text("dimes.errors", bound=f"{bound:g}", unit=split_unit(subject.metric)[1])
         blocks.append(Block(heading="Errors by category", plates=plates, note=note))
-    data = {"cells": [one | {"valid": asdict(one["valid"])} for one in found]}
+    data = {"cells": [one | {"valid": asdict(one["valid"])} for one in cells]}
     return Section("field-test", "Field test", "Runs and categories, next to the paper's Fig. 11", blocks, data)
 
 
 def field_cells(subject: Subject) -> list[dict[str, Any]]:
     """Results of every category and run, first in the paper's order, then in the rows' order."""
-    frame, found = subject.frame, []
+    frame, blocks = subject.frame, []
     named = frame[["category", "run"]].dropna().drop_duplicates()
     pairs = [(str(category), str(run)) for category, run in named.itertuples(index=False)]
     for category, run in [*(pair for pair in FIG_11 if pair in pairs), *(pair for pair in pairs if pair not in FIG_11)]:
@@ -77,8 +103,8 @@ def field_cells(subject: Subject) -> list[dict[str, Any]]:
         answered = rates.members(chosen, "valid")
         errors = np.abs(numbers(chosen[answered], subject.metric)) if subject.metric else np.array([])
         errors = errors[np.isfinite(errors)]
-        share, paper = rates.share_of(answered, chosen), FIG_11.get((category, run), {}).get("percent")
-        found.append(
+        share, paper = rates.fraction_of(answered, chosen), FIG_11.get((category, run), {}).get("percent")
+        blocks.append(
             {
                 "category": category,
                 "run": run,
@@ -89,7 +115,7 @@ def field_cells(subject: Subject) -> list[dict[str, Any]]:
                 "difference_points": math.nan if paper is None else 100.0 * share.share - paper,
             }
         )
-    return found
+    return blocks
 
 
 def _difference_text(points: float) -> str:
@@ -141,7 +167,6 @@ def scatter_plates(subject: Subject) -> list[SvgFigure]:
 
 @in_page_style
 def _scatter(chosen: kinds.Rows, parts: Sequence[str], subject: Subject, reach: float) -> Figure:
-    """Errors of one category, marked by run."""
     figure, axes = new_axes(4.2, 4.4)
     runs = sorted(str(run) for run in subject.frame["run"].dropna().unique())
     for place, run in enumerate(runs):
@@ -184,7 +209,7 @@ NOTABLE_M_S = 1.0
 SPEEDS_M_S = (5.0, 10.0, 15.0, 20.0, 25.0)
 
 
-def _landed(subject: Subject) -> pd.DataFrame | None:
+def _landing_rows(subject: Subject) -> pd.DataFrame | None:
     speeds = np.column_stack([numbers(subject.frame, name) for name in (WITH, WITHOUT)])
     landed = subject.frame[np.isfinite(speeds).all(axis=1)]
     return landed if len(landed) else None
@@ -194,17 +219,16 @@ def landing_shares(landed: kinds.Rows) -> dict[str, rates.Share]:
     """Landings that the answer helped and harmed, and answers in time for the thrusters' firing."""
     change = numbers(landed, WITH) - numbers(landed, WITHOUT)
     shares = {
-        f"slower by more than {NOTABLE_M_S:g} m/s": rates.share_of(change < -NOTABLE_M_S, landed),
-        f"faster by more than {NOTABLE_M_S:g} m/s": rates.share_of(change > NOTABLE_M_S, landed),
+        f"slower by more than {NOTABLE_M_S:g} m/s": rates.fraction_of(change < -NOTABLE_M_S, landed),
+        f"faster by more than {NOTABLE_M_S:g} m/s": rates.fraction_of(change > NOTABLE_M_S, landed),
     }
     if rates.is_flag(landed, "answer_punctual"):
         name = "computed before the thrusters fired, of all landings"
-        shares[name] = rates.share_of(rates.flag(landed, "answer_punctual"), landed)
+        shares[name] = rates.fraction_of(rates.flag(landed, "answer_punctual"), landed)
     return shares
 
 
 def _speeds(landed: kinds.Rows, subject: Subject, key: str) -> kinds.Drawn:
-    """Table of mean, quantiles with bounds, and fractions above round speeds."""
     columns, groups = [numbers(landed, name) for name in (WITH, WITHOUT)], rates.terrain_groups(landed)
     change = columns[0] - columns[1]
     rows = [["mean (m/s)", *(number(float(values.mean())) for values in columns)]]
@@ -214,7 +238,7 @@ def _speeds(landed: kinds.Rows, subject: Subject, key: str) -> kinds.Drawn:
             bound = quantile_bounds(values, probability, CONFIDENCE, groups)[1]
             bounded = f" (≤ {number(bound)})" if np.isfinite(bound) else ""
             texts.append(f"{number(float(np.quantile(values, probability)))}{bounded}")
-        rows.append([f"{stated(probability)} quantile (its bound)", *texts])
+        rows.append([f"{format_fraction(probability)} quantile (its bound)", *texts])
     rows += [
         [f"faster than {speed:g} m/s", *(percent(float(np.mean(values > speed))) for values in columns)]
         for speed in SPEEDS_M_S
@@ -230,7 +254,7 @@ def _speeds(landed: kinds.Rows, subject: Subject, key: str) -> kinds.Drawn:
         "largest_loss_m_s": float(change.max()),
     }
     gain, loss = number(data["largest_gain_m_s"]), number(data["largest_loss_m_s"])
-    note = note_text("dimes.landing", confidence=stated(CONFIDENCE), gain=gain, loss=loss)
+    note = note_text("dimes.landing", confidence=format_fraction(CONFIDENCE), gain=gain, loss=loss)
     return [Block(heading="Horizontal speed at touchdown", grid=Grid(["", "With", "Without"], rows), note=note)], data
 
 
@@ -239,7 +263,7 @@ LANDING = kinds.SectionDeclaration(
     "landing",
     "Landing",
     "Horizontal speed at the ground",
-    rows=_landed,
+    rows=_landing_rows,
     parts=(
         kinds.Distribution(
             (kinds.Quantity(WITH, "with"), kinds.Quantity(WITHOUT, "without")),
@@ -290,7 +314,7 @@ def sensitivity_section(subject: Subject) -> Section | None:
     unit = split_unit(metric)[1]
     caption = f"Change of the mean {magnitude_label(metric)} from the 5 % to the 95 % quantile of each condition."
     drawn = plate(effect_figure(drivers, unit), "sensitivity", caption)
-    note = note_text("dimes.sensitivity", metric=magnitude_label(metric), confidence=stated(CONFIDENCE))
+    note = note_text("dimes.sensitivity", metric=magnitude_label(metric), confidence=format_fraction(CONFIDENCE))
     rows = [
         [label(one.column), f"{number(one.low)} to {number(one.high)}"]
         + ["{} ({} to {})".format(*map(number, value)) for value in (one.rank_correlation, one.coefficient, one.effect)]
@@ -321,11 +345,11 @@ def rank_effects(subject: Subject, metric: str) -> list[Driver]:
     ranks = correlate_weighted(stats.rankdata(x, axis=0), stats.rankdata(y), weights)
     # the sample's own value, then the interval over the resamples
     values = [ranks, slopes / y.std(), slopes / x.std(axis=0) * (high - low)]
-    found = []
+    blocks = []
     for k, name in enumerate(columns):
         intervals = [(float(one[0, k]), *rates.percentile_interval(one[1:, k])) for one in values]
-        found.append(Driver(name, float(low[k]), float(high[k]), *intervals))
-    return found
+        blocks.append(Driver(name, float(low[k]), float(high[k]), *intervals))
+    return blocks
 
 
 def regress_weighted(

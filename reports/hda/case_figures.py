@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from marsyard.reports.hda import products as stages
 from marsyard.reports.presentation import save_figures
-from marsyard.reports.svg import MUTED, in_page_style, show_picture
+from marsyard.reports.section import MUTED, in_page_style, show_picture
 
 T = TypeVar("T")
 
@@ -145,7 +145,6 @@ def draw_maps(products: Mapping[str, Any]) -> Figure:
 
 
 def _draw_safety(above: Axes, below: Axes, maps: stages.LandingMaps, truth: stages.TrueGround) -> None:
-    """Draw the safe landing map, and below it the true one with a legend."""
     scale: dict[str, Any] = {"vmin": 0, "vmax": 2, "cmap": SAFETY_COLOURS}
     above.imshow(maps.safety, interpolation="nearest", **scale)
     if (maps.safety > 1.5).any() and (maps.safety < 1.5).any():
@@ -171,9 +170,9 @@ def draw_site(products: Mapping[str, Any]) -> Figure:
         show_picture(axes, shown[0])
     limits = {"xlim": over.get_xlim(), "ylim": over.get_ylim()}
     if np.isfinite(maps.pixels).all():
-        known = np.where(np.isfinite(maps.elevation_m), maps.safety, np.nan)
+        finite = np.where(np.isfinite(maps.elevation_m), maps.safety, np.nan)
         over.pcolormesh(
-            maps.pixels[..., 0], maps.pixels[..., 1], known, shading="nearest", alpha=0.38,
+            maps.pixels[..., 0], maps.pixels[..., 1], finite, shading="nearest", alpha=0.38,
             vmin=0, vmax=2, cmap=SAFETY_COLOURS, rasterized=True, linewidth=0.0,
         )  # fmt: skip
     over.set(**limits)
@@ -236,7 +235,6 @@ def _draw_segments(axes: Axes, starts: stages.Pixels, ends: stages.Pixels, colou
 
 
 def _picture_pair(products: Mapping[str, Any]) -> tuple[Figure, Axes, Axes]:
-    """A figure of both pictures side by side."""
     shown = _require(stages.pictures(products), "pictures")
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)

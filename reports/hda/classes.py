@@ -12,15 +12,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from marsyard.reports.charts import RateLine, draw_rates
-from marsyard.reports.columns import numbers
+from marsyard.reports.figures import RateLine, draw_rates
 from marsyard.reports.hda.sections import PAPER, landing_rows
 from marsyard.reports.kinds import Drawn, Rows
 from marsyard.reports.rates import CONFIDENCE, PooledRate, flag, pooled_rate, rate_text
-from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
-from marsyard.reports.svg import MUTED, REQUIREMENT, in_page_style
-from marsyard.reports.wording import NOTHING, note_text, percent, stated
-from marsyard.scenarios.landing.confusion import CLASS_NAMES, CLASSES
+from marsyard.reports.section import MUTED, REQUIREMENT, Block, Grid, Section, Subject, build_grid, in_page_style, plate
+from marsyard.reports.wording import NOTHING, format_fraction, note_text, numbers, percent
+from marsyard.scenarios.landing.pictures import CLASS_NAMES, CLASSES
 
 
 @dataclass(frozen=True)
@@ -62,14 +60,14 @@ RATES: Mapping[str, tuple[str, str]] = {
 def hazard_classes(frame: Rows) -> list[HazardClass]:
     """Missed hazards by size; empty if rows do not count them."""
     edges = (0.0, *CLASSES, math.inf)
-    found = []
+    rows = []
     for kind in ("roughness", "slope"):
         for name, low, high in zip(CLASS_NAMES, edges[:-1], edges[1:], strict=True):
             column = f"footprints_{kind}_{name}"
             if column in frame:
                 called, unflagged = (pooled_rate(frame, f"{column}_{part}", column) for part in ("safe", "unflagged"))
-                found.append(HazardClass(kind, low, high, called, unflagged))
-    return found
+                rows.append(HazardClass(kind, low, high, called, unflagged))
+    return rows
 
 
 def draw_classes(frame: Rows, subject: Subject, key: str) -> Drawn:
@@ -79,7 +77,7 @@ def draw_classes(frame: Rows, subject: Subject, key: str) -> Drawn:
         return [], {}
     rates = {name: pooled_rate(frame, *columns) for name, columns in RATES.items()}
     figure = plate(class_figure(classes), key, "Hazards by size: called safe, and not flagged.")
-    by_class = grid_of(
+    by_class = build_grid(
         [one for one in classes if one.called_safe.of],
         {
             "By": lambda one: one.kind,
@@ -91,10 +89,10 @@ def draw_classes(frame: Rows, subject: Subject, key: str) -> Drawn:
         },
     )
     rows = [[name, f"{one.hits:,} of {one.of:,}", rate_text(one)] for name, one in rates.items()]
-    counted = Grid(["Footprints", "Counted", f"Share ({stated(CONFIDENCE)} interval)"], rows)
+    counted = Grid(["Footprints", "Counted", f"Share ({format_fraction(CONFIDENCE)} interval)"], rows)
     blocks = [
         Block(heading="Hazards missed, by height and slope", plates=[figure], grid=by_class),
-        Block(grid=counted, note=note_text("hda.classes", confidence=stated(CONFIDENCE))),
+        Block(grid=counted, note=note_text("hda.classes", confidence=format_fraction(CONFIDENCE))),
     ]
     data = {"rates": {name: asdict(one) for name, one in rates.items()}, "classes": [asdict(one) for one in classes]}
     return blocks, data
@@ -166,11 +164,11 @@ class Curve:
 def limits_section(subject: Subject) -> Section | None:
     """Features tracked by the change between the pictures; None unless flights change one condition at a time."""
     frame = landing_rows(subject)
-    found = [] if frame is None else curves(frame)
-    if not found:
+    class_curves = [] if frame is None else curves(frame)
+    if not class_curves:
         return None
-    knees = grid_of(
-        found,
+    knees = build_grid(
+        class_curves,
         {
             "Change": lambda one: one.change["name"],
             "Paper's limit": lambda one: f"{one.change['paper']:g} {one.change['unit']}",
@@ -179,8 +177,8 @@ def limits_section(subject: Subject) -> Section | None:
             "Minimum share within the paper's limit": lambda one: percent(one.min_fraction_within_limit),
         },
     )
-    by_size = grid_of(
-        [(one.change, at) for one in found for at in one.points],
+    by_size = build_grid(
+        [(one.change, at) for one in class_curves for at in one.points],
         {
             "Change": lambda pair: pair[0]["name"],
             "Size": lambda pair: f"{pair[1].size:g} {pair[0]['unit']}",
@@ -191,11 +189,13 @@ def limits_section(subject: Subject) -> Section | None:
     )
     caption = "Correctly tracked features, of those in both pictures; red: the paper's limits; grey: 90 %."
     blocks = [
-        Block(text=note_text("hda.limits_text"), plates=[plate(limits_figure(found), "limits", caption, wide=True)]),
+        Block(
+            text=note_text("hda.limits_text"), plates=[plate(limits_figure(class_curves), "limits", caption, wide=True)]
+        ),
         Block(heading="Knees", grid=knees, note=note_text("hda.limits")),
         Block(heading="By size", grid=by_size),
     ]
-    data = {"curves": [asdict(one) for one in found]}
+    data = {"curves": [asdict(one) for one in class_curves]}
     return Section("limits", "Limits", "Tracking by change between the pictures", blocks, data)
 
 
@@ -210,7 +210,7 @@ def curves(frame: pd.DataFrame) -> list[Curve]:
     if not flown.any() or np.any(present[:, flown].sum(axis=0) > 1):
         return []
     still = flown & ~present.any(axis=0)
-    found = []
+    rows = []
     for one, size, changed in zip(changes, sizes, present, strict=True):
         chosen = flown & (changed | still)
         rounded = np.where(changed, np.round(size, 1), 0.0)
@@ -221,8 +221,8 @@ def curves(frame: pd.DataFrame) -> list[Curve]:
                 # a flight without tracks has tracked none of the visible features
                 tracked = pooled_rate(flights, "tracks_correct", "features_in_view")
                 points.append(AtSize(float(value), tracked, len(flights), int(flag(flights, "tracked_well").sum())))
-            found.append(Curve(one, points, knee(points, 1.0), knee(points, -1.0)))
-    return found
+            rows.append(Curve(one, points, knee(points, 1.0), knee(points, -1.0)))
+    return rows
 
 
 def knee(points: Sequence[AtSize], sign: float) -> float:

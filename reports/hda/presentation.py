@@ -13,8 +13,7 @@ from marsyard.reports.hda.case_figures import FIGURES, figures_reached, write_hd
 from marsyard.reports.hda.classes import draw_classes, limits_section
 from marsyard.reports.kinds import Distribution, MadeBy, RateTable, SectionDeclaration
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
-from marsyard.reports.section import plate
-from marsyard.reports.svg import draw_pictures
+from marsyard.reports.section import draw_pictures, plate
 from marsyard.reports.wording import note_text, number
 
 _CAPTIONS: Mapping[str, str] = {
@@ -31,10 +30,10 @@ _LEFT_OUT = "fig1-tracks"
 def view(products: Mapping[str, Any], key: str) -> CaseView:
     """A landing case; its pictures alone without results of the paper's stages."""
     names = [name for name in figures_reached(products) if name != _LEFT_OUT]
-    seen = stages.pictures(products)
-    if not names and seen is not None:
+    picture_pair = stages.pictures(products)
+    if not names and picture_pair is not None:
         caption = "The two pictures that the algorithm was given."
-        shown = plate(draw_pictures(seen), f"{key}pictures", caption, wide=True)
+        shown = plate(draw_pictures(picture_pair), f"{key}pictures", caption, wide=True)
         return CaseView([], [shown], *_stages(products), note_text("hda.plain_legend"))
     plates = [plate(FIGURES[name](products), f"{key}{name[:4]}", _CAPTIONS[name], wide=True) for name in names]
     facts = [("Figures", ", ".join(name.split("-")[0] for name in names) or "none")]
@@ -42,7 +41,6 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
 
 
 def _stages(products: Mapping[str, Any]) -> tuple[list[str], list[TableRow]]:
-    """Table of the stages with their results."""
     tracks, motion = stages.tracked_features(products), stages.solved_motion(products)
     matches, maps = stages.epipolar_matches(products), stages.landing_maps(products)
     results = dict.fromkeys(("Features and tracks", "Motion", "Structure", "Map", "Site"), "")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from marsyard.reports.presentation import numbers, plane, read_arrays, shaped
+from marsyard.reports.presentation import check_shape, numeric_product, plane, read_arrays
 
 Plane = Float[np.ndarray, "rows columns"]
 Pixels = Float[np.ndarray, "n 2"]
@@ -113,30 +113,30 @@ def pictures(products: Mapping[str, Any]) -> tuple[Float[np.ndarray, "_ _"], Flo
 
 def tracked_features(products: Mapping[str, Any]) -> TrackedFeatures | None:
     """Features and tracks; None if missing."""
-    found = read_arrays(products, {"features": (None, 2), "tracked": (None, 2), "tracks_accepted": (None,)})
-    if found is None or len({len(one) for one in found}) > 1:
+    arrays = read_arrays(products, {"features": (None, 2), "tracked": (None, 2), "tracks_accepted": (None,)})
+    if arrays is None or len({len(one) for one in arrays}) > 1:
         return None
-    return TrackedFeatures(found[0], found[1], found[2] > 0.5)
+    return TrackedFeatures(arrays[0], arrays[1], arrays[2] > 0.5)
 
 
 def solved_motion(products: Mapping[str, Any]) -> SolvedMotion | None:
     """Motion and structure; None if the motion was not solved."""
     rotation, translation, rays = (3, 3), (3,), (4, 3)
     shapes = {"rotation": rotation, "translation": translation, "frustum_0": rays, "frustum_1": rays}
-    found = read_arrays(products, shapes | {"true_rotation": rotation, "true_translation": translation}, finite=True)
-    points = shaped(products.get("sparse_points"), None, 3)
-    if found is None or points is None or not len(points):
+    arrays = read_arrays(products, shapes | {"true_rotation": rotation, "true_translation": translation}, finite=True)
+    points = check_shape(products.get("sparse_points"), None, 3)
+    if arrays is None or points is None or not len(points):
         return None
-    return SolvedMotion(found[0], found[1], (found[2], found[3]), found[4], found[5], points)
+    return SolvedMotion(arrays[0], arrays[1], (arrays[2], arrays[3]), arrays[4], arrays[5], points)
 
 
 def epipolar_matches(products: Mapping[str, Any]) -> EpipolarMatches | None:
     """Structure pixels and matches; None if missing."""
     shapes = dict.fromkeys(("grid", "segment_starts", "segment_ends", "matched"), (None, 2))
-    found = read_arrays(products, {**shapes, "matches_accepted": (None,)})
-    if found is None or len({len(one) for one in found}) > 1:
+    arrays = read_arrays(products, {**shapes, "matches_accepted": (None,)})
+    if arrays is None or len({len(one) for one in arrays}) > 1:
         return None
-    return EpipolarMatches(found[0], found[1], found[2], found[3], found[4] > 0.5)
+    return EpipolarMatches(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4] > 0.5)
 
 
 def landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
@@ -146,15 +146,15 @@ def landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
         return None
     shapes = {"corner": (2,), "apriori": (2,), "surface_from_camera": (3, 3), "world_from_surface": (3, 3)}
     frames = read_arrays(products, shapes | {"limits": (3,)}, finite=True)
-    pixels, cell_m = shaped(products.get("map_pixels"), *planes[0].shape, 2), _positive(products, "cell")
+    pixels, cell_m = check_shape(products.get("map_pixels"), *planes[0].shape, 2), _positive(products, "cell")
     if frames is None or pixels is None or cell_m is None or not np.all(frames[-1] > 0.0):
         return None
-    known = np.isfinite(pixels).all(axis=-1)
-    if not known.all() and known.sum() >= 3:
+    observed = np.isfinite(pixels).all(axis=-1)
+    if not observed.all() and observed.sum() >= 3:
         # unknown pixels by an affine map of the known ones, as for level ground
-        cells = np.concatenate([np.moveaxis(np.indices(known.shape), 0, -1), np.ones((*known.shape, 1))], axis=-1)
-        level = np.linalg.lstsq(cells[known], pixels[known], rcond=None)[0]
-        pixels = np.where(known[..., None], pixels, cells @ level)
+        cells = np.concatenate([np.moveaxis(np.indices(observed.shape), 0, -1), np.ones((*observed.shape, 1))], axis=-1)
+        level = np.linalg.lstsq(cells[observed], pixels[observed], rcond=None)[0]
+        pixels = np.where(observed[..., None], pixels, cells @ level)
     (site,) = read_arrays(products, {"site": (2,)}, finite=True) or [np.full(2, np.nan)]
     names = ("elevation_m", "roughness_m", "slope_rad", "safety", "corner_m", "apriori", "surface_from_camera")
     arrays = dict(zip((*names, "world_from_surface", "limits"), (*planes, *frames), strict=True))
@@ -163,7 +163,7 @@ def landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
 
 def true_ground(products: Mapping[str, Any]) -> TrueGround | None:
     """The truth; None if missing."""
-    places, heights = shaped(products.get("true_places"), None, None, 2), plane(products.get("true_heights"))
+    places, heights = check_shape(products.get("true_places"), None, None, 2), plane(products.get("true_heights"))
     frames = read_arrays(products, {"camera_true": (4, 4), "true_corner": (2,)}, finite=True)
     spacing_m = _positive(products, "true_spacing")
     if places is None or min(places.shape[:2]) < 2 or heights is None or frames is None or spacing_m is None:
@@ -180,5 +180,5 @@ def true_ground(products: Mapping[str, Any]) -> TrueGround | None:
 
 
 def _positive(products: Mapping[str, Any], name: str) -> float | None:
-    value = numbers(products.get(name))
+    value = numeric_product(products.get(name))
     return float(value.item()) if value is not None and value.size == 1 and value.item() > 0.0 else None

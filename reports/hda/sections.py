@@ -11,12 +11,11 @@ import pandas as pd
 from jaxtyping import Bool, Float
 
 from marsyard.reports import kinds, rates
-from marsyard.reports.columns import numbers
 from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.statistics.samples import mean_interval, quantile_bounds
-from marsyard.reports.wording import NOTHING, count, note_text, number, stated
+from marsyard.reports.wording import NOTHING, count, format_fraction, note_text, number, numbers
 from marsyard.scenarios.landing.parameters import LanderParameters
 
 PAPER = read_paper(Path(__file__).with_name("paper.toml"))
@@ -56,17 +55,22 @@ THRESHOLD = kinds.SectionDeclaration(
         kinds.RateByCondition(
             by=kinds.Quantity("max_roughness_m", "Threshold of roughness (m)"),
             rates=(
-                kinds.Rate("false_alarms", "False alarms", kinds.pooled("false_alarms", "footprints_truly_safe")),
-                kinds.Rate("missed", "Missed", kinds.pooled("missed", "footprints_not_safe")),
+                kinds.Rate(
+                    "false_alarms", "False alarms", kinds.pooled_fraction("false_alarms", "footprints_truly_safe")
+                ),
+                kinds.Rate("missed", "Missed", kinds.pooled_fraction("missed", "footprints_not_safe")),
                 kinds.Rate(
                     "called_safe_unsafe",
                     "Called safe, not safe",
-                    kinds.pooled("footprints_called_safe_unsafe", "footprints_called_safe"),
+                    kinds.pooled_fraction("footprints_called_safe_unsafe", "footprints_called_safe"),
                 ),
                 kinds.Rate(
-                    "found", "Site found, of those with one", kinds.flagged("site_reported", "wide_site_exists"), False
+                    "found",
+                    "Site found, of those with one",
+                    kinds.flag_rate("site_reported", "wide_site_exists"),
+                    False,
                 ),
-                kinds.Rate("safe", "Sites truly safe", kinds.flagged("site_safe", "site_reported"), False),
+                kinds.Rate("safe", "Sites truly safe", kinds.flag_rate("site_safe", "site_reported"), False),
             ),
             cases="Flights",
             ylabel="share of footprints",
@@ -83,8 +87,8 @@ THRESHOLD = kinds.SectionDeclaration(
 
 
 def _fault_words(fault: str, size: float) -> tuple[str, str]:
-    known = PAPER["fault_names"].get(fault, {"name": fault.replace("_", " "), "unit": "number"})
-    name, unit = known["name"], known.get("unit")
+    description = PAPER["fault_names"].get(fault, {"name": fault.replace("_", " "), "unit": "number"})
+    name, unit = description["name"], description.get("unit")
     if unit is None or math.isnan(size):
         return name, ""
     if unit == "share":
@@ -128,7 +132,7 @@ FAULT_OUTCOMES = kinds.OutcomesBySize(
         ("Sinking (m/s)", "sink_m_s", lambda rows: _median(rows, "touchdown_sink_m_s"), _two_digits),
     ),
     caption="Full: a truly safe site. Hatched: no safe site. Dotted: not converged. Crossed: a site that is not safe.",
-    note=note_text("hda.faults", confidence=stated(CONFIDENCE)),
+    note=note_text("hda.faults", confidence=format_fraction(CONFIDENCE)),
 )
 FAULTS = kinds.SectionDeclaration("landing-faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), rows=landing_rows)
 
@@ -193,7 +197,7 @@ TOUCHDOWN_ERRORS = (
 _DEVIATIONS = ("gps_deviation_north_m", "gps_deviation_east_m")
 
 
-def _landed(subject: Subject) -> pd.DataFrame | None:
+def _landing_rows(subject: Subject) -> pd.DataFrame | None:
     frame = landing_rows(subject)
     return None if frame is None else frame[rates.flag(frame, "landed")]
 
@@ -223,13 +227,15 @@ def _table_2(landed: pd.DataFrame, subject: Subject, key: str) -> kinds.Drawn:
             off = [f"{each.mean():.2f}" if each.size else NOTHING for each in deviations.values()]
             rows.append([f"ours, {one.title}", f"{int(finite.sum()):,}", text, spread, *off, run_time])
     head = ["", "Landings", "Position error (m)", "90 % of errors (m)", "Northing dev. (m)", "Easting dev. (m)"]
-    note = note_text("hda.touchdown", confidence=stated(CONFIDENCE))
+    note = note_text("hda.touchdown", confidence=format_fraction(CONFIDENCE))
     data = {
         "landings": len(landed),
         "mean_m": means,
         "mean_interval_m": intervals,
         "deviations_m": {name: float(values.mean()) for name, values in deviations.items() if values.size},
-        "touchdown_safe": rates.flag_share(landed, "touchdown_safe").share if "touchdown_safe" in landed else math.nan,
+        "touchdown_safe": rates.flag_fraction(landed, "touchdown_safe").share
+        if "touchdown_safe" in landed
+        else math.nan,
         "paper_m": {str(run["run"]): run["error_m"] for run in runs},
     }
     return [Block(heading="Table II", grid=Grid([*head, "Run time"], rows), note=note)], data
@@ -239,7 +245,7 @@ TOUCHDOWN = kinds.SectionDeclaration(
     "touchdown",
     "Touchdown",
     "Touchdown, next to Table II",
-    rows=_landed,
+    rows=_landing_rows,
     requires=("touchdown_error_gps_m", "touchdown_error_m"),
     parts=(
         kinds.Distribution(
@@ -251,8 +257,8 @@ TOUCHDOWN = kinds.SectionDeclaration(
         kinds.MadeBy(_table_2),
         kinds.RateTable(
             (
-                kinds.Rate("touchdown", "touchdown on safe ground", kinds.flagged("touchdown_safe")),
-                kinds.Rate("site", "safe site", kinds.flagged("site_safe")),
+                kinds.Rate("touchdown", "touchdown on safe ground", kinds.flag_rate("touchdown_safe")),
+                kinds.Rate("site", "safe site", kinds.flag_rate("site_safe")),
             ),
             cases="Landings",
             heading="Ground under the helicopter",
@@ -276,15 +282,15 @@ def site_shares(frame: pd.DataFrame) -> dict[str, rates.Share]:
     refused, safe = rates.flag(frame, "no_site_reported"), rates.flag(frame, "site_safe")
     narrow, right = rates.flag(frame, "safe_site_exists") & ~roomy, refused | (reported & safe)
     shares = {
-        "chosen sites that are truly safe": rates.share_of(safe[reported], frame[reported]),
-        "'no safe site', where none exists": rates.share_of(refused[none], frame[none]),
-        "a site reported, where none exists": rates.share_of(reported[none], frame[none]),
-        "a site reported, where a wide safe site exists": rates.share_of(reported[roomy], frame[roomy]),
-        "a truly safe site or 'no safe site', where all safe sites are narrow": rates.share_of(
+        "chosen sites that are truly safe": rates.fraction_of(safe[reported], frame[reported]),
+        "'no safe site', where none exists": rates.fraction_of(refused[none], frame[none]),
+        "a site reported, where none exists": rates.fraction_of(reported[none], frame[none]),
+        "a site reported, where a wide safe site exists": rates.fraction_of(reported[roomy], frame[roomy]),
+        "a truly safe site or 'no safe site', where all safe sites are narrow": rates.fraction_of(
             right[narrow], frame[narrow]
         ),
-        "ground mapped, of all flights": rates.share_of(rates.flag(frame, "converged"), frame),
-        "landings on safe ground": rates.share_of(rates.flag(frame, "touchdown_safe")[landed], frame[landed]),
+        "ground mapped, of all flights": rates.fraction_of(rates.flag(frame, "converged"), frame),
+        "landings on safe ground": rates.fraction_of(rates.flag(frame, "touchdown_safe")[landed], frame[landed]),
     }
     return {name: one for name, one in shares.items() if one.n}
 
@@ -336,12 +342,12 @@ def run_times_section(subject: Subject) -> Section | None:
     frame, stages = landing_rows(subject), PAPER["stages"]
     if frame is None:
         return None
-    taken = np.column_stack([numbers(frame, stage["column"]) for stage in stages])
-    complete = np.isfinite(taken).all(axis=1)
-    taken, chosen, cases = taken[complete], frame[complete], int(complete.sum())
-    if not cases or not taken.sum() > 0.0:
+    durations = np.column_stack([numbers(frame, stage["column"]) for stage in stages])
+    complete = np.isfinite(durations).all(axis=1)
+    durations, chosen, cases = durations[complete], frame[complete], int(complete.sum())
+    if not cases or not durations.sum() > 0.0:
         return None
-    median, late = np.median(taken, axis=0), np.quantile(taken, 0.95, axis=0)
+    median, late = np.median(durations, axis=0), np.quantile(durations, 0.95, axis=0)
     paper, ours = sum(stage["seconds"] for stage in stages), float(median.sum())
     factor, rows, data = paper / ours, [], []
     for stage, middle, slow in zip(stages, median.tolist(), late.tolist(), strict=True):

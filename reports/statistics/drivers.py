@@ -60,14 +60,14 @@ def driver(
     Smith, Eur. J. Oper. Res. 226, 2013), corrected for bias as Kelley's epsilon squared (Proc. Nat. Acad. Sci. 21,
     1935), with the interval of the noncentral F distribution.
     """
-    known = np.isfinite(condition) & np.isfinite(response)
-    n = int(known.sum())
-    if n < MIN_CASES or np.ptp(condition[known]) == 0.0 or np.ptp(response[known]) == 0.0:
+    finite = np.isfinite(condition) & np.isfinite(response)
+    n = int(finite.sum())
+    if n < MIN_CASES or np.ptp(condition[finite]) == 0.0 or np.ptp(response[finite]) == 0.0:
         return None
-    x, y = stats.rankdata(condition[known]), stats.rankdata(response[known])
+    x, y = stats.rankdata(condition[finite]), stats.rankdata(response[finite])
     effective = float(n)
     if groups is not None:
-        index = np.unique(groups[known], return_inverse=True)[1]
+        index = np.unique(groups[finite], return_inverse=True)[1]
         sizes = np.bincount(index).astype(np.float64)
         size = float((sizes**2).sum() / sizes.sum())
         effective = n / max(
@@ -118,10 +118,12 @@ def _estimate_explained_fraction(
         high = max(1.0, ratio * (bins - 1.0))
         while excess(high, level) > 0.0:
             high *= 2.0
-        found = 0.0
+        noncentrality = 0.0
         if excess(0.0, level) > 0.0:
-            found = float(optimize.brentq(excess, 0.0, high, args=(level,), xtol=1e-4 * high, rtol=1e-4)) / effective
-        bounds.append(found / (1.0 + found))
+            noncentrality = (
+                float(optimize.brentq(excess, 0.0, high, args=(level,), xtol=1e-4 * high, rtol=1e-4)) / effective
+            )
+        bounds.append(noncentrality / (1.0 + noncentrality))
     return fraction, bounds[0], bounds[1], float(stats.f.sf(ratio, bins - 1.0, freedom))
 
 

@@ -1,4 +1,4 @@
-"""Success rates: exact binomial bounds, and the number of cases that a reliability requires.
+"""Success rates: exact binomial bounds, also for cases that share terrains, and the number of cases required.
 
 Bounds: Clopper & Pearson, "The use of confidence or fiducial limits illustrated in the case of the binomial",
 Biometrika 26, 1934.
@@ -7,8 +7,15 @@ Biometrika 26, 1934.
 from __future__ import annotations
 
 import bisect
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from itertools import pairwise
 
-from scipy import stats
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int
+from scipy import special, stats
 
 _LARGEST_SAMPLE_SIZE = 2**40
 #: A lower and an upper bound.
@@ -91,3 +98,195 @@ def consumer_risk(successes: float | int, n: float | int, rate: float) -> float:
     """
     _check_counts(successes, n)
     return 1.0 if successes <= 0 else float(stats.beta.cdf(rate, successes, n - successes + 1.0))
+
+
+#: Minimum number of terrains, and of terrains with a failure (and with a success), to estimate the design effect.
+#: Chosen by simulation (`tests/reports/statistics/test_clusters.py`) so that the bounds keep their confidence.
+_MIN_TERRAINS = 50
+_MIN_MIXED_TERRAINS = 10
+
+
+class ClusterMethod(StrEnum):
+    """Method of the bounds of clustered cases."""
+
+    KORN_GRAUBARD = "Korn-Graubard effective sample size"
+    TERRAIN_COUNT = "whole terrains counted"
+
+
+@dataclass(frozen=True)
+class ClusteredEvidence:
+    """Evidence for a success rate from cases that share terrains.
+
+    terrains, failed_terrains: distinct terrains, and those on which at least one case failed.
+    method: method of the bounds.
+    design_effect: variance of the success rate over that of as many independent cases; NaN where it cannot be
+    estimated. effective_n, effective_successes: equivalent independent cases, and successes that give the lower bound.
+    lower, upper: one-sided bounds of the success rate of a case, each at the requirement's confidence.
+    """
+
+    terrains: int
+    failed_terrains: int
+    method: ClusterMethod
+    design_effect: float
+    effective_n: float
+    effective_successes: float
+    lower: float
+    upper: float
+
+
+def clustered_evidence(
+    success: Bool[np.ndarray, " n"], terrain: Int[np.ndarray, " n"], confidence: float
+) -> ClusteredEvidence:
+    """Bounds of a success rate, each at `confidence`, for at least one case; `terrain` numbers the terrain of each.
+
+    Few terrains with failures or successes are counted whole. Otherwise the bounds are those of Clopper and Pearson
+    with the effective sample size of Korn & Graubard 1998, never larger than n.
+    """
+    index = number_terrains(terrain)
+    sizes = np.bincount(index).astype(np.float64)
+    successes = np.bincount(index, weights=success.astype(np.float64))
+    failed, succeeded = int((successes < sizes).sum()), int((successes > 0).sum())
+    n, terrains = float(sizes.sum()), sizes.size
+    if terrains >= _MIN_TERRAINS and min(failed, succeeded) >= _MIN_MIXED_TERRAINS:
+        method, design_effect = ClusterMethod.KORN_GRAUBARD, _estimate_design_effect(successes, sizes)
+        # The second factor pays for estimating the variance from so many terrains only.
+        freedom = (stats.t.ppf(confidence, n - 1) / stats.t.ppf(confidence, terrains - 1)) ** 2
+        effective_n = min(n, n / max(design_effect, 1e-9) * float(freedom))
+        min_successes = max_successes = float(successes.sum() / n * effective_n)
+    else:
+        # With equally many cases on each, a terrain has a failure at least as often as a case fails, and a success at
+        # least as often as a case succeeds: both bounds are safe. Where bad terrains have fewer cases (they answer less
+        # often) or more, the rate of the cases is on the safe side of the terrains' rate for one of the two bounds.
+        method, design_effect, effective_n = ClusterMethod.TERRAIN_COUNT, float("nan"), float(terrains)
+        of_cases = terrains * float(successes.sum() / n)
+        min_successes, max_successes = min(float(terrains - failed), of_cases), max(float(succeeded), of_cases)
+    lower = proportion_lower(min_successes, effective_n, confidence)
+    upper = proportion_upper(max_successes, effective_n, confidence)
+    return ClusteredEvidence(terrains, failed, method, design_effect, effective_n, min_successes, lower, upper)
+
+
+def _estimate_design_effect(successes: Float[np.ndarray, " terrains"], sizes: Float[np.ndarray, " terrains"]) -> float:
+    """Variance of the rate over terrains (Taylor linearisation) over the binomial one."""
+    terrains, n = sizes.size, sizes.sum()
+    rate = successes.sum() / n
+    residuals = successes - rate * sizes
+    variance = terrains / (terrains - 1) * float((residuals**2).sum()) / n**2
+    return float(variance / (rate * (1.0 - rate) / n))
+
+
+def number_terrains(terrain: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Consecutive terrain numbers from 0, in the order of the given ones."""
+    first, last = int(terrain.min()), int(terrain.max())
+    if last - first > 4 * terrain.size:
+        return np.unique(terrain, return_inverse=True)[1]
+    # without sorting, which takes most of a report of a million cases
+    shifted = terrain - first
+    return np.asarray((np.cumsum(np.bincount(shifted) > 0) - 1)[shifted])
+
+
+#: Minimum risk: a confidence nearer to 1 would round to 1.
+_MIN_RISK = 1e-12
+#: Minimum number of cases of the first look, and maximum number of looks.
+_MIN_FIRST_CASES, _MAX_LOOKS = 16, 6
+
+
+@dataclass(frozen=True)
+class Look:
+    """A look at the verdicts: number of cases, and fraction of the risk that is spent."""
+
+    cases: int
+    share: float
+
+
+def planned_looks(cases: int) -> tuple[Look, ...]:
+    """Looks of a campaign of at most `cases` cases: at the last case, at half of them, a quarter, and so on."""
+    if cases < 1:
+        raise ValueError(f"{cases} cases; a campaign has at least one")
+    sizes = [cases]
+    while len(sizes) < _MAX_LOOKS and sizes[0] // 2 >= _MIN_FIRST_CASES:
+        sizes.insert(0, sizes[0] // 2)
+    return tuple(Look(size, (size - before) / cases) for before, size in pairwise([0, *sizes]))
+
+
+def spent_fraction(looks: tuple[Look, ...], cases: int) -> float:
+    """Fraction of the risk for a verdict from a number of cases: that of the first look with at least as many.
+
+    For more cases than at the last look it is that look's: cases added to a stopped campaign gain nothing.
+    """
+    return next((look.share for look in looks if cases <= look.cases), looks[-1].share)
+
+
+def confidence_at(confidence: float, share: float) -> float:
+    """Confidence of the bounds at one look."""
+    return 1.0 - (1.0 - confidence) * share
+
+
+@dataclass(frozen=True)
+class LaterLook:
+    """Test at a look at a campaign that was judged before: one verdict, PASS or FAIL, of a requirement.
+
+    Events are failures for PASS, successes for FAIL: few of them show it. Under `rate`, the rate at the requirement's
+    limit, the likelihood ratio (`_log_likelihood_ratio`) is a martingale, and under any higher rate a supermartingale.
+    By Ville's inequality it ever reaches c with probability at most its value at the first look over c, for any
+    stopping rule. The threshold c is chosen so that the probabilities of a verdict at the first look, by the ordinary
+    bound, and at any later look add up to `risk`.
+
+    rate: probability of an event in a case at the limit: 1 - probability for PASS, probability for FAIL.
+    risk: probability of a false verdict of all looks together: 1 - confidence.
+    first: cases of the first look, or whole terrains where these are counted.
+    """
+
+    rate: float
+    risk: float
+    first: int
+
+    @cached_property
+    def log_threshold(self) -> float:
+        """Logarithm of the likelihood ratio that shows the verdict at a later look."""
+        events = np.arange(self.first + 1, dtype=np.float64)
+        decided = events[stats.binom.cdf(events, self.first, self.rate) <= self.risk]
+        chance = stats.binom.logpmf(decided, self.first, self.rate)
+        spent = float(np.exp(chance).sum())
+        # rest of the martingale's mean of 1 where the first look does not decide
+        remaining = 1.0 - float(np.exp(chance + _log_likelihood_ratio(decided, self.first, self.rate)).sum())
+        return math.log(max(_MIN_RISK, remaining) / max(_MIN_RISK, self.risk - spent))
+
+    def risk_of_bound(self, n: float | int) -> float:
+        """Risk at which the one-sided Clopper-Pearson bound of n cases shows the verdict at this look."""
+        log_ratio = float(_log_likelihood_ratio(0.0, n, self.rate))
+        if log_ratio < self.log_threshold:
+            level = n * math.log1p(-self.rate) + log_ratio - self.log_threshold
+            return max(_MIN_RISK, min(self.risk, math.exp(level)))
+        few, many = 0.0, float(n)
+        while many - few > 1e-9 * max(1.0, n):
+            middle = 0.5 * (few + many)
+            few, many = (
+                (middle, many) if _log_likelihood_ratio(middle, n, self.rate) >= self.log_threshold else (few, middle)
+            )
+        return max(_MIN_RISK, min(self.risk, float(stats.beta.cdf(1.0 - self.rate, n - few, few + 1.0))))
+
+    def cases_needed(self, n: int, events: int) -> int:
+        """Total number of cases, at least n, that shows the verdict if no further event happens."""
+
+        def is_shown(cases: int) -> bool:
+            return bool(_log_likelihood_ratio(events, cases, self.rate) >= self.log_threshold)
+
+        upper = max(n, 1)
+        while not is_shown(upper):
+            upper *= 2
+        return n + bisect.bisect_left(range(n, upper), True, key=is_shown)
+
+
+def _log_likelihood_ratio(
+    events: Float64[np.ndarray, "*n"] | float | int, n: float | int, rate: float
+) -> Float64[np.ndarray, "*n"]:
+    """Logarithm of the likelihood ratio of a lower rate to `rate`, for a number of events in n cases.
+
+    The lower rate has Jeffreys' prior, Beta(1/2, 1/2), truncated at `rate`. The ratio falls with the events, and rises
+    with every case without one.
+    """
+    events = np.asarray(events, dtype=np.float64)
+    likelihood = special.betaln(events + 0.5, n - events + 0.5) - special.betaln(0.5, 0.5)
+    with np.errstate(divide="ignore"):
+        weight = np.log(special.betainc(events + 0.5, n - events + 0.5, rate) / special.betainc(0.5, 0.5, rate))
+    return np.asarray(likelihood + weight - events * math.log(rate) - (n - events) * math.log1p(-rate))

@@ -12,7 +12,7 @@ Values that share terrains (`groups`) are correlated; the terrain is the samplin
 bootstrap of whole terrains (Davison & Hinkley, "Bootstrap methods and their application", 1997, section 3.8), widened
 for few of them as for single values; it contains Student's interval with the variance over terrains (Taylor
 linearisation; Cochran, "Sampling techniques", 1977, section 6). Quantiles: order statistics, with the counts of
-`marsyard.reports.statistics.clusters`: the effective number of values (Woodruff, J. Amer. Statist. Assoc. 47, 1952,
+`marsyard.reports.statistics.proportions`: the effective number of values (Woodruff, J. Amer. Statist. Assoc. 47, 1952,
 with Korn & Graubard's number), or whole terrains where too few of them lie on either side.
 
 `python -m benchmarks.validation --only intervals --only shared` measures the coverage of all of these.
@@ -32,8 +32,14 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
 
-from marsyard.reports.statistics.clusters import ClusterMethod, clustered_evidence, number_terrains
-from marsyard.reports.statistics.proportions import Interval, check_confidence, proportion_lower
+from marsyard.reports.statistics.proportions import (
+    ClusterMethod,
+    Interval,
+    check_confidence,
+    clustered_evidence,
+    number_terrains,
+    proportion_lower,
+)
 
 #: Number of values (or terrains) above which the bootstrap's interval equals the large-sample one as printed.
 _MAX_BOOTSTRAP = 2000
@@ -283,12 +289,12 @@ def summarize(
     median = float(np.median(finite)) if n else math.nan
     mean_lower, mean_upper = mean_interval(finite, confidence, shared)
     sd_lower, sd_upper = spread_interval(finite, confidence, shared)
-    found = []
+    intervals = []
     for probability in quantiles:
         # a quantile beyond all but the last value is an extrapolation, not an estimate
         is_estimate = n * min(probability, 1.0 - probability) >= 1.0 - 1e-9
         estimate = float(np.quantile(finite, probability)) if is_estimate else math.nan
-        found.append(Quantile(probability, estimate, *quantile_bounds(finite, probability, confidence, shared)))
+        intervals.append(Quantile(probability, estimate, *quantile_bounds(finite, probability, confidence, shared)))
     return ErrorSummary(
         n=n,
         missing=missing,
@@ -302,7 +308,7 @@ def summarize(
         median=median,
         robust_sd=1.4826 * float(np.median(np.abs(finite - median))) if n else math.nan,
         largest=float(np.abs(finite).max()) if n else math.nan,
-        quantiles=tuple(found),
+        quantiles=tuple(intervals),
         confidence=confidence,
     )
 
@@ -342,17 +348,17 @@ def error_ellipse(errors: Float[np.ndarray, "n 2"], probability: float) -> Error
     "Confidence, prediction and tolerance regions for the multivariate normal distribution", J. Amer. Statist. Assoc.
     61, 1966): the fraction of future errors inside is the probability on average, however small n is.
     """
-    known = errors[np.isfinite(errors).all(axis=1)]
-    n = len(known)
+    finite = errors[np.isfinite(errors).all(axis=1)]
+    n = len(finite)
     if n < _MIN_FOR_ELLIPSE:
         return None
-    centre = known.mean(axis=0)
-    values, axes = np.linalg.eigh(np.cov(known.T))
+    centre = finite.mean(axis=0)
+    values, axes = np.linalg.eigh(np.cov(finite.T))
     if values[1] <= 0.0:
         return None
     factor = 2.0 * (n - 1.0) * (n + 1.0) / (n * (n - 2.0)) * float(stats.f.ppf(probability, 2, n - 2))
     variances = np.maximum(values, 0.0)
-    principal = (known - centre) @ axes
+    principal = (finite - centre) @ axes
     with np.errstate(divide="ignore", invalid="ignore"):
         distances = np.where(variances > 0.0, principal**2 / variances, 0.0).sum(axis=1)
     angle = math.degrees(math.atan2(axes[1, 1], axes[0, 1]))

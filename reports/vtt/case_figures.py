@@ -22,8 +22,8 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle, Rectangle
 from scipy import ndimage
 
-from marsyard.reports.presentation import numbers, plane, save_figures, shaped
-from marsyard.reports.svg import GRID, INK, MUTED, SERIES, in_page_style, show_subframe
+from marsyard.reports.presentation import check_shape, numeric_product, plane, save_figures
+from marsyard.reports.section import GRID, INK, MUTED, SERIES, in_page_style, show_subframe
 
 Picture = Float[np.ndarray, "_ _"]
 Point = Float[np.ndarray, "2"]
@@ -106,23 +106,25 @@ def is_vtt_case(products: Mapping[str, Any]) -> bool:
 
 def template_px(products: Mapping[str, Any]) -> float | None:
     """Side of the template; None if unknown."""
-    side = numbers(products.get("template_px"))
+    side = numeric_product(products.get("template_px"))
     return float(side) if side is not None and side.ndim == 0 and np.isfinite(side) else None
 
 
-def stops_of(products: Mapping[str, Any]) -> list[StopPictures]:
+def list_stops(products: Mapping[str, Any]) -> list[StopPictures]:
     """The stops in order, up to the first without a left subframe."""
-    found: list[StopPictures] = []
+    pictures: list[StopPictures] = []
     states, table = products.get("states"), products.get("figures")
-    columns = {str(name): numbers(values) for name, values in table.items()} if isinstance(table, Mapping) else {}
+    columns = (
+        {str(name): numeric_product(values) for name, values in table.items()} if isinstance(table, Mapping) else {}
+    )
     arrays = {name: values for name, values in columns.items() if values is not None and values.ndim == 1}
     for number in _STOPS:
         left = plane(products.get(f"stop_{number}_left"))
         if left is None:
-            return found
+            return pictures
         state = states[number - 1] if isinstance(states, list) and number <= len(states) else ""
         shapes = {"corners": (2, 2), "window": (4,), "found": (2, 2), "point": (2,)}
-        found.append(
+        pictures.append(
             StopPictures(
                 number=number,
                 state=str(state).replace("_", " ").lower(),
@@ -132,37 +134,37 @@ def stops_of(products: Mapping[str, Any]) -> list[StopPictures]:
                 **{part: _shaped_or_nan(products.get(f"stop_{number}_{part}"), *of) for part, of in shapes.items()},
             )
         )
-    return found
+    return pictures
 
 
-def path_of(products: Mapping[str, Any]) -> RoverPath | None:
+def rover_path(products: Mapping[str, Any]) -> RoverPath | None:
     """The run seen from above; None if missing."""
-    target = numbers(products.get("target_m"))
+    target = numeric_product(products.get("target_m"))
     stops, believed = _positions(products.get("rover_true_m")), _positions(products.get("rover_believed_m"))
     estimates = _positions(products.get("target_believed_m"))
     if target is None or target.shape != (3,) or not stops.size or not stops.shape == estimates.shape == believed.shape:
         return None
-    path, rocks = _positions(products.get("path_true_m")), shaped(products.get("rocks_m"), None, 3)
+    path, rocks = _positions(products.get("path_true_m")), check_shape(products.get("rocks_m"), None, 3)
     rocks = np.empty((0, 3)) if rocks is None else rocks
     heading = np.radians(_shaped_or_nan(products.get("heading_deg"), len(stops)))
     return RoverPath(path if path.size else stops, stops, believed, heading, target[:2], estimates, rocks)
 
 
 def _shaped_or_nan(value: object, *shape: int) -> Float[np.ndarray, "..."]:
-    values = shaped(value, *shape)
+    values = check_shape(value, *shape)
     return np.full(shape, np.nan) if values is None else values
 
 
 def _positions(value: object) -> Float[np.ndarray, "n 2"]:
     """East and north of world positions, shape (0, 2) if the product is something else."""
-    values = next((one for width in (2, 3) if (one := shaped(value, None, width)) is not None), np.empty((0, 2)))
+    values = next((one for width in (2, 3) if (one := check_shape(value, None, width)) is not None), np.empty((0, 2)))
     return np.asarray(values[:, :2])
 
 
 @in_page_style
 def draw_stops(products: Mapping[str, Any], max_stops: int | None = None) -> Figure:
     """Subframes of all stops, or of `max_stops` of them, spread evenly from the first to the last."""
-    stops = stops_of(products)
+    stops = list_stops(products)
     if max_stops is not None and len(stops) > max_stops:
         stops = [stops[k] for k in np.unique(np.rint(np.linspace(0, len(stops) - 1, max_stops)).astype(np.int64))]
     side = template_px(products)
@@ -181,7 +183,7 @@ def draw_stops(products: Mapping[str, Any], max_stops: int | None = None) -> Fig
 @in_page_style
 def draw_path(products: Mapping[str, Any]) -> Figure:
     """The path from above, and the target's estimates around the designated point; ValueError if missing."""
-    way = path_of(products)
+    way = rover_path(products)
     if way is None:
         raise ValueError("the products hold no way of a rover")
     figure = Figure(figsize=(10.5, 5.0), layout="constrained")
@@ -195,7 +197,7 @@ def draw_path(products: Mapping[str, Any]) -> Figure:
 def write_vtt_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
     """Write `stops.png` and, if the products hold the path, `way.png` into a folder; returns their paths."""
     figures = {"stops": draw_stops(products)}
-    if path_of(products) is not None:
+    if rover_path(products) is not None:
         figures["way"] = draw_path(products)
     return save_figures(directory, figures)
 
@@ -283,20 +285,20 @@ def _draw_above(axes: Axes, way: RoverPath) -> None:
 def _draw_close(axes: Axes, way: RoverPath) -> None:
     """Estimates of the target relative to the designated point, joined in the order of the stops."""
     offsets = 100.0 * (way.estimates - way.target)
-    known = np.flatnonzero(np.isfinite(offsets).all(axis=1))
+    finite = np.flatnonzero(np.isfinite(offsets).all(axis=1))
     for east, north, diameter in way.rocks[:1]:
         middle = 100.0 * (np.array([east, north]) - way.target)
         axes.add_patch(Circle((middle[0], middle[1]), 50.0 * diameter, facecolor=GRID, edgecolor=MUTED, linewidth=0.8))
-    moved = float(np.linalg.norm(offsets[known[-1]] - offsets[known[0]])) if known.size else 0.0
-    axes.plot(*offsets[known].T, "-", color=SERIES[1], linewidth=1.0)
+    moved = float(np.linalg.norm(offsets[finite[-1]] - offsets[finite[0]])) if finite.size else 0.0
+    axes.plot(*offsets[finite].T, "-", color=SERIES[1], linewidth=1.0)
     text = f"target as estimated ({moved:.0f} cm from first to last)"
-    axes.plot(*offsets[known].T, "o", color=SERIES[1], markersize=5, label=text)
+    axes.plot(*offsets[finite].T, "o", color=SERIES[1], markersize=5, label=text)
     axes.plot(0.0, 0.0, "*", color=INK, markersize=12)
     axes.set(xlabel="east of the target (cm)", ylabel="north of the target (cm)")
     axes.set_title("The target as estimated")
-    width = _set_limits(axes, np.vstack([offsets[known], np.zeros((1, 2))]), 2.0)
-    for place in _choose_numbered(offsets[known], width):
-        _write_number(axes, offsets[known[place]], int(known[place]) + 1)
+    width = _set_limits(axes, np.vstack([offsets[finite], np.zeros((1, 2))]), 2.0)
+    for place in _choose_numbered(offsets[finite], width):
+        _write_number(axes, offsets[finite[place]], int(finite[place]) + 1)
 
 
 def _choose_numbered(points: Float[np.ndarray, "n 2"], width: float) -> list[int]:

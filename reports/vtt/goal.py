@@ -10,12 +10,11 @@ import pandas as pd
 
 from marsyard.algorithms.vtt.accuracy import GOAL_M, NAVCAM, PANCAM, drift_error_m, stereo_range_error_m
 from marsyard.reports import rates
-from marsyard.reports.columns import numbers
 from marsyard.reports.kinds import Distribution, Drawn, MadeBy, Rows, SectionDeclaration
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Subject, grid_of
+from marsyard.reports.section import Block, Grid, Subject, build_grid
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.wording import NOTHING, note_text, number, stated
+from marsyard.reports.wording import NOTHING, format_fraction, note_text, number, numbers
 
 #: Columns of every row of a tracking case.
 _TRACKING_COLUMNS = ("tracked", "drift_px", "position_error_m", "losses")
@@ -58,18 +57,18 @@ def _by_camera(runs: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
 
 def camera_runs(runs: Rows) -> list[dict[str, Any]]:
     """Each camera's rates (`_RATES`, each a `Share`), and position errors and drift of its completed runs."""
-    found = []
+    rows = []
     for camera, ours in _by_camera(runs):
         reached = np.isfinite(numbers(ours, "position_error_m"))
         completed = ours[reached]
         error, drift = rates.known(completed, "position_error_m"), rates.known(completed, "drift_px")
-        found.append(
+        rows.append(
             {
                 "camera": camera,
-                "completed": rates.share_of(reached, ours),
-                "tracked": rates.flag_share(ours, "tracked"),
-                "within": rates.share_of(error <= WITHIN_M, completed),
-                "false_tracks": rates.flag_share(ours, "true_track", wanted=False),
+                "completed": rates.fraction_of(reached, ours),
+                "tracked": rates.flag_fraction(ours, "tracked"),
+                "within": rates.fraction_of(error <= WITHIN_M, completed),
+                "false_tracks": rates.flag_fraction(ours, "true_track", wanted=False),
                 "median_m": rates.quantile(error, 0.5),
                 "quantile_m": rates.quantile(error, QUANTILE),
                 "quantile_bound_m": quantile_bounds(error, QUANTILE, CONFIDENCE, rates.terrain_groups(completed))[1],
@@ -79,7 +78,7 @@ def camera_runs(runs: Rows) -> list[dict[str, Any]]:
                 "drift_quantile_px": rates.quantile(drift, QUANTILE),
             }
         )
-    return found
+    return rows
 
 
 def _millimetres(name: str) -> Any:
@@ -87,27 +86,27 @@ def _millimetres(name: str) -> Any:
 
 
 def _draw_cameras(runs: Rows, subject: Subject, key: str) -> Drawn:
-    found = camera_runs(runs)
+    groups = camera_runs(runs)
     rows = [
-        [one["camera"], name, rates.share_text(one[rate]), rates.interval_text(one[rate])]
-        for one in found
+        [one["camera"], name, rates.fraction_text(one[rate]), rates.interval_text(one[rate])]
+        for one in groups
         for name, rate in _RATES.items()
     ]
-    of_runs = Grid(["Camera", "", "Runs", f"{stated(CONFIDENCE)} interval"], rows)
-    of_errors = grid_of(
-        found,
+    of_runs = Grid(["Camera", "", "Runs", f"{format_fraction(CONFIDENCE)} interval"], rows)
+    of_errors = build_grid(
+        groups,
         {
             "Camera": lambda one: one["camera"],
             "Median (mm)": _millimetres("median_m"),
-            f"{stated(QUANTILE)} quantile (mm)": _millimetres("quantile_m"),
+            f"{format_fraction(QUANTILE)} quantile (mm)": _millimetres("quantile_m"),
             "Its bound (mm)": _millimetres("quantile_bound_m"),
             "Along, rms (mm)": _millimetres("range_rms_m"),
             "Across, rms (mm)": _millimetres("cross_rms_m"),
             "Drift, median (px)": lambda one: number(one["drift_median_px"]),
-            f"Drift, {stated(QUANTILE)} quantile (px)": lambda one: number(one["drift_quantile_px"]),
+            f"Drift, {format_fraction(QUANTILE)} quantile (px)": lambda one: number(one["drift_quantile_px"]),
         },
     )
-    note = note_text("vtt.goal", confidence=stated(CONFIDENCE))
+    note = note_text("vtt.goal", confidence=format_fraction(CONFIDENCE))
     blocks = [
         Block(heading="Runs at selectable targets", grid=of_runs, note=note),
         Block(heading="Errors at the goal", grid=of_errors, note=_expected_errors()),
@@ -116,7 +115,7 @@ def _draw_cameras(runs: Rows, subject: Subject, key: str) -> Drawn:
     if lost.rows:
         note = note_text("vtt.losses")
         blocks.append(Block(heading="Runs that lost the target", grid=lost, note=note))
-    data = [one | {rate: vars(one[rate]) for rate in _RATES.values()} for one in found]
+    data = [one | {rate: vars(one[rate]) for rate in _RATES.values()} for one in groups]
     return blocks, {"cameras": data}
 
 
@@ -129,8 +128,8 @@ def _expected_errors() -> str:
         errors.append(f"{design.name.lower()} {1000.0 * stereo:.1f} mm along and {1000.0 * drift:.2f} mm across")
     return (
         f"By Eqs. 1 and 4 a pixel of disparity and a pixel of drift at {GOAL_M:g} m are, for the paper's cameras: "
-        f"{'; '.join(errors)}. Along: along the line of sight. Bound: of the {stated(QUANTILE)} quantile at "
-        f"{stated(CONFIDENCE)} confidence (order statistics; it takes 230 runs)."
+        f"{'; '.join(errors)}. Along: along the line of sight. Bound: of the {format_fraction(QUANTILE)} quantile at "
+        f"{format_fraction(CONFIDENCE)} confidence (order statistics; it takes 230 runs)."
     )
 
 
@@ -142,7 +141,7 @@ def losses_grid(frame: Rows) -> Grid:
         azimuth, distance = rates.known(chosen, "azimuth_change_max_deg"), rates.known(chosen, "lost_range_m")
         turned = f"{azimuth.max():.1f}" if azimuth.size else NOTHING
         where = f"{distance.min():.1f} to {distance.max():.1f}" if distance.size else NOTHING
-        cloudy = rates.flag_share(chosen, "clear_sky", wanted=False).hits if "clear_sky" in chosen else 0
+        cloudy = rates.flag_fraction(chosen, "clear_sky", wanted=False).hits if "clear_sky" in chosen else 0
         words = str(losses).replace("_", " ").lower()
         rows.append([str(outcome), words, f"{len(chosen):,}", where, turned, f"{cloudy:,}"])
     rows.sort(key=lambda row: -int(row[2].replace(",", "")))

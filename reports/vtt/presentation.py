@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from marsyard.reports.columns import label
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
 from marsyard.reports.section import plate
-from marsyard.reports.vtt.case_figures import draw_path, draw_stops, is_vtt_case, path_of, stops_of, write_vtt_figures
-from marsyard.reports.vtt.goal import GOAL
-from marsyard.reports.vtt.sections import (
-    SINGLE_RUNS,
-    regression_section,
-    steps_section,
-    table_1_section,
-    terrains_section,
-    updates_section,
+from marsyard.reports.vtt import sections
+from marsyard.reports.vtt.case_figures import (
+    draw_path,
+    draw_stops,
+    is_vtt_case,
+    list_stops,
+    rover_path,
+    write_vtt_figures,
 )
-from marsyard.reports.wording import NOTHING, note_text, number
+from marsyard.reports.vtt.goal import GOAL
+from marsyard.reports.wording import NOTHING, label, note_text, number
 
 #: Maximum number of stops whose pictures the page shows.
 _MAX_STOPS = 8
@@ -31,10 +30,10 @@ _QUANTITIES = (
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
     """A tracking case."""
-    stops = stops_of(products)
+    stops = list_stops(products)
     caption = f"{_MAX_STOPS} stops of {len(stops)}." if len(stops) > _MAX_STOPS else "All stops."
     plates = [plate(draw_stops(products, _MAX_STOPS), f"{key}stops", caption, wide=True)]
-    if path_of(products) is not None:
+    if rover_path(products) is not None:
         text = "The path from above, and the target as estimated."
         plates.append(plate(draw_path(products), f"{key}way", text, wide=True))
     names = [name for name in _QUANTITIES if any(name in stop.figures for stop in stops)]
@@ -46,6 +45,5 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
 
 
 VTT = Presentation(
-    cases=(CaseKind(is_vtt_case, view, write_vtt_figures, note_text("vtt.legend")),),
-    first=(table_1_section, SINGLE_RUNS, updates_section, steps_section, terrains_section, regression_section, GOAL),
+    cases=(CaseKind(is_vtt_case, view, write_vtt_figures, note_text("vtt.legend")),), first=(*sections.SECTIONS, GOAL)
 )

@@ -15,15 +15,14 @@ import pandas as pd
 
 from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, AccuracyRow, table_1, tracked_approach_error_m
 from marsyard.reports import rates
-from marsyard.reports.charts import RateLine, rate_figure
-from marsyard.reports.columns import numbers
+from marsyard.reports.figures import RateLine, rate_figure
 from marsyard.reports.kinds import Drawn, MadeBy, Rows
 from marsyard.reports.papers import PaperFacts, read_paper
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Section, Subject, grid_of, plate
+from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, plate
 from marsyard.reports.stored import table
 from marsyard.reports.vtt.goal import is_closed_loop, is_tracking, losses_grid, selectable
-from marsyard.reports.wording import NOTHING, note_text, number, percent, stated
+from marsyard.reports.wording import NOTHING, format_fraction, note_text, number, numbers, percent
 
 _PAPER_FILE = Path(__file__).with_name("paper.toml")
 PAPER = read_paper(_PAPER_FILE)
@@ -37,12 +36,12 @@ _NEAR = 0.1
 
 def table_1_section(subject: Subject) -> Section | None:
     """Table I: computed, printed and measured; None without completed runs from the paper's 10 m to its 2 m."""
-    found = measured_accuracy(subject.frame)
-    if not found:
+    accuracy = measured_accuracy(subject.frame)
+    if not accuracy:
         return None
     computed = {row.name: row for row in table_1()}
     both = [(kind, row[name]) for name in PRINTED for kind, row in (("printed", PRINTED), ("computed", computed))]
-    grid = grid_of(
+    grid = build_grid(
         both,
         {
             "Camera": lambda pair: pair[1].name,
@@ -55,12 +54,12 @@ def table_1_section(subject: Subject) -> Section | None:
     measured_note = note_text("vtt.table_1_measured", start=f"{START_M:g}", goal=f"{GOAL_M:g}")
     blocks = [
         Block(heading="Computed", grid=grid, note=note_text("vtt.table_1")),
-        Block(heading="Measured", grid=_measured_grid(found), note=measured_note),
+        Block(heading="Measured", grid=_measured_grid(accuracy), note=measured_note),
     ]
     data = {
         "computed": {name: asdict(row) for name, row in computed.items()},
         "printed": {name: asdict(row) for name, row in PRINTED.items()},
-        "measured": found,
+        "measured": accuracy,
     }
     return Section("table-1", "Table I", "Table I: accuracy of a target's position", blocks, data)
 
@@ -76,11 +75,11 @@ def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
     ends = {"range_start_m": START_M, "range_end_m": GOAL_M}
     near = [np.abs(numbers(frame, name) / distance - 1.0) < _NEAR for name, distance in ends.items()]
     completed = selectable(frame[near[0] & near[1] & np.isfinite(numbers(frame, "position_error_m"))])
-    found = []
+    rows = []
     for camera in sorted(completed["camera"].unique()):
         runs = completed[completed["camera"].eq(camera)]
         designation, pose = numbers(runs, "designation_error_m"), numbers(runs, "pose_error_m")
-        found.append(
+        rows.append(
             {
                 "camera": str(camera),
                 "runs": len(runs),
@@ -91,7 +90,7 @@ def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
                 "drift_px": rates.rms(numbers(runs, "drift_px")),
             }
         )
-    return found
+    return rows
 
 
 def _measured_grid(found: Sequence[Mapping[str, Any]]) -> Grid:
@@ -113,8 +112,8 @@ def _measured_grid(found: Sequence[Mapping[str, Any]]) -> Grid:
 def legs(subject: Subject) -> list[Mapping[str, Any]]:
     """The legs of the campaign's drive or runs."""
     drive = subject.run.parameter("drive")
-    found = table(drive).get("legs") if drive is not None else subject.run.parameter("legs")
-    return [table(leg) for leg in found] if isinstance(found, list | tuple) else []
+    leg_table = table(drive).get("legs") if drive is not None else subject.run.parameter("legs")
+    return [table(leg) for leg in leg_table] if isinstance(leg_table, list | tuple) else []
 
 
 def table_4(frame: Rows, driven: Sequence[Mapping[str, Any]]) -> Grid:
@@ -191,15 +190,15 @@ def updates_section(subject: Subject) -> Section | None:
 
 #: Columns that distinguish the lines of a figure of steps, if they vary.
 _SERIES = ("algorithm", "search_px")
-_STEPS_NOTE = note_text("vtt.steps", confidence=stated(CONFIDENCE))
+_STEPS_NOTE = note_text("vtt.steps", confidence=format_fraction(CONFIDENCE))
 #: Edges of classes of the most oblique sight, deg.
 _CLASSES_DEG = (0.0, 45.0, 60.0, 65.0, 70.0, 90.0)
 
 
 def steps_section(subject: Subject) -> Section | None:
     """Targets tracked by step size: Fig. 8, sideways motion (5.2), turns (5.3); None unless rows share pictures."""
-    motion, found = _motion(subject), step_rates(subject)
-    if motion is None or not found:
+    motion, steps = _motion(subject), step_rates(subject)
+    if motion is None or not steps:
         return None
     lines = [
         RateLine(
@@ -208,22 +207,22 @@ def steps_section(subject: Subject) -> Section | None:
             [one["good"] for one in ours],
             {one["step"]: one["paper_percent"] / 100.0 for one in ours if one["paper_percent"] is not None},
         )
-        for name in dict.fromkeys(one["line"] for one in found)
-        if (ours := [one for one in found if one["line"] == name and one["good"].n])
+        for name in dict.fromkeys(one["line"] for one in steps)
+        if (ours := [one for one in steps if one["line"] == name and one["good"].n])
     ]
     unit = "% of the distance" if motion["per_cent"] else "deg"
     xlabel = "step (% of the target's distance)" if motion["per_cent"] else "step (deg)"
     caption = "Selectable targets tracked to the end, with intervals; open: the paper's text."
-    grid = grid_of(
-        found,
+    grid = build_grid(
+        steps,
         {
             "Tracker": lambda one: one["line"] or "vtt",
             f"Step ({unit})": lambda one: number(one["step"]).rstrip("0").rstrip("."),
-            "Tracked, of selectable": lambda one: rates.share_text(one["good"]),
-            f"{stated(CONFIDENCE)} interval": lambda one: rates.interval_text(one["good"]),
+            "Tracked, of selectable": lambda one: rates.fraction_text(one["good"]),
+            f"{format_fraction(CONFIDENCE)} interval": lambda one: rates.interval_text(one["good"]),
             "Paper": lambda one: NOTHING if one["paper_percent"] is None else f"{one['paper_percent']:.0f} %",
-            "Tracked, of all targets": lambda one: rates.share_text(one["all_targets"]),
-            "False track, of selectable": lambda one: rates.share_text(one["false_tracks"]),
+            "Tracked, of all targets": lambda one: rates.fraction_text(one["all_targets"]),
+            "False track, of selectable": lambda one: rates.fraction_text(one["false_tracks"]),
         },
     )
     figure = rate_figure(lines, (xlabel, "targets tracked"))
@@ -232,7 +231,7 @@ def steps_section(subject: Subject) -> Section | None:
     if oblique is not None:
         blocks.append(Block(grid=oblique, note=note_text("vtt.obliquity")))
     keys = ("good", "all_targets", "false_tracks")
-    data = [one | {name: asdict(one[name]) for name in keys} for one in found]
+    data = [one | {name: asdict(one[name]) for name in keys} for one in steps]
     return Section("steps", "Steps", motion["title"], blocks, {"cells": data})
 
 
@@ -248,23 +247,23 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
     frame, motion = subject.frame, _motion(subject)
     if motion is None or not is_tracking(frame) or "step" not in frame or "skip" not in frame:
         return []
-    found = []
+    limits = []
     for line, rows in _lines(frame[frame["step"].notna()]):
         paper = motion["paper"].get(line) or motion["paper"].get("", {})
         for _, chosen in rows.groupby("skip"):
             step = float(chosen["step"].iloc[0]) * (100.0 if motion["per_cent"] else 1.0)
             good = selectable(chosen)
-            found.append(
+            limits.append(
                 {
                     "line": line,
                     "step": step,
-                    "good": rates.flag_share(good, "tracked"),
-                    "all_targets": rates.flag_share(chosen, "tracked"),
-                    "false_tracks": rates.flag_share(good, "true_track", wanted=False),
+                    "good": rates.flag_fraction(good, "tracked"),
+                    "all_targets": rates.flag_fraction(chosen, "tracked"),
+                    "false_tracks": rates.flag_fraction(good, "true_track", wanted=False),
                     "paper_percent": next((p for size, p in paper.items() if abs(step - float(size)) < 0.5), None),
                 }
             )
-    return found
+    return limits
 
 
 def _lines(frame: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -283,13 +282,13 @@ def _obliquity_grid(frame: Rows) -> Grid | None:
     """Targets tracked by maximum obliquity and step size; None if rows lack obliquities."""
     if "obliquity_max_deg" not in frame:
         return None
-    seen = frame[rates.all_flags(frame, "selectable", "in_view") & frame["obliquity_max_deg"].notna().to_numpy()]
-    steps = sorted(seen["step"].unique())
+    visible = frame[rates.all_flags(frame, "selectable", "in_view") & frame["obliquity_max_deg"].notna().to_numpy()]
+    steps = sorted(visible["step"].unique())
     rows = []
     for low, high in pairwise(_CLASSES_DEG):
-        chosen = seen[seen["obliquity_max_deg"].between(low, high, inclusive="left")]
+        chosen = visible[visible["obliquity_max_deg"].between(low, high, inclusive="left")]
         if len(chosen):
-            shares = [rates.flag_share(chosen[chosen["step"].eq(step)], "tracked") for step in steps]
+            shares = [rates.flag_fraction(chosen[chosen["step"].eq(step)], "tracked") for step in steps]
             rows.append([f"{low:g} to {high:g}", *(f"{one.hits:,} of {one.n:,}" for one in shares)])
     return Grid(["Maximum obliquity (deg)", *(f"{step:g} deg" for step in steps)], rows) if rows else None
 
@@ -313,16 +312,16 @@ def terrains_section(subject: Subject) -> Section | None:
         good, slips = selectable(runs), rates.known(runs, "slip_max")
         lost = good[~rates.flag(good, "tracked")]
         counted = dict(Counter(failure_cause(row) for _, row in lost.iterrows()).most_common())
-        failed, failed_all = (rates.flag_share(one, "tracked", wanted=False) for one in (good, runs))
+        failed, failed_all = (rates.flag_fraction(one, "tracked", wanted=False) for one in (good, runs))
         slip = float(slips.max()) if slips.size else float("nan")
         row = printed.get(name)
         paper = [NOTHING] * 2 if row is None else [f"{row['failures']} of {row['trials']}", row["reason"]]
         causes = "; ".join(f"{cause}: {n}" for cause, n in counted.items()) or "none"
-        ours = [rates.share_text(failed), rates.interval_text(failed), causes, rates.share_text(failed_all)]
+        ours = [rates.fraction_text(failed), rates.interval_text(failed), causes, rates.fraction_text(failed_all)]
         rows.append([name, *paper, *ours, percent(slip)])
         shares = {"failed": asdict(failed), "failed_all": asdict(failed_all)}
         data.append({"name": name, **shares, "causes": counted, "slip_max": slip})
-    head = ["Terrain", "Failures, paper", "Reason, paper", "Failures, ours", f"{stated(CONFIDENCE)} interval"]
+    head = ["Terrain", "Failures, paper", "Reason, paper", "Failures, ours", f"{format_fraction(CONFIDENCE)} interval"]
     head += ["Cause, ours", "Failures, all targets", "Maximum slip"]
     note = note_text("vtt.table_2", limit=f"{EXCESSIVE_DEG:g}")
     title = "Table II: tracking with visual odometry on four kinds of ground"
@@ -353,14 +352,14 @@ def regression_section(subject: Subject) -> Section | None:
         driving=np.where(frame["autonav"].astype(bool), by_map, driving),
         rock=np.where(numbers(frame, "rock_height_m") <= SMALL_M, "small", "large"),
     )
-    grid = grid_of(
+    grid = build_grid(
         list(described.groupby(["driving", "rock", "incline"], sort=True)),
         {
             "Driving": lambda one: str(one[0][0]),
             "Rock": lambda one: str(one[0][1]),
             "Ground": lambda one: str(one[0][2]),
             "Runs": lambda one: f"{len(one[1]):,}",
-            "Tracked to the goal": lambda one: rates.share_text(rates.flag_share(one[1], "tracked")),
+            "Tracked to the goal": lambda one: rates.fraction_text(rates.flag_fraction(one[1], "tracked")),
             "Outcomes": lambda one: ", ".join(sorted(str(outcome) for outcome in one[1]["outcome"].unique())),
             "Position error (cm)": lambda one: rates.spread_text(rates.known(one[1], "position_error_m", 100.0), 2),
             "Drift (px)": lambda one: rates.spread_text(rates.known(one[1], "drift_px"), 1),
@@ -371,5 +370,8 @@ def regression_section(subject: Subject) -> Section | None:
     blocks, lost = [Block(grid=grid, note=note)], losses_grid(frame)
     if lost.rows:
         blocks.append(Block(heading="Runs that lost the target", grid=lost))
-    data = {"tracked": asdict(rates.flag_share(frame, "tracked"))}
+    data = {"tracked": asdict(rates.flag_fraction(frame, "tracked"))}
     return Section("regression", "Regression", "Regression runs on the engineering model", blocks, data)
+
+
+SECTIONS = (table_1_section, SINGLE_RUNS, updates_section, steps_section, terrains_section, regression_section)

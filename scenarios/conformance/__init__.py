@@ -16,9 +16,9 @@ from marsyard.algorithms.exchange import PREFIXES, ExecutableLimits
 from marsyard.scenarios.conformance import estimators, parts, trackers
 from marsyard.scenarios.conformance.checks import Finding as Finding
 from marsyard.scenarios.conformance.checks import Suite
-from marsyard.scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, installed
-from marsyard.scenarios.import_path import import_object
+from marsyard.scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, list_installed
 from marsyard.scenarios.parts.named import KINDS
+from marsyard.scenarios.user_files import import_object
 
 #: Tasks and kinds with a suite, words of the command line.
 SUBJECT_KINDS = (*TASKS, *KINDS)
@@ -86,10 +86,10 @@ def determine_task(spec: str) -> str:
         return shipped
     if spec.startswith(tuple(PREFIXES)):
         return VELOCITY.name
-    kind = None if spec in installed() else parts.kind_of(spec)
+    kind = None if spec in list_installed() else parts.part_kind(spec)
     if kind is not None:
         return kind
-    path = installed()[spec].value if spec in installed() else spec
+    path = list_installed()[spec].value if spec in list_installed() else spec
     if ":" not in path:
         VELOCITY.check(spec)
     try:

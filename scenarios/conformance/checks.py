@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from marsyard.algorithms.faults import AlgorithmError
+from marsyard.algorithms.answers import AlgorithmError
 from marsyard.scenarios.algorithm_run import copy_inputs, hash_inputs
 from marsyard.scenarios.estimators import algorithm_sources
 
@@ -80,7 +80,7 @@ class Check:
 class Suite(ABC):
     """Conformance suite of one algorithm or part, which is constructed again for each check.
 
-    The process of a check detects state left behind in it (`marsyard.campaigns.running.conformance`).
+    The process of a check detects state left behind in it (`marsyard.campaigns.running.replay`).
 
     - make: constructs the algorithm or part
     - program: it is a program with files as input, which cannot change the suite's objects
@@ -132,8 +132,8 @@ class Suite(ABC):
         if not self.program:
             copies = "work on copies: counts.astype(...), array.copy()"
             yield Check("inputs", "leaves its inputs as they are", copies, self._leaves_inputs)
-        asked = "gives the same answers to the same case, after any other cases"
-        yield Check("deterministic", asked, self.deterministic_advice, self._repeats_answers)
+        rule = "gives the same answers to the same case, after any other cases"
+        yield Check("deterministic", rule, self.deterministic_advice, self._repeats_answers)
         faster = "be faster, or allow more with --time-limit"
         yield Check("time", f"{self.answers} within {self.limit_s:g} s", faster, self._answers_in_time)
         if self.closed_to_truth and not self.program:
@@ -179,7 +179,20 @@ class Suite(ABC):
         return measure_time_s(lambda: self._answer(case))
 
     def _imports_no_truth(self) -> str:
-        if closed := closed_imports(self.spec):
+        closed, allowed = [], tuple(f"{one}." for one in OPEN_MODULES)
+        for name, path in algorithm_sources(self.spec):
+            try:
+                nodes = list(ast.walk(ast.parse(path.read_bytes())))
+            except (SyntaxError, ValueError):
+                continue
+            imports = [(node.lineno, one.name) for node in nodes if isinstance(node, ast.Import) for one in node.names]
+            for node in nodes:
+                if isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:
+                    imports += [(node.lineno, f"{node.module}.{alias.name}") for alias in node.names]
+            for line, module in imports:
+                if module.partition(".")[0] == "marsyard" and not f"{module}.".startswith(allowed):
+                    closed.append(f"{name}, line {line}: {module}")
+        if closed:
             raise BreachError(f"it imports modules with access to the truth: {'; '.join(closed[:5])}")
         return ""
 
@@ -194,22 +207,3 @@ def measure_time_s(call: Callable[[], object]) -> float:
 def fingerprint(answer: Any) -> str:
     """Fingerprint of an answer without its details, which may contain times."""
     return hash_inputs(answer, ("details",))
-
-
-def closed_imports(spec: str) -> list[str]:
-    """Imports in a Python algorithm's sources that give access to the truth: file, line and name."""
-    closed = []
-    for name, path in algorithm_sources(spec):
-        try:
-            nodes = list(ast.walk(ast.parse(path.read_bytes())))
-        except (SyntaxError, ValueError):
-            continue
-        imports = [(node.lineno, alias.name) for node in nodes if isinstance(node, ast.Import) for alias in node.names]
-        for node in nodes:
-            if isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:
-                imports += [(node.lineno, f"{node.module}.{alias.name}") for alias in node.names]
-        allowed = tuple(f"{one}." for one in OPEN_MODULES)
-        for line, module in imports:
-            if module.partition(".")[0] == "marsyard" and not f"{module}.".startswith(allowed):
-                closed.append(f"{name}, line {line}: {module}")
-    return closed

@@ -69,27 +69,28 @@ class EstimatorSuite(Suite):
         """See `Suite`."""
         p = self.protocol
         form = "see algorithms/interface.py for the answer's form"
-        asked = "gives a well-formed answer to textured pictures"
-        yield Check("answer", asked, form, lambda: p.describe(self._answer(p.measurements())))
+        rule = "gives a well-formed answer to textured pictures"
+        yield Check("answer", rule, form, lambda: p.describe(self._answer(p.measurements())))
         advice = f"return one of the failures: {p.failures}"
         for name, blank in inputs.BLANKS.items():
-            asked = f"ends with a failure if pictures are {name}"
-            yield Check(name, asked, advice, partial(self._fails_on, name, blank))
-        asked = "gives a well-formed answer to pictures of noise"
-        yield Check("noise", asked, advice, lambda: self._outcome(inputs.noisy(p.measurements())))
+            rule = f"ends with a failure if pictures are {name}"
+            yield Check(name, rule, advice, partial(self._fails_on, name, blank))
+        rule = "gives a well-formed answer to pictures of noise"
+        yield Check("noise", rule, advice, lambda: self._outcome(inputs.noisy(p.measurements())))
         if p is LANDING:
-            asked = "gives a well-formed answer without a range"
+            rule = "gives a well-formed answer without a range"
             no_range = replace(inputs.landing(), slant_range_m=float("nan"))
-            yield Check("no-range", asked, advice, lambda: self._outcome(no_range))
+            yield Check("no-range", rule, advice, lambda: self._outcome(no_range))
         yield from self.common_checks()
         if p is STREAM:
             advice = f"return one of the failures from finish: {VELOCITY.failures}"
             yield Check("few", "ends with a failure if there is no picture, or one", advice, self._fails_on_few)
-            asked = f"gives a well-formed answer to {', '.join(map(str, _ENOUGH))} and {_MANY} pictures"
+            rule = f"gives a well-formed answer to {', '.join(map(str, _ENOUGH))} and {_MANY} pictures"
             advice = "expect any number: see VelocityStream in algorithms/interface.py"
-            yield Check("number", asked, advice, self._answers_any_number)
-            asked, advice = "resets its state after an interrupted descent", "reset the whole state in start"
-            yield Check("start", asked, advice, self._starts_again)
+            streams = (*map(_first_pictures, _ENOUGH), inputs.descent(_MANY))
+            yield Check("number", rule, advice, lambda: "; ".join(describe_velocity(self._answer(x)) for x in streams))
+            rule, advice = "resets its state after an interrupted descent", "reset the whole state in start"
+            yield Check("start", rule, advice, self._starts_again)
 
     def cases(self) -> Sequence[Any]:
         """See `Suite`."""
@@ -108,7 +109,7 @@ class EstimatorSuite(Suite):
         return str(self._answer(measurements).outcome.name)
 
     def _fails_on(self, name: str, blank: inputs.Blank) -> str:
-        answer = self._answer(inputs.blanked(self.protocol.measurements(), blank))
+        answer = self._answer(inputs.blank_pictures(self.protocol.measurements(), blank))
         if self.protocol.is_valid(answer):
             raise BreachError(f"it answers {answer.outcome.name} to pictures that are {name}: there is nothing to see")
         return str(answer.outcome.name)
@@ -121,10 +122,6 @@ class EstimatorSuite(Suite):
                 raise BreachError(f"it answers {answer.outcome.name} to {number or 'no'} picture: nothing has moved")
             outcomes.append(answer.outcome.name)
         return ", ".join(outcomes)
-
-    def _answers_any_number(self) -> str:
-        streams = (*map(_first_pictures, _ENOUGH), inputs.descent(_MANY))
-        return "; ".join(describe_velocity(self._answer(one)) for one in streams)
 
     def _starts_again(self) -> str:
         measurements = self.protocol.measurements()

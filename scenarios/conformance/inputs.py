@@ -134,16 +134,16 @@ def _take_pictures(
     (camera,) = chosen.cameras()
     ground = TexturedPlane(np.zeros(3), np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), step_m)
     rng = np.random.default_rng(1)
-    detector = Detector.drawn(natural_fall_off(camera), chosen.detector, rng)
-    delivered = camera.binned(columns=1, rows=chosen.detector.rows_summed)
+    detector = Detector.draw(natural_fall_off(camera), chosen.detector, rng)
+    delivered = camera.bin(columns=1, rows=chosen.detector.rows_summed)
     images = []
     for position, attitude, time in zip(positions, attitudes, times, strict=True):
-        radiance = ground.radiance(camera.moved(rigid(attitude, position)))
+        radiance = ground.radiance(camera.transform(rigid(attitude, position)))
         images.append(DetectorImage(detector.expose(radiance, rng), time, delivered, detector.calibration))
     return images
 
 
-def blanked(measurements: Measurements, blank: Blank) -> Measurements:
+def blank_pictures(measurements: Measurements, blank: Blank) -> Measurements:
     """The measurements with blank pictures."""
     return _replace_counts(measurements, lambda one: np.full(one.counts.shape, blank(one.calibration), np.uint16))
 

@@ -23,21 +23,10 @@ from marsyard.scenarios.conformance import inputs, trackers
 from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, fingerprint
 from marsyard.scenarios.landing.pictures import GroundTruth
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
+from marsyard.scenarios.parts import scores
 from marsyard.scenarios.parts.instruments import InstrumentTruth, check_readings
 from marsyard.scenarios.parts.motions import DescentPlace, Poses, check_poses
-from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, KINDS, SCORE, Kind, check_columns, installed
-from marsyard.scenarios.parts.scores import (
-    SCORED,
-    ScoredCase,
-    ScoredDescent,
-    ScoredFlight,
-    ScoredLanding,
-    ScoredRun,
-    ScoredSite,
-    ScoredVelocity,
-    accepted_cases,
-    load_score,
-)
+from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, KINDS, SCORE, Kind, check_columns, list_installed
 from marsyard.sim.dynamics.recorded import RecordedMotion
 from marsyard.sim.frames import rigid
 
@@ -47,9 +36,9 @@ _SLOPE = 0.05
 _NORMAL = np.array([-_SLOPE, 0.0, 1.0]) / np.hypot(_SLOPE, 1.0)
 
 
-def kind_of(spec: str) -> str | None:
+def part_kind(spec: str) -> str | None:
     """Kind of a named part by its entry point, members or annotations; None if they do not determine it."""
-    named = next((kind.name for kind in KINDS.values() if spec in installed(kind.group)), None)
+    named = next((kind.name for kind in KINDS.values() if spec in list_installed(kind.group)), None)
     if named is not None or ":" not in spec:
         return named
     try:
@@ -58,8 +47,8 @@ def kind_of(spec: str) -> str | None:
         return None
     if isinstance(part, type):
         return next((kind.name for kind in (DYNAMICS, INSTRUMENT) if hasattr(part, kind.members[0])), None)
-    accepted = accepted_cases(part) if callable(part) else SCORED
-    return SCORE.name if accepted and accepted != SCORED else None
+    accepted = scores.accepted_cases(part) if callable(part) else scores.SCORED
+    return SCORE.name if accepted and accepted != scores.SCORED else None
 
 
 @dataclass(frozen=True)
@@ -76,21 +65,22 @@ class PartSuite(Suite):
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
         form = "see docs/custom-parts.md for inputs and outputs"
-        asked = "returns the output of its kind: right shapes, finite and in order"
-        yield Check("answer", asked, form, lambda: ", ".join(_describe(self._answer(case)) for case in self.cases()))
-        asked = "reports the same columns in every case: identifiers, with numbers or truth values"
-        yield Check("columns", asked, "report every column in every case; NaN for no number", self._columns)
+        rule = "returns the output of its kind: right shapes, finite and in order"
+        yield Check("answer", rule, form, lambda: ", ".join(_describe(self._answer(case)) for case in self.cases()))
+        rule = "reports the same columns in every case: identifiers, with numbers or truth values"
+        yield Check("columns", rule, "report every column in every case; NaN for no number", self._columns)
         yield from self.common_checks()
         if self.kind is not SCORE:
-            asked = "depends on its random stream if it states so, and only then"
+            rule = "depends on its random stream if it states so, and only then"
             advice = "set random to true if it draws, and draw only from the generator in the arguments"
-            yield Check("random", asked, advice, self._depends_on_stream)
+            yield Check("random", rule, advice, self._depends_on_stream)
 
     def cases(self) -> Sequence[Any]:
         """See `Suite`."""
         if self.kind is not SCORE:
             return places() if self.kind is DYNAMICS else truths()
-        return [case for case in scored_cases() if isinstance(case, accepted_cases(load_score(self.spec)))]
+        accepted = scores.accepted_cases(scores.load_score(self.spec))
+        return [case for case in scored_cases() if isinstance(case, accepted)]
 
     def _call(self, algorithm: Any, case: Any, seed: int) -> Any:
         rng = np.random.default_rng(seed)
@@ -135,7 +125,7 @@ class PartSuite(Suite):
 
 def load_part(kind: Kind, spec: str) -> Any:
     """A part with default options. Raises ValueError with the allowed names if there is none of this name and kind."""
-    return load_score(spec) if kind is SCORE else kind.create(spec, {})
+    return scores.load_score(spec) if kind is SCORE else kind.create(spec, {})
 
 
 def _describe(answer: Any) -> str:
@@ -187,7 +177,7 @@ def truths() -> tuple[InstrumentTruth, ...]:
 
 
 @cache
-def scored_cases() -> tuple[ScoredCase, ...]:
+def scored_cases() -> tuple[scores.ScoredCase, ...]:
     """Inputs of scores: all kinds of cases with an answer and with a failure; real ones also without truth."""
     velocities = (
         VelocityEstimate(VelocityOutcome.VALID, np.array([11.0, -7.5])),
@@ -199,19 +189,19 @@ def scored_cases() -> tuple[ScoredCase, ...]:
     )
     three = (motion().state(0.0), motion().state(3.75), motion().state(7.5))
     poses = rigid(three[0].attitude, three[0].position_m), rigid(three[1].attitude, three[1].position_m)
-    cases: list[ScoredCase] = []
+    cases: list[scores.ScoredCase] = []
     for answer in velocities:
         asked: dict[str, Any] = {"measurements": inputs.descent(), "answer": answer}
         known: dict[str, Any] = asked | {"true_velocity_m_s": inputs.DESCENT_VELOCITY_M_S[:2].copy()}
         flown: dict[str, Any] = known | {"states": three, "motion": motion()}
         landed: dict[str, Any] = {"at_firing": motion().state(20.0), "touchdown_m_s": np.array([3.0, -1.0])}
-        unknown = ScoredVelocity(**asked, true_velocity_m_s=None)
-        cases += [ScoredDescent(**flown, **landed), ScoredFlight(**flown), ScoredVelocity(**known), unknown]
+        cases += [scores.ScoredDescent(**flown, **landed), scores.ScoredFlight(**flown)]
+        cases += [scores.ScoredVelocity(**known), scores.ScoredVelocity(**asked, true_velocity_m_s=None)]
     for site in sites:
         asked = {"measurements": inputs.landing(), "answer": site}
         known = asked | {"true_poses": poses}
-        landing = ScoredLanding(**known, states=three[:2], ground=_ground_truth())
-        cases += [landing, ScoredSite(**known), ScoredSite(**asked, true_poses=None)]
+        landing = scores.ScoredLanding(**known, states=three[:2], ground=_ground_truth())
+        cases += [landing, scores.ScoredSite(**known), scores.ScoredSite(**asked, true_poses=None)]
     return (*cases, _scored_run(TrackingState.NORMAL), _scored_run(TrackingState.FAILURE))
 
 
@@ -227,12 +217,12 @@ def _ground_truth() -> GroundTruth:
     return GroundTruth(relief, Limits(2.0, 0.26, 0.2), positions_m, footprints, np.ones(zeros.shape, dtype=bool), 1.0)
 
 
-def _scored_run(state: TrackingState) -> ScoredRun:
+def _scored_run(state: TrackingState) -> scores.ScoredRun:
     """A rover's run of two stops, the second with an answer of this state."""
     poses = (trackers.pose(0.0), trackers.pose(0.4))
     first = TargetUpdate(TrackingState.NORMAL, (), trackers.TARGET_M.copy())
     last = TargetUpdate(state, (), trackers.TARGET_M - 0.4 if state is TrackingState.NORMAL else None)
-    return ScoredRun(
+    return scores.ScoredRun(
         outcome="COMPLETED" if last.found else "LOST",
         target_world=trackers.TARGET_M.copy(),
         world_from_rover=poses,

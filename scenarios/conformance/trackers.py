@@ -47,7 +47,7 @@ def designation() -> PixelTarget:
     angles = mast_angles(TARGET_M, mast())
     if angles is None:
         raise ValueError("the mast cannot point at the suite's target")
-    left = mast().left.moved(mast().geometry.rover_from_head(*angles))
+    left = mast().left.transform(mast().geometry.rover_from_head(*angles))
     return PixelTarget(np.asarray(left.project(TARGET_M)[0]), *angles)
 
 
@@ -55,8 +55,8 @@ def take_pictures(aim: MastAim, world_from_rover: RigidTransform, blank: int | N
     """Measurements of a stop at the aim: pictures of the wall, or blank pictures of one count."""
     angles = aim.azimuth_rad, aim.elevation_rad
     head = world_from_rover * mast().geometry.rover_from_head(*angles)
-    left = _take_picture(mast().left.moved(head), aim.left, blank)
-    right = _take_picture(mast().right.moved(head), aim.right, blank)
+    left = _take_picture(mast().left.transform(head), aim.left, blank)
+    right = _take_picture(mast().right.transform(head), aim.right, blank)
     return RoverMeasurements(left, right, mast(), *angles, world_from_rover)
 
 
@@ -64,7 +64,7 @@ def _take_picture(camera: CameraModel, box: PixelBox, blank: int | None) -> Mast
     if blank is not None:
         return MastImage(np.full(box.size[::-1], blank, np.uint16), box.corner)
     wall = TexturedPlane(np.array([_WALL_M, 0.0, 0.0]), np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]), 0.006)
-    radiance = wall.radiance(camera.cropped(*box.corner, box.size))
+    radiance = wall.radiance(camera.crop(*box.corner, box.size))
     return MastImage(np.clip(np.rint(_LEVEL_DN / MEAN * radiance), 0, FULL_SCALE_DN).astype(np.uint16), box.corner)
 
 
@@ -79,14 +79,14 @@ class TrackerSuite(Suite):
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
         form = "see algorithms/interface.py for aim, update and state"
-        asked = "gives a well-formed aim and answer at every stop of a drive"
-        yield Check("answer", asked, form, lambda: ", ".join(one.state.name for one in drive(self.make())))
+        rule = "gives a well-formed aim and answer at every stop of a drive"
+        yield Check("answer", rule, form, lambda: ", ".join(one.state.name for one in drive(self.make())))
         yield Check("states", "has no target before one is designated and after it is cleared", form, self._has_states)
         advice = "return a TargetUpdate with the state LOST and the reasons in losses"
         for name, blank in BLANKS.items():
             yield Check(name, f"loses its target if pictures are {name}", advice, partial(self._loses, name, blank))
-        asked = "answers if the pose jumps and pictures show other ground"
-        yield Check("pose", asked, advice, self._answers_after_jump)
+        rule = "answers if the pose jumps and pictures show other ground"
+        yield Check("pose", rule, advice, self._answers_after_jump)
         yield from self.common_checks()
 
     def cases(self) -> Sequence[PixelTarget]:
@@ -95,7 +95,6 @@ class TrackerSuite(Suite):
         return [designation()]
 
     def _call(self, algorithm: Any, case: PixelTarget, seed: int) -> Sequence[TargetUpdate]:
-        """A drive; the target is cleared afterwards."""
         updates = drive(algorithm)
         algorithm.clear()
         return updates

@@ -9,8 +9,12 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.scenarios.descent.faults import draw_clouds, faulty_terrain
-from marsyard.scenarios.descent.parameters import CameraParameters, DescentScenarioParameters
+from marsyard.scenarios.descent.parameters import (
+    CameraParameters,
+    DescentScenarioParameters,
+    draw_clouds,
+    faulty_terrain,
+)
 from marsyard.scenarios.exposure import Optics, add_calibration_error, render_state, sunlight_ratio
 from marsyard.scenarios.exposure import camera_optics as shared_optics
 from marsyard.scenarios.meshes import MeshParameters, add_meshes

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from marsyard.scenarios.descent.faults import faulty_times
-from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters, faulty_times
 from marsyard.scenarios.descent.recorded import AFTER_S, check_looks_down
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.motions import CustomMotion, DescentPlace

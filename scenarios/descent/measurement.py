@@ -10,9 +10,8 @@ from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.descent.exposure import World, calibrated_camera
-from marsyard.scenarios.descent.faults import faulty_altitudes, faulty_attitudes
 from marsyard.scenarios.descent.flight import MARGIN_S, DescentFlight, gravity_m_s2
-from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters, faulty_altitudes, faulty_attitudes
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.instruments import (
     CustomAltimeter,
@@ -52,9 +51,9 @@ class Instruments:
         """Draw the instruments of a case, propagate the navigation, and read a user's own instruments."""
         start, end = -flight.lead_s + MARGIN_S, flight.firing_s + MARGIN_S
         approach = Approach(p.approach, start)
-        unit = Imu.drawn(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
+        unit = Imu.draw(p.imu, (approach.start_s, end), streams.generator("inertial unit"))
         imu = approach.calibrate(unit, streams.generator("inertial unit's calibration"))
-        clock = Clock.drawn(p.clock, streams.generator("image clock"))
+        clock = Clock.draw(p.clock, streams.generator("image clock"))
         surface, motion = world.surface, flight.motion
         # readings and columns of the user's own instruments, by parameter table
         own: dict[str, tuple[InstrumentReadings, Mapping[str, Scalar]]] = {}
@@ -81,7 +80,7 @@ class Instruments:
             navigation=InertialSolution.propagate(increments, attitude, velocity, gravity_m_s2(p)),
             altimeter=own["altimeter"][0]
             if isinstance(p.altimeter, CustomAltimeter)
-            else RadarAltimeter.drawn(p.altimeter, world.surface, streams.generator("altimeter")),
+            else RadarAltimeter.draw(p.altimeter, world.surface, streams.generator("altimeter")),
             tags_s=tags,
             attitude_source=own["attitude_source"][0] if "attitude_source" in own else None,
             row={name: value for _, row in own.values() for name, value in row.items()},
@@ -100,7 +99,7 @@ def measure(
     """Measurements of an estimator: attitudes at the pictures' tags, altitudes of the last readings before them."""
     tags = instruments.tags_s
     model = calibrated_camera(p.camera, streams.generator("camera calibration"))
-    camera = model.binned(columns=1, rows=p.detector.rows_summed)
+    camera = model.bin(columns=1, rows=p.detector.rows_summed)
     images = [
         DetectorImage(counts, float(tag), camera, detector.calibration)
         for counts, tag in zip(pictures, tags, strict=True)

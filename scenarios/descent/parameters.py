@@ -1,15 +1,17 @@
-"""Parameters of a descent campaign."""
+"""Parameters of a descent campaign, and the faults that a case may have."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
-from pydantic import Field, Tag, field_validator, model_validator
+import numpy as np
+from pydantic import Field, Tag, model_validator
+from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
-from marsyard.scenarios.descent.faults import Faults, faulty_times
+from marsyard.scenarios.algorithm_run import AlgorithmSelection
+from marsyard.scenarios.conditions import SizedFaults
 from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.meshes import MeshParameters
@@ -17,10 +19,12 @@ from marsyard.scenarios.parts.instruments import CustomAltimeter, CustomAttitude
 from marsyard.scenarios.parts.motions import CustomMotion
 from marsyard.scenarios.parts.named import default_or_custom
 from marsyard.scenarios.parts.scores import CustomScores, ScoredDescent
-from marsyard.scenarios.terrain_files import CheckedTerrain
+from marsyard.scenarios.terrain_files import CheckedTerrain, check_site
 from marsyard.sim.dynamics import SwingParameters
-from marsyard.sim.parameters import Parameters, bounded
+from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
+from marsyard.sim.parameters import NonNegative, Parameters, bounded_field, merge_settings
 from marsyard.sim.render.backend import Backend, default_backend
+from marsyard.sim.render.photometry import CloudLayer, CloudParameters
 from marsyard.sim.sensor import (
     ApproachParameters,
     ClockParameters,
@@ -32,6 +36,83 @@ from marsyard.sim.sensor import (
     RadarParameters,
 )
 from marsyard.sim.terrain import Site, TerrainParameters, site, sites
+from marsyard.sim.terrain.landforms import Dunes
+
+#: Amplitude and length of a noise burst on the cable: a third of the picture's signal, over two delivered rows.
+BURST_DN, BURST_PX = 300.0, 2048.0
+#: Regular dunes.
+REGULAR_DUNES = Dunes(wavelength_m=60.0, height_m=1.0, crest_length=20.0, regularity=12.0)
+#: Index of the picture that single-picture faults affect: it is in both pairs.
+FAULTY_PICTURE = 1
+
+
+class Faults(SizedFaults):
+    """Faults of a descent."""
+
+    heat_shield_deg: Annotated[
+        NonNegative, Field(le=90.0, description="angular diameter of the falling heat shield in the first picture")
+    ] = 0.0
+    cloud_cover: Annotated[NonNegative, Field(le=0.9, description="fraction of the ground in cloud shadows")] = 0.0
+    haze: Annotated[NonNegative, Field(le=10.0, description="optical depth of dusty air over 2000 m")] = 0.0
+    dunes_m: Annotated[NonNegative, Field(le=30.0, description="height of regular dunes on all of the ground")] = 0.0
+    cable_bursts: Annotated[NonNegative, Field(le=1e4, description="mean number of noise bursts in a picture")] = 0.0
+    late_s: Annotated[NonNegative, Field(le=3.0, description="delay of the second picture after its time tag")] = 0.0
+    repeated_picture: Annotated[int, bounded_field(0, 3, "picture delivered as the previous one, 2 or 3; 0: none")] = 0
+    black_picture: Annotated[int, bounded_field(0, 3, "picture that is delivered black, 1 to 3; 0: none")] = 0
+    altitude_error: Annotated[NonNegative, Field(le=0.9, description="relative error of all altitudes, too high")] = 0.0
+    altitude_error_once: Annotated[NonNegative, Field(le=0.9, description="the same of the second altitude")] = 0.0
+    attitude_error_deg: Annotated[NonNegative, Field(le=90.0, description="tilt error of all attitudes")] = 0.0
+    attitude_error_once_deg: Annotated[NonNegative, Field(le=90.0, description="the same of the second attitude")] = 0.0
+
+    def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
+        """Changed detector parameters, noise bursts on the cable included."""
+        bursts = {"bursts": self.cable_bursts, "length_px": BURST_PX, "amplitude_dn": BURST_DN}
+        return {**super().detector_changes(), "bursts": bursts if self.cable_bursts else {}}
+
+
+def faulty_terrain(faults: Faults, terrain: TerrainParameters) -> TerrainParameters:
+    """The terrain, or regular dunes on it with that fault."""
+    if faults.dunes_m == 0.0:
+        return terrain
+    dunes = REGULAR_DUNES.model_copy(update={"height_m": faults.dunes_m})
+    return terrain.model_copy(update={"dunes": dunes, "rocks": None, "craters_per_km2": 0.0})
+
+
+def draw_clouds(faults: Faults, ground_m: float, rng: np.random.Generator) -> CloudLayer | None:
+    """Draw clouds whose shadows move over ground of this height; None without the fault."""
+    if faults.cloud_cover == 0.0:
+        return None
+    return CloudLayer.draw(CloudParameters(cover=faults.cloud_cover), rng, ground_m=ground_m)
+
+
+def faulty_times(faults: Faults, times_s: Sequence[float]) -> list[float]:
+    """True times of pictures due at these times."""
+    return [time + faults.late_s * (number == FAULTY_PICTURE) for number, time in enumerate(times_s)]
+
+
+def faulty_altitudes(faults: Faults, altitudes: Sequence[AltitudeMeasurement]) -> list[AltitudeMeasurement]:
+    """Altitudes with the faults' errors added to the instrument's."""
+    errors = [faults.altitude_error + faults.altitude_error_once * (n == FAULTY_PICTURE) for n in range(len(altitudes))]
+    return [
+        AltitudeMeasurement(one.altitude_m * (1.0 + error), one.time_s)
+        for one, error in zip(altitudes, errors, strict=True)
+    ]
+
+
+def faulty_attitudes(
+    faults: Faults, attitudes: Sequence[AttitudeMeasurement], rng: np.random.Generator
+) -> list[AttitudeMeasurement]:
+    """Attitudes tilted about drawn horizontal axes: one of the common error, one of the single picture's error."""
+    axes = [np.array([np.cos(turn), np.sin(turn), 0.0]) for turn in rng.uniform(-np.pi, np.pi, 2)]
+    common = Rotation.from_rotvec(np.radians(faults.attitude_error_deg) * axes[0])
+    once = Rotation.from_rotvec(np.radians(faults.attitude_error_once_deg) * axes[1])
+    return [
+        AttitudeMeasurement(
+            (once if n == FAULTY_PICTURE else Rotation.identity()) * common * one.world_from_body, one.time_s
+        )
+        for n, one in enumerate(attitudes)
+    ]
+
 
 #: Pictures of a descent as flown, the input of estimators without a stream.
 PICTURES = 3
@@ -40,7 +121,7 @@ PICTURES = 3
 class Location(Parameters):
     """Terrain and position of the descent."""
 
-    bank: Annotated[int, bounded(1, 100000, "terrains in the bank")] = 4
+    bank: Annotated[int, bounded_field(1, 100000, "terrains in the bank")] = 4
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
     terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
     east_m: Annotated[float, Field(description="position of the first picture on the periodic terrain")] = 0.0
@@ -56,7 +137,7 @@ class Location(Parameters):
 class SunParameters(Parameters):
     """Direction to the sun."""
 
-    azimuth_deg: Annotated[float, bounded(-360.0, 720.0, "clockwise from north")] = 270.0
+    azimuth_deg: Annotated[float, bounded_field(-360.0, 720.0, "clockwise from north")] = 270.0
     elevation_deg: Annotated[float, Field(gt=0.0, le=90.0, description="above the horizon")] = 40.0
 
 
@@ -69,18 +150,18 @@ class LanderParameters(Parameters):
     by 1 deg of the view, is not modelled: the zero-phase spot that DIMES masks is 4 deg in radius.
     """
 
-    caster_diameter_m: Annotated[float, bounded(0.0, 100.0, "disc that casts the lander's shadow")] = 10.9
+    caster_diameter_m: Annotated[float, bounded_field(0.0, 100.0, "disc that casts the lander's shadow")] = 10.9
 
 
 class LandingParameters(Parameters):
     """Landing with the estimate (`marsyard.scenarios.descent.score.touchdown`); values but the burn's are assumed."""
 
-    computation_s: Annotated[float, bounded(0.0, 1000.0, "time to the answer on the flight computer")] = 14.0
+    computation_s: Annotated[float, bounded_field(0.0, 1000.0, "time to the answer on the flight computer")] = 14.0
     processor_factor: Annotated[float, Field(gt=0.0, le=1e6, description="flight computer over host (assumed)")] = 600.0
-    min_steered_m_s: Annotated[float, bounded(0.0, 100.0, "speed up to which the thrusters do not steer")] = 5.0
-    max_steered_m_s: Annotated[float, bounded(0.0, 100.0, "steering limit: 80 m/s burn tilted by 15 deg")] = 20.0
-    steering_error: Annotated[float, bounded(0.0, 1.0, "RMS relative error of the steering per axis")] = 0.1
-    burn_error_m_s: Annotated[float, bounded(0.0, 50.0, "RMS of the burn's velocity error per axis")] = 1.0
+    min_steered_m_s: Annotated[float, bounded_field(0.0, 100.0, "speed up to which the thrusters do not steer")] = 5.0
+    max_steered_m_s: Annotated[float, bounded_field(0.0, 100.0, "steering limit: 80 m/s burn tilted by 15 deg")] = 20.0
+    steering_error: Annotated[float, bounded_field(0.0, 1.0, "RMS relative error of the steering per axis")] = 0.1
+    burn_error_m_s: Annotated[float, bounded_field(0.0, 50.0, "RMS of the burn's velocity error per axis")] = 1.0
 
 
 class CameraParameters(Parameters):
@@ -94,21 +175,21 @@ class CameraParameters(Parameters):
     pixel_pitch_um: Annotated[float, Field(gt=0.5, le=100.0)] = 12.0
     columns: Annotated[int, Field(ge=64, le=4096)] = 1024
     rows: Annotated[int, Field(ge=64, le=4096)] = 1024
-    radial_0: Annotated[float, bounded(-0.1, 0.1, "first term of CAHVOR's R")] = 0.00096
-    radial_1: Annotated[float, bounded(-0.5, 0.5, "second term of CAHVOR's R")] = -0.002183
-    radial_2: Annotated[float, bounded(-0.5, 0.5, "third term of CAHVOR's R")] = 0.018547
-    alignment_error_deg: Annotated[float, bounded(0.0, 10.0, "RMS error of the mounting per axis")] = 0.02
-    focal_error: Annotated[float, bounded(0.0, 0.05, "RMS relative error of the calibrated focal length")] = 0.0002
-    centre_error_px: Annotated[float, bounded(0.0, 50.0, "RMS error of the calibrated centre, full-frame")] = 0.5
-    distortion_error_px: Annotated[float, bounded(0.0, 50.0, "RMS error of the distortion in the corners")] = 0.3
+    radial_0: Annotated[float, bounded_field(-0.1, 0.1, "first term of CAHVOR's R")] = 0.00096
+    radial_1: Annotated[float, bounded_field(-0.5, 0.5, "second term of CAHVOR's R")] = -0.002183
+    radial_2: Annotated[float, bounded_field(-0.5, 0.5, "third term of CAHVOR's R")] = 0.018547
+    alignment_error_deg: Annotated[float, bounded_field(0.0, 10.0, "RMS error of the mounting per axis")] = 0.02
+    focal_error: Annotated[float, bounded_field(0.0, 0.05, "RMS relative error of the calibrated focal length")] = (
+        0.0002
+    )
+    centre_error_px: Annotated[float, bounded_field(0.0, 50.0, "RMS error of the calibrated centre, full-frame")] = 0.5
+    distortion_error_px: Annotated[float, bounded_field(0.0, 50.0, "RMS error of the distortion in the corners")] = 0.3
 
 
 class RenderParameters(Parameters):
     """Rendering of the pictures."""
 
-    backend: Annotated[Backend, Field(description="library that provides OpenGL's context")] = Field(
-        default_factory=default_backend
-    )
+    backend: Backend = Field(default_factory=default_backend, description="library that provides OpenGL's context")
 
 
 Flight = Annotated[
@@ -131,14 +212,18 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     task = VELOCITY
     scored = ScoredDescent
 
-    site: Annotated[str | None, Field(description="preset of terrain, light and gravity; none: a plain terrain")] = None
+    site: Annotated[
+        str | None,
+        check_site("a descent", "descent"),
+        Field(description="preset of terrain, light and gravity; none: a plain terrain"),
+    ] = None
     terrain_site: Annotated[str | None, Field(description="site of the terrain; filled in with `site`, not set")] = None
     location: Location = Location()
     terrain: CheckedTerrain = TerrainParameters()
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="own bodies on the ground")] = ()
     sun: SunParameters = SunParameters()
     descent: SwingParameters = SwingParameters()
-    pictures: Annotated[int, bounded(2, 100, "pictures, descent.interval_s apart; a stream gets all")] = PICTURES
+    pictures: Annotated[int, bounded_field(2, 100, "pictures, descent.interval_s apart; a stream gets all")] = PICTURES
     #: By default the last picture and two others, as far apart as possible at equal intervals.
     triple: Annotated[tuple[int, int, int] | None, Field(description="numbers of the three used, from 1")] = None
     flight: Annotated[Flight | None, Field(description="recorded flight or own motion instead of the dynamics")] = None
@@ -158,23 +243,17 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     landing: LandingParameters = LandingParameters()
     render: RenderParameters = Field(default_factory=RenderParameters)
 
-    @field_validator("site")
-    @classmethod
-    def _check_site(cls, name: str | None) -> str | None:
-        if name is not None and name not in descent_sites():
-            raise ValueError(f"no site for a descent is called '{name}'; allowed: {', '.join(descent_sites())}")
-        return name
-
     @model_validator(mode="before")
     @classmethod
     def _complete_terrain(cls, stated: Any) -> Any:
-        if not isinstance(stated, Mapping) or stated.get("site") not in descent_sites():
+        name = stated.get("site") if isinstance(stated, Mapping) else None
+        if not isinstance(name, str) or getattr(sites().get(name), "descent", None) is None:
             return stated
         changes = stated.get("terrain", {})
         if not isinstance(changes, Mapping):
             return stated
-        of_site = site(stated["site"]).terrain("descent").model_dump()
-        return {"terrain_site": stated["site"], **stated, "terrain": _merge(of_site, changes)}
+        of_site = site(name).terrain("descent").model_dump()
+        return {"terrain_site": name, **stated, "terrain": merge_settings(of_site, changes)}
 
     @model_validator(mode="after")
     def _check_consistency(self) -> DescentScenarioParameters:
@@ -241,16 +320,3 @@ def binned_size_for(columns: int, rows: int) -> tuple[int, int]:
     """Binned size for DIMES: square blocks that leave at least, and about, 256 columns."""
     factors = [f for f in range(1, max(columns // 256, 1) + 1) if columns % f == 0 and rows % f == 0]
     return columns // factors[-1], rows // factors[-1]
-
-
-def descent_sites() -> list[str]:
-    """Names of the sites with a terrain for descents."""
-    return [name for name, one in sites().items() if one.descent is not None]
-
-
-def _merge(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(base)
-    for key, value in changes.items():
-        inner = merged.get(key)
-        merged[key] = _merge(inner, value) if isinstance(inner, Mapping) and isinstance(value, Mapping) else value
-    return merged

@@ -10,10 +10,9 @@ from jaxtyping import Float64
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.recorded_axes import RecordedAxes
-from marsyard.scenarios.user_files import UserFile
+from marsyard.scenarios.user_files import RecordedAxes, UserFile
 from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError, read_poses
-from marsyard.sim.parameters import bounded
+from marsyard.sim.parameters import bounded_field
 
 #: Required duration of the flight after the last picture, s.
 AFTER_S = 0.5
@@ -33,8 +32,8 @@ class FlightFile(UserFile, RecordedAxes):
     first_picture_s: Annotated[
         float | None, Field(description="file's time of the first picture; default: `lead_s` after its beginning")
     ] = None
-    lead_s: Annotated[float, bounded(0.2, 30.0, "start of the navigation before the first picture")] = 5.0
-    turn_deg: Annotated[float, bounded(-720.0, 720.0, "rotation about the vertical, clockwise from above")] = 0.0
+    lead_s: Annotated[float, bounded_field(0.2, 30.0, "start of the navigation before the first picture")] = 5.0
+    turn_deg: Annotated[float, bounded_field(-720.0, 720.0, "rotation about the vertical, clockwise from above")] = 0.0
 
     @classmethod
     def file_hash(cls, file: str) -> str:

@@ -13,12 +13,11 @@ from pydantic import BaseModel
 from marsyard.algorithms.dimes import DimesDetails
 from marsyard.scenarios.algorithm_run import case_result
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
-from marsyard.scenarios.conditions import picture_columns
+from marsyard.scenarios.conditions import deliver, faulty_detector, hash_images, picture_columns
 from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
-from marsyard.scenarios.descent.faults import faulty_terrain
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, picture_states, true_velocity
 from marsyard.scenarios.descent.measurement import Instruments, measure
-from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters, faulty_terrain
 from marsyard.scenarios.descent.score import (
     Pictures,
     conditions,
@@ -29,10 +28,9 @@ from marsyard.scenarios.descent.score import (
 )
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import Optics, Sample, pixel_sample
-from marsyard.scenarios.faults import deliver, faulty_detector
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, Kind
-from marsyard.scenarios.parts.scores import ScoredDescent, scored
+from marsyard.scenarios.parts.scores import ScoredDescent, compute_scores
 from marsyard.scenarios.velocity import (
     Horizontal,
     Span,
@@ -56,7 +54,6 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
     name = "descent"
     parameters_type = DescentScenarioParameters
     task = VELOCITY
-    algorithm_table = ()
     part_keys: Mapping[str, Kind] = {
         "flight.motion": DYNAMICS,
         "altimeter.instrument": INSTRUMENT,
@@ -83,7 +80,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         world = World.of(p)
         states = picture_states(p, create_flight(p, world.surface, streams))
         optics = camera_optics(p.camera)
-        camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
+        camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
         exposed = take_exposures(p, world, states, optics, draw_detector(p, optics, streams), streams)
         for state, (counts, frame) in zip(states, exposed, strict=True):
             pose = frame.world_from_body
@@ -102,14 +99,20 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         """Simulate one descent and score all algorithms."""
         p = self.check_parameters(parameters)
         descent = Descent.simulate(p, streams)
-        shared = descent.conditions()
+        shared = {
+            **descent.overlap,
+            **conditions(p, descent.world, descent.states, descent.at_firing, descent.instruments),
+            **instrument_errors(descent.world, descent.states, descent.measurements),
+            **descent.flight.row,
+            **picture_columns(p.render.backend, hash_images(descent.pictures)),
+        }
         return case_result(p.algorithms, lambda algorithm: _score_algorithm(descent, algorithm, shared), shared)
 
 
 def draw_detector(p: DescentScenarioParameters, optics: Optics, streams: Streams) -> Detector:
     """Draw the pixel response of a case's detector, its faults included."""
     settings = faulty_detector(p.faults, p.detector)
-    return Detector.drawn(optics.fall_off, settings, streams.generator("detector response"))
+    return Detector.draw(optics.fall_off, settings, streams.generator("detector response"))
 
 
 @dataclass(frozen=True)
@@ -145,7 +148,7 @@ class Descent:
         overlap: Mapping[str, Scalar] = {}
         if p.triple_indices is not None:
             three = [states[index] for index in p.triple_indices]
-            camera = optics.camera.binned(columns=1, rows=p.detector.rows_summed)
+            camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
             overlap = feasible_overlap_row(three, world, camera, detector.calibration, p.dimes)
         return cls(p, streams, world, flight, instruments, states, pictures, measurements, overlap)
 
@@ -153,16 +156,6 @@ class Descent:
     def at_firing(self) -> State:
         """True state at the thrusters' firing."""
         return self.flight.motion.state(self.flight.firing_s)
-
-    def conditions(self) -> dict[str, Scalar]:
-        """Columns independent of the algorithm."""
-        return {
-            **self.overlap,
-            **conditions(self.p, self.world, self.states, self.at_firing, self.instruments),
-            **instrument_errors(self.world, self.states, self.measurements),
-            **self.flight.row,
-            **picture_columns(self.p.render.backend, self.pictures),
-        }
 
     def truth(self, span_s: Span) -> Horizontal:
         """True horizontal velocity over a span of time tags."""
@@ -201,7 +194,7 @@ def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scal
             at_firing=firing,
             touchdown_m_s=landed.with_answer,
         )
-        row |= scored(p.scores, case, {*row, *shared})
+        row |= compute_scores(p.scores, case, {*row, *shared})
     # figures show the three pictures of DIMES' input, or all of other algorithms
     is_dimes = estimate is not None and isinstance(estimate.details, DimesDetails)
     shown = p.triple_indices if is_dimes and p.triple_indices is not None else range(len(descent.pictures))

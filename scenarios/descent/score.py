@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float64, UInt16
+from jaxtyping import UInt16
 
-from marsyard.algorithms.dimes import DimesOptions, propagated
+from marsyard.algorithms.dimes import DimesOptions, propagate_velocity
 from marsyard.algorithms.dimes.binning import View, altitudes_at_images, bin_factors, place_camera
 from marsyard.algorithms.dimes.overlap import search_geometry, template_candidates
 from marsyard.algorithms.interface import VelocityEstimate
@@ -19,13 +19,13 @@ from marsyard.scenarios.descent.flight import mean_velocities
 from marsyard.scenarios.descent.measurement import Instruments
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, LandingParameters
 from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.velocity import Horizontal
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import DescentMeasurements, DetectorCalibration
 from marsyard.sim.sensor import height_above_ground
 
 Pictures = Sequence[UInt16[np.ndarray, "rows columns"]]
-Horizontal = Float64[np.ndarray, "2"]
 
 #: Width of the ground patch whose mean height is the reference of DIMES' altitude, m.
 PATCH_M = 200.0
@@ -83,7 +83,7 @@ def propagate_to_firing(
     is_instant = estimate.span_s[0] == estimate.span_s[1]
     then = (navigation.velocity(span) if is_instant else navigation.mean_velocities(span))[0]
     now = navigation.velocity(np.array([firing_s]))[0]
-    return propagated(estimate.velocity_m_s, then[:2], now[:2])
+    return propagate_velocity(estimate.velocity_m_s, then[:2], now[:2])
 
 
 def conditions(
@@ -170,7 +170,7 @@ def feasible_overlap_row(
     views = []
     for state in states:
         altitude_m = float(state.position_m[2] - world.surface.height(state.position_m[0], state.position_m[1], level))
-        placed, centre = place_camera(camera.binned(columns, rows), state.attitude, altitude_m)
+        placed, centre = place_camera(camera.bin(columns, rows), state.attitude, altitude_m)
         views.append(View(blank, blank, placed, centre, state.time_s, calibration, calibration.rows_summed * rows))
     sun = world.sun.direction
     first, second = (

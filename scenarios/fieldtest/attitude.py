@@ -38,7 +38,7 @@ class Targets:
     surveyed_m: Float64[np.ndarray, "targets 3"]
 
     @classmethod
-    def drawn(
+    def draw(
         cls, p: TargetParameters, surface: Surface, middle_m: Float64[np.ndarray, "2"], rng: np.random.Generator
     ) -> Targets:
         """Draw targets on the ground around a position; the first ones of those placed are used."""
@@ -112,18 +112,9 @@ def add_thermal_drift(
     return replace(increments, delta_angles_rad=drifted)
 
 
-@dataclass(frozen=True)
-class AttitudeSolution:
-    """Attitudes over the flight, estimated gyro bias, and RMS angle between measured and predicted directions."""
-
-    inertial: InertialSolution
-    bias_rad_s: Float64[np.ndarray, "3"]
-    residual_rad: float
-
-
 def solve_attitude(
     increments: ImuIncrements, first: Sightings, second: Sightings, sighting_sd_rad: float, bias_sd_rad_s: float
-) -> AttitudeSolution:
+) -> InertialSolution:
     """Estimate the attitude over a flight from its gyros and both passes over the targets.
 
     - increments: gyro increments over the whole flight
@@ -155,9 +146,7 @@ def solve_attitude(
         start = Rotation.from_rotvec(change[:3]) * start
         bias = bias + change[3:]
     propagated = _propagate(increments, bias)
-    inertial = replace(propagated, attitudes=start * propagated.attitudes)
-    errors = inertial.attitude(times).apply(camera) - world
-    return AttitudeSolution(inertial, bias, float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))))
+    return replace(propagated, attitudes=start * propagated.attitudes)
 
 
 def _propagate(increments: ImuIncrements, bias_rad_s: Float64[np.ndarray, "3"]) -> InertialSolution:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import AwareDatetime, Field, field_validator, model_validator
+from pydantic import AwareDatetime, Field, model_validator
 
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
+from marsyard.scenarios.algorithm_run import AlgorithmSelection
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import CalibrationParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredFlight
+from marsyard.scenarios.terrain_files import check_site
 from marsyard.sim.dynamics.helicopter import HelicopterParameters
 from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.render import CloudParameters
@@ -18,7 +19,7 @@ from marsyard.sim.sensor import DetectorChoice, preset
 from marsyard.sim.sensor.imu import ImuParameters
 from marsyard.sim.sensor.instrument import ClockParameters
 from marsyard.sim.sensor.satellite_navigation import POST_PROCESSED, GpsParameters
-from marsyard.sim.terrain import TerrainParameters, site, sites
+from marsyard.sim.terrain import TerrainParameters, site
 
 Count = Annotated[int, Field(ge=0, le=100000)]
 
@@ -30,7 +31,7 @@ class RunParameters(Parameters):
     """A run: site, time, and number of triples of each category."""
 
     name: Annotated[str, Field(min_length=1, description="what the report calls the run")]
-    site: Annotated[str, Field(description="preset of terrain and light")]
+    site: Annotated[str, check_site("a flight", "descent"), Field(description="preset of terrain and light")]
     begins: Annotated[AwareDatetime, Field(description="start of the first pass, with time zone")]
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
     longitude_deg: Annotated[float, Field(ge=-180.0, le=180.0, description="east positive")]
@@ -38,14 +39,6 @@ class RunParameters(Parameters):
     same_direction: Annotated[Count, Field(description="triples apart in altitude, flown in one direction")] = 0
     opposite_direction: Annotated[Count, Field(description="triples apart in altitude, direction switched")] = 0
     clouds: Annotated[CloudParameters | None, Field(description="clouds whose shadows drift over the site")] = None
-
-    @field_validator("site")
-    @classmethod
-    def _check_site(cls, name: str) -> str:
-        allowed = [one.name for one in sites().values() if one.descent is not None]
-        if name not in allowed:
-            raise ValueError(f"no site for a flight is called '{name}'; allowed: {', '.join(allowed)}")
-        return name
 
     @property
     def triples(self) -> int:
@@ -144,9 +137,7 @@ class FieldTestParameters(AlgorithmSelection, CustomScores):
         CalibrationParameters, Field(description="errors of the calibrated camera, the same in all cases")
     ] = CalibrationParameters()
     detector: DetectorChoice = Field(default_factory=lambda: preset(CAMERA).detector)
-    backend: Annotated[Backend, Field(description="library that provides OpenGL's context")] = Field(
-        default_factory=default_backend
-    )
+    backend: Backend = Field(default_factory=default_backend, description="library that provides OpenGL's context")
 
     @model_validator(mode="after")
     def _check_run_names(self) -> FieldTestParameters:

@@ -6,6 +6,7 @@ century, without refraction (0.02 deg at 45 deg of elevation) and parallax (0.00
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
@@ -16,13 +17,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.fieldtest.attitude import (
-    AttitudeSolution,
-    Targets,
-    add_thermal_drift,
-    sight_targets,
-    solve_attitude,
-)
+from marsyard.scenarios.fieldtest.attitude import Targets, add_thermal_drift, sight_targets, solve_attitude
 from marsyard.scenarios.fieldtest.parameters import (
     CAMERA,
     ElevationParameters,
@@ -37,10 +32,13 @@ from marsyard.sim.frames import direction
 from marsyard.sim.render import CloudLayer
 from marsyard.sim.sensor import preset
 from marsyard.sim.sensor.imu import DEG_H, Imu
+from marsyard.sim.sensor.inertial import InertialSolution
 from marsyard.sim.sensor.instrument import Clock
 from marsyard.sim.sensor.satellite_navigation import Gps
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface, TerrainBank, site
+
+_Stream = Callable[[str], np.random.Generator]
 
 #: Points of the line whose mean ground is the reference of the flight's heights.
 _GROUND_POINTS = 256
@@ -195,7 +193,6 @@ class Run:
     truth: Motion
     pictures: Pictures
     attitudes: Rotation
-    attitude_solution: AttitudeSolution
     triples: tuple[Triple, ...]
 
     def sun(self, time_s: float) -> Float64[np.ndarray, "3"]:
@@ -205,42 +202,37 @@ class Run:
         return sun_direction(p.begins + since, p.latitude_deg, p.longitude_deg)
 
 
-@dataclass(frozen=True)
-class ElevationModel:
-    """Heights on a grid, with errors; linear between posts (paper, III.D.1)."""
+def survey_ground(
+    p: ElevationParameters, surface: Surface, points_m: Float64[np.ndarray, "n 2"], rng: np.random.Generator
+) -> RegularGridInterpolator:
+    """Survey the ground around points on a grid, linear between posts (paper, III.D.1).
 
-    posts: RegularGridInterpolator
-    interpolation_m: float
-
-    @classmethod
-    def surveyed(
-        cls, p: ElevationParameters, surface: Surface, points_m: Float64[np.ndarray, "n 2"], rng: np.random.Generator
-    ) -> ElevationModel:
-        """Survey the ground around these points; a post holds the mean height of its cell and a correlated error."""
-        x, y = (
-            p.posting_m * np.arange(np.floor(a / p.posting_m) - _MARGIN, np.ceil(b / p.posting_m) + _MARGIN + 1.0)
-            for a, b in zip(points_m.min(axis=0), points_m.max(axis=0), strict=True)
-        )
-        level = int(np.clip(np.rint(np.log2(p.posting_m / surface.spacing_m)), 0, len(surface.levels) - 1))
-        ground = surface.height(*np.meshgrid(x, y, indexing="ij"), level)
-        sigma = p.correlation_m / p.posting_m
-        error = gaussian_filter(rng.standard_normal(ground.shape), sigma, mode="wrap")
-        # white noise smoothed by a Gaussian keeps 1 / (4 pi sigma**2) of its variance
-        error *= p.error_m * np.sqrt(4.0 * np.pi) * sigma
-        return cls(RegularGridInterpolator((x, y), ground + error), p.interpolation_m)
-
-    def heights(self, points_m: Float64[np.ndarray, "n 2"], rng: np.random.Generator) -> Float64[np.ndarray, "n"]:
-        """Interpolate heights, metres, with the error of interpolation."""
-        return np.asarray(self.posts(points_m) + self.interpolation_m * rng.standard_normal(len(points_m)))
+    A post holds the mean height of its cell and a correlated error.
+    """
+    x, y = (
+        p.posting_m * np.arange(np.floor(a / p.posting_m) - _MARGIN, np.ceil(b / p.posting_m) + _MARGIN + 1.0)
+        for a, b in zip(points_m.min(axis=0), points_m.max(axis=0), strict=True)
+    )
+    level = int(np.clip(np.rint(np.log2(p.posting_m / surface.spacing_m)), 0, len(surface.levels) - 1))
+    ground = surface.height(*np.meshgrid(x, y, indexing="ij"), level)
+    sigma = p.correlation_m / p.posting_m
+    error = gaussian_filter(rng.standard_normal(ground.shape), sigma, mode="wrap")
+    # white noise smoothed by a Gaussian keeps 1 / (4 pi sigma**2) of its variance
+    error *= p.error_m * np.sqrt(4.0 * np.pi) * sigma
+    return RegularGridInterpolator((x, y), ground + error)
 
 
 def simulate_run(key: RunKey) -> Run:
     """Simulate and process a run; a function of the key alone."""
     p, run = key.field_test, key.field_test.runs[key.number]
-    streams = _RunStreams(Streams(key.seed, key.campaign, 0), run.name)
+
+    def stream(name: str) -> np.random.Generator:
+        """Return a stream that all cases of the run share: named by the run, not by a case."""
+        return Streams(key.seed, key.campaign, 0).generator(f"run {run.name}: {name}")
+
     surface = TerrainBank(p.terrain(run.site), p.bank_seed).terrain(0)
     # a line of random position and azimuth; heights count from the mean ground under it
-    rng = streams.generator("flight")
+    rng = stream("flight")
     middle, azimuth = rng.uniform(0.0, surface.period_m, 2), float(rng.uniform(0.0, 2.0 * np.pi))
     steps = np.linspace(-0.5, 0.5, _GROUND_POINTS) * p.helicopter.length_m
     line = surface.height(middle[0] + steps * np.sin(azimuth), middle[1] + steps * np.cos(azimuth))
@@ -250,14 +242,15 @@ def simulate_run(key: RunKey) -> Run:
     times_of_pass = [np.arange(one.start_s + 0.5 * step, one.end_s, step) for one in flight.passes]
     times = np.concatenate(times_of_pass)
     passes = np.repeat(np.arange(len(times_of_pass)), [part.size for part in times_of_pass])
-    clock = Clock.drawn(p.pictures.clock, streams.generator("camera clock"))
-    gps = Gps.drawn(p.gps, flight.span_s, streams.generator("gps"))
-    position = gps.measure(flight, times, streams.generator("gps noise")).values
-    solution = _estimate_attitudes(p, surface, flight, clock, gps, streams)
-    attitudes = solution.inertial.attitude(clock.tags(times, streams.generator("picture tags")))
+    clock = Clock.draw(p.pictures.clock, stream("camera clock"))
+    gps = Gps.draw(p.gps, flight.span_s, stream("gps"))
+    position = gps.measure(flight, times, stream("gps noise")).values
+    solution = _estimate_attitudes(p, surface, flight, clock, gps, stream)
+    attitudes = solution.attitude(clock.tags(times, stream("picture tags")))
     horizontal = np.ascontiguousarray(position[:, :2])
-    model = ElevationModel.surveyed(p.elevation, surface, horizontal, streams.generator("elevation model"))
-    altitude = position[:, 2] - model.heights(horizontal, streams.generator("elevation interpolation"))
+    posts = survey_ground(p.elevation, surface, horizontal, stream("elevation model"))
+    interpolation = stream("elevation interpolation").standard_normal(len(horizontal))
+    altitude = position[:, 2] - (posts(horizontal) + p.elevation.interpolation_m * interpolation)
     down = attitudes.apply(np.array([0.0, 0.0, -1.0]))
     pictures = Pictures(
         flown=np.array([one.number for one in flight.passes], dtype=np.int64)[passes],
@@ -268,7 +261,7 @@ def simulate_run(key: RunKey) -> Run:
     )
     clouds = None
     if run.clouds is not None:
-        clouds = CloudLayer.draw(run.clouds, streams.generator("clouds"), ground_m=float(flight.origin_m[2]))
+        clouds = CloudLayer.draw(run.clouds, stream("clouds"), ground_m=float(flight.origin_m[2]))
     return Run(
         key=key,
         parameters=run,
@@ -277,36 +270,24 @@ def simulate_run(key: RunKey) -> Run:
         truth=flight.motion(times),
         pictures=pictures,
         attitudes=attitudes,
-        attitude_solution=solution,
-        triples=make_triples(run, pictures, p.triples, streams.generator("triples")),
+        triples=make_triples(run, pictures, p.triples, stream("triples")),
     )
 
 
-@dataclass(frozen=True)
-class _RunStreams:
-    """Streams of a run that all its cases share: named by the run, not by a case."""
-
-    streams: Streams
-    run: str
-
-    def generator(self, name: str) -> np.random.Generator:
-        return self.streams.generator(f"run {self.run}: {name}")
-
-
 def _estimate_attitudes(
-    p: FieldTestParameters, surface: Surface, flight: HelicopterFlight, clock: Clock, gps: Gps, streams: _RunStreams
-) -> AttitudeSolution:
+    p: FieldTestParameters, surface: Surface, flight: HelicopterFlight, clock: Clock, gps: Gps, stream: _Stream
+) -> InertialSolution:
     """Simulate both passes over the targets and the gyros, and estimate the attitude over the flight."""
-    camera, noise, sightings = field_camera(), streams.generator("sightings"), []
-    targets = Targets.drawn(p.targets, surface, flight.origin_m[:2], streams.generator("targets"))
+    camera, noise, sightings = field_camera(), stream("sightings"), []
+    targets = Targets.draw(p.targets, surface, flight.origin_m[:2], stream("targets"))
     for start, end in flight.fly_overs_s:
         times = np.linspace(start, end, p.targets.pictures + 2)[1:-1]
         tags = clock.tags(times, noise)
         fixes = gps.measure(flight, times, noise).values
         motion = flight.motion(times)
         sightings.append(sight_targets(targets, camera, motion, tags, fixes, p.targets.centroid_px, noise))
-    unit = Imu.drawn(p.imu, flight.span_s, streams.generator("imu errors"))
-    increments = unit.increments(flight, *flight.span_s, streams.generator("imu noise"))
+    unit = Imu.draw(p.imu, flight.span_s, stream("imu errors"))
+    increments = unit.increments(flight, *flight.span_s, stream("imu noise"))
     middle = np.array(camera.size) / 2.0
     _, directions = camera.rays(np.stack([middle, middle + np.array([1.0, 0.0])]))
     pixel_rad = float(np.linalg.norm(directions[1] - directions[0]))

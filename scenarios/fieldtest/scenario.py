@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -14,14 +14,13 @@ from pydantic import BaseModel
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
 from marsyard.scenarios.base import LoadGround, TerrainScenario, algorithm_result
-from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, picture_columns, sun_columns
+from marsyard.scenarios.conditions import attitude_rate_deg_s, hash_images, off_nadir_deg, picture_columns, sun_columns
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import camera_optics, draw_calibrated, render_state, sunlight_ratio
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
 from marsyard.scenarios.fieldtest.run import Category, Run, RunKey, Triple, field_camera, simulate_run
 from marsyard.scenarios.interface import CaseResult, Scalar
-from marsyard.scenarios.parts.named import SCORE, Kind
-from marsyard.scenarios.parts.scores import ScoredFlight, scored
+from marsyard.scenarios.parts.scores import ScoredFlight, compute_scores
 from marsyard.scenarios.velocity import check_last_interval, consistency_row, velocity_products, velocity_row
 from marsyard.scenarios.views import Eye, SiteGround, site_scene
 from marsyard.sim.camera import CameraModel
@@ -54,8 +53,6 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
     name = "fieldtest"
     parameters_type = FieldTestParameters
     task = VELOCITY
-    algorithm_table = ()
-    part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
     def __init__(self) -> None:
         super().__init__(_CACHED_GROUNDS)
@@ -89,20 +86,20 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         case = Case(run, triple, (first, second, third))
         # one camera took all pictures
         response = Streams(streams.seed, streams.campaign, 0).generator("detector response")
-        detector = Detector.drawn(camera_optics(field_camera()).fall_off, p.detector, response)
+        detector = Detector.draw(camera_optics(field_camera()).fall_off, p.detector, response)
         noise, scene = streams.generator("detector noise"), self._start_scene(key)
-        taken = [take_picture(run, scene, ground, state, detector, noise) for state in case.states]
-        pictures = [one.counts for one in taken]
+        shots = [take_picture(run, scene, ground, state, detector, noise) for state in case.states]
+        pictures = [counts for counts, _ in shots]
         truth = truth_velocities(p, case)[1, :2]
         measurements = measure(p, case, pictures, detector, calibrated_camera(p, streams))
         # the clouds' transmittance over the middle picture's ground at each picture, and its changes
-        light = cloud_transmittances(run, taken[1].ground_m, [state.time_s for state in case.states])
+        light = cloud_transmittances(run, shots[1][1], [state.time_s for state in case.states])
         changes = np.abs(np.diff(light, axis=0))
         conditions = {
             **_conditions(p, case, measurements, ground.surface),
             **{f"cloud_transmittance_{number}": float(np.nanmean(one)) for number, one in enumerate(light, start=1)},
             **{f"cloud_change_{pair}": float(np.nanmean(one)) for pair, one in enumerate(changes, start=1)},
-            **picture_columns(p.backend, pictures),
+            **picture_columns(p.backend, hash_images(pictures)),
         }
 
         def judge(algorithm: str) -> CaseResult:
@@ -117,7 +114,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
             if estimate is not None:
                 known: dict[str, Any] = {"true_velocity_m_s": truth, "states": case.states, "motion": run.flight}
                 flight = ScoredFlight(measurements=measurements, answer=estimate, **known)
-                row |= scored(p.scores, flight, {*row, *conditions})
+                row |= compute_scores(p.scores, flight, {*row, *conditions})
             return algorithm_result(attempt, velocity is not None, row, velocity_products(pictures, estimate, truth))
 
         return case_result(p.algorithms, judge, conditions)
@@ -126,7 +123,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
 def calibrated_camera(p: FieldTestParameters, streams: Streams) -> CameraModel:
     """Return the calibrated camera of the delivered pictures, the same in all cases."""
     rng = Streams(streams.seed, streams.campaign, 0).generator("camera calibration")
-    return draw_calibrated(field_camera(), p.calibration, rng).binned(columns=1, rows=p.detector.rows_summed)
+    return draw_calibrated(field_camera(), p.calibration, rng).bin(columns=1, rows=p.detector.rows_summed)
 
 
 def _find_triple(p: FieldTestParameters, case: int) -> tuple[int, int]:
@@ -214,23 +211,14 @@ def _conditions(
     return row
 
 
-@dataclass(frozen=True)
-class Picture:
-    """Counts of the detector, and the ground points of a coarse grid of pixels in world axes."""
-
-    counts: UInt16[np.ndarray, "rows columns"]
-    ground_m: Float64[np.ndarray, "m n 3"]
-
-
 def take_picture(
     run: Run, start_scene: Scene, ground: SiteGround, state: State, detector: Detector, rng: np.random.Generator
-) -> Picture:
-    """Render and expose the picture of a state of the flight."""
+) -> tuple[UInt16[np.ndarray, "rows columns"], Float64[np.ndarray, "m n 3"]]:
+    """Render and expose the picture of a state; return counts, and ground points of a coarse grid of pixels, world."""
     p, scene = run.key.field_test, scene_at(run, start_scene, ground, state.time_s)
     frame, motion = render_state(p.backend, scene, camera_optics(field_camera()), state)
     brightness = sunlight_ratio(ground.site.environment, float(np.arcsin(scene.sun.direction[2])), p.detector)
-    counts = detector.expose(frame.radiance * np.float32(brightness), rng, motion)
-    return Picture(counts, frame.points_world(GRID_PX))
+    return detector.expose(frame.radiance * np.float32(brightness), rng, motion), frame.points_world(GRID_PX)
 
 
 def cloud_transmittances(

@@ -11,9 +11,14 @@ from jaxtyping import Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.exposure import draw_calibrated
-from marsyard.scenarios.landing.faults import arrived_numbers, faulty_helicopter, faulty_ranges
 from marsyard.scenarios.landing.helicopter import Transit
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters, PairParameters
+from marsyard.scenarios.landing.parameters import (
+    LandingScenarioParameters,
+    PairParameters,
+    draw_arrivals,
+    faulty_helicopter,
+    faulty_ranges,
+)
 from marsyard.scenarios.views import nadir_pose
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
@@ -44,7 +49,7 @@ class Flight:
             upright = stated[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
             tilt = np.radians(p.navigation.inclinometer_deg) * streams.generator("inclinometers").standard_normal(3)
             up_body = Rotation.from_rotvec(tilt).apply(upright)
-            return cls(stated, believed_poses(p, stated, streams), up_body)
+            return cls(stated, measure_poses(p, stated, streams), up_body)
         helicopter = faulty_helicopter(p.faults, p.helicopter)
         ground = float(surface.height(p.location.east_m, p.location.north_m))
         height = helicopter.transit.height_m
@@ -52,15 +57,15 @@ class Flight:
         heading = -np.radians(p.flown.heading_deg)
         course = np.pi / 2 - np.radians(p.flown.heading_deg + p.flown.course_deg)
         gravity = p.preset.environment.gravity_m_s2
-        transit = Transit.flown(helicopter, over, float(course), float(heading), gravity, streams)
-        numbers = arrived_numbers(p.faults, transit.times_s.size, streams.generator("lost pictures"))
+        transit = Transit.fly(helicopter, over, float(course), float(heading), gravity, streams)
+        numbers = draw_arrivals(p.faults, transit.times_s.size, streams.generator("lost pictures"))
         # the laser's ranges to the ground at all pictures, without rocks
         states = [transit.state(number) for number in range(transit.times_s.size)]
         axes = [np.asarray(state.attitude.apply(DOWN)) for state in states]
         true = [
             range_along(surface, state.position_m, axis, 5.0 * height) for state, axis in zip(states, axes, strict=True)
         ]
-        unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
+        unit = RangingUnit.draw(p.laser, streams.generator("laser"))
         readings = unit.readings(transit.times_s, np.array(true), streams.generator("laser noise, transit"))
         ranges = faulty_ranges(p.faults, readings.values, height)[numbers]
         calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
@@ -98,7 +103,7 @@ def true_states(p: LandingScenarioParameters, surface: Surface, streams: Streams
     )
 
 
-def believed_poses(
+def measure_poses(
     p: LandingScenarioParameters, states: tuple[State, State], streams: Streams
 ) -> tuple[PoseMeasurement, PoseMeasurement]:
     """The filter's poses: a common error of both, and an error of the motion between them."""

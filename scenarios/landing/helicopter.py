@@ -85,12 +85,12 @@ class Instruments:
     navigation: NavigationFilter
 
     @classmethod
-    def drawn(cls, p: HelicopterParameters, gravity_m_s2: float, streams: Streams) -> Instruments:
+    def draw(cls, p: HelicopterParameters, gravity_m_s2: float, streams: Streams) -> Instruments:
         """The units of a case."""
         return cls(
-            Imu.drawn(p.imu, p.span_s, streams.generator("inertial unit")),
-            RtkReceiver.drawn(p.rtk, p.received_s, streams.generator("receiver")),
-            TiltCompass.drawn(p.compass, streams.generator("compass")),
+            Imu.draw(p.imu, p.span_s, streams.generator("inertial unit")),
+            RtkReceiver.draw(p.rtk, p.received_s, streams.generator("receiver")),
+            TiltCompass.draw(p.compass, streams.generator("compass")),
             NavigationFilter(p.navigation, p.imu, p.rtk, p.compass, gravity_m_s2),
         )
 
@@ -156,7 +156,7 @@ class Transit:
     tags_s: Float64[np.ndarray, "pictures"]  #: time tags of the pictures
 
     @classmethod
-    def flown(
+    def fly(
         cls,
         parameters: HelicopterParameters,
         over_m: Float64[np.ndarray, "3"],
@@ -175,11 +175,11 @@ class Transit:
         flight = transit_flight(
             p.craft, p.transit, over_m, course_rad, heading_rad, gravity_m_s2, air, streams.generator("vibration")
         )
-        instruments = Instruments.drawn(p, gravity_m_s2, streams)
+        instruments = Instruments.draw(p, gravity_m_s2, streams)
         navigated = NavigatedPart.over(flight.path, *flight.path.span_s, instruments, streams, "transit")
         times = np.linspace(0.0, p.transit.pictures_s, p.transit.pictures)
         clock_stream = streams.generator("picture clock")
-        tags = Clock.drawn(p.picture_clock, clock_stream).tags(times, clock_stream)
+        tags = Clock.draw(p.picture_clock, clock_stream).tags(times, clock_stream)
         return cls(p, instruments, air, flight, navigated, times, tags)
 
     def state(self, number: int) -> State:

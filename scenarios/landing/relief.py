@@ -87,7 +87,7 @@ class Relief:
         """Fractional row and column of positions (x, y)."""
         return np.asarray((places - np.array([self.west_m, self.south_m]))[..., ::-1] / self.spacing_m)
 
-    def averaged(self, places: Float[np.ndarray, "rows columns 2"], side_m: float) -> Float[np.ndarray, "rows columns"]:
+    def average(self, places: Float[np.ndarray, "rows columns 2"], side_m: float) -> Float[np.ndarray, "rows columns"]:
         """Mean height over squares of this side about positions (x, y); NaN outside the grid."""
         width = max(round(side_m / self.spacing_m), 1)
         means = cv2.blur(self.heights_m, (width, width)) if width > 1 else self.heights_m

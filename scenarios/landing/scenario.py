@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 from pydantic import BaseModel
@@ -11,9 +11,9 @@ from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
-from marsyard.scenarios.conditions import picture_columns
+from marsyard.scenarios.conditions import hash_images, picture_columns
 from marsyard.scenarios.estimators import LANDING
-from marsyard.scenarios.exposure import Sample, pixel_sample, summed_rows
+from marsyard.scenarios.exposure import Sample, pixel_sample, sum_rows
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.pictures import KEPT_GROUNDS, RenderedFlight, measure
@@ -27,8 +27,7 @@ from marsyard.scenarios.landing.score import (
     site_row,
     times_row,
 )
-from marsyard.scenarios.parts.named import SCORE, Kind
-from marsyard.scenarios.parts.scores import ScoredLanding, scored
+from marsyard.scenarios.parts.scores import ScoredLanding, compute_scores
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
@@ -39,8 +38,6 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
     name = "landing"
     parameters_type = LandingScenarioParameters
     task = LANDING
-    algorithm_table = ()
-    part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
     def __init__(self) -> None:
         super().__init__(KEPT_GROUNDS)
@@ -71,7 +68,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
                 "sun_direction": case.world.sun.direction.tolist(),
                 "lander": p.lander.model_dump(mode="json"),
             }
-            hazard = case.truth.hazard_map(frame.points_world()[summed_rows(p.detector.rows_summed)])
+            hazard = case.truth.hazard_map(frame.points_world()[sum_rows(p.detector.rows_summed)])
             yield pixel_sample(image.counts, frame, p.detector, image.camera, about, hazard)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
@@ -80,7 +77,8 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
         case = RenderedFlight.of(p, streams, self.load_ground)
         flight, truth = case.flight, case.truth
         measurements = measure(p, flight, case.pair, streams)
-        known = {**conditions(case, measurements), **picture_columns(p.render.backend, case.pair.counts)}
+        provenance = picture_columns(p.render.backend, hash_images(case.pair.counts))
+        known = {**conditions(case, measurements), **provenance}
 
         def judge(algorithm: str) -> CaseResult:
             attempt = run_algorithm_on_copy(
@@ -107,7 +105,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
                     states=flight.states,
                     ground=truth,
                 )
-                row |= scored(p.scores, answered, {*row, *known})
+                row |= compute_scores(p.scores, answered, {*row, *known})
             converged = attempt.answer is not None and estimate.outcome.converged
             return algorithm_result(attempt, converged, row, products(case, estimate))
 

@@ -8,16 +8,14 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.hda import STAGES, Fate, HdaDetails, hda_products
-from marsyard.algorithms.hda.view import camera_pose
+from marsyard.algorithms.hda.motion import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.conditions import sun_columns
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.landing.confusion import SampledMap, hazard_counts, map_errors
-from marsyard.scenarios.landing.faults import stuck_range_m
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.helicopter import horizontal_distance_m, land
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.pictures import GroundTruth, Pair, RenderedFlight
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters, stuck_range_m
+from marsyard.scenarios.landing.pictures import GroundTruth, Pair, RenderedFlight, SampledMap, hazard_counts, map_errors
 from marsyard.sim.dynamics.rotorcraft import GroundPatch
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor import height_above_ground
@@ -117,7 +115,7 @@ def landing_row(
     site, relief, landed = estimate.site_world, truth.relief, None
     if flight.transit is not None and site is not None:
         ground = GroundPatch(np.array([relief.west_m, relief.south_m]), relief.spacing_m, relief.heights_m)
-        unit = RangingUnit.drawn(p.laser, streams.generator("laser"))
+        unit = RangingUnit.draw(p.laser, streams.generator("laser"))
         landed = land(flight.transit, site, ground, unit, streams, stuck_range_m(p.faults, p.height_m))
     if landed is None or site is None:
         columns = (*(f"touchdown_{column}" for column in PLACE_COLUMNS), *TOUCHDOWN_COLUMNS)
@@ -161,7 +159,7 @@ def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]
         tracks = details.tracks
         column, line = np.rint(tracks.first).astype(np.int64).T
         points = pair.frames[0].points_world()[line * pair.images[0].calibration.rows_summed, column]
-        camera = pair.images[1].camera.moved(flight.states[1].world_from_body)
+        camera = pair.images[1].camera.transform(flight.states[1].world_from_body)
         pixels, ahead = camera.project(points)
         with np.errstate(invalid="ignore"):
             inside = np.all((pixels >= BORDER_PX) & (pixels <= np.array(camera.size) - 1.0 - BORDER_PX), axis=1) & ahead
@@ -216,8 +214,8 @@ def solved_row(details: HdaDetails) -> dict[str, Scalar]:
 
 def times_row(details: object) -> dict[str, Scalar]:
     """Processor time of the stages of Table I; NaN for stages that were not reached."""
-    taken = details.times_s if isinstance(details, HdaDetails) else {}
-    return {f"{stage}_time_s": taken.get(stage, NAN) for stage in STAGES}
+    stage_times_s = details.times_s if isinstance(details, HdaDetails) else {}
+    return {f"{stage}_time_s": stage_times_s.get(stage, NAN) for stage in STAGES}
 
 
 def map_row(
@@ -238,11 +236,17 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     slopes = truth.footprints.slope_rad[covered]
     # the paper's limits of tracking (section II.A)
     pitch, yaw, roll = np.degrees(np.abs(true_motion(case.flight, pair).rotation.as_rotvec()))
-    climb = abs(float(case.flight.states[1].position_m[2] - case.flight.states[0].position_m[2]))
+    # height and attitude at the first picture, motion and rotation to the second
+    first, second = case.flight.states
+    motion = second.position_m - first.position_m
+    positions = np.stack([first.position_m, second.position_m])
+    height = float(height_above_ground(case.world.ground.surface, positions)[0])
+    upright = first.attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
+    rotation_deg = (first.attitude.inv() * second.attitude).as_rotvec(degrees=True)
     within_limits = (
         roll < MAX_ROLL_DEG + 0.5
         and max(pitch, yaw) < MAX_TILT_DEG + 0.5
-        and climb < (MAX_CLIMB + 0.01) * pair.axis_range_m
+        and abs(float(motion[2])) < (MAX_CLIMB + 0.01) * pair.axis_range_m
     )
     return {
         "site": p.site,
@@ -251,7 +255,13 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
         "location_east_m": p.location.east_m,
         "location_north_m": p.location.north_m,
         **sun_columns(case.world.sun.direction),
-        **_true_motion_columns(case),
+        "height_m": height,
+        "baseline_m": float(np.linalg.norm(motion)),
+        "height_change_fraction": float(motion[2] / height),
+        "baseline_fraction": float(np.hypot(*motion[:2]) / height),
+        "pair_rotation_deg": float(np.linalg.norm(rotation_deg)),
+        **{f"{axis}_deg": float(angle) for axis, angle in zip(("pitch", "yaw", "roll"), rotation_deg, strict=True)},
+        "off_nadir_deg": float(np.degrees(np.arccos(np.clip(upright[2], -1.0, 1.0)))),
         "exposure_s": pair.images[0].calibration.exposure_s,
         "picture_median_dn": float(np.median(pair.counts[0])),
         "range_m": pair.axis_range_m,
@@ -270,26 +280,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     }
 
 
-def _true_motion_columns(case: RenderedFlight) -> dict[str, Scalar]:
-    """Height and attitude at the first picture, motion and rotation to the second."""
-    states = case.flight.states
-    heights = height_above_ground(case.world.ground.surface, np.stack([state.position_m for state in states]))
-    motion = states[1].position_m - states[0].position_m
-    rotation_deg = (states[0].attitude.inv() * states[1].attitude).as_rotvec(degrees=True)
-    upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
-    return {
-        "height_m": float(heights[0]),
-        "baseline_m": float(np.linalg.norm(motion)),
-        "height_change_fraction": float(motion[2] / heights[0]),
-        "baseline_fraction": float(np.hypot(*motion[:2]) / heights[0]),
-        "pair_rotation_deg": float(np.linalg.norm(rotation_deg)),
-        **{f"{axis}_deg": float(angle) for axis, angle in zip(("pitch", "yaw", "roll"), rotation_deg, strict=True)},
-        "off_nadir_deg": float(np.degrees(np.arccos(np.clip(upright[2], -1.0, 1.0)))),
-    }
-
-
 def _navigation_errors(flight: Flight, measurements: LandingMeasurements) -> dict[str, Scalar]:
-    """Errors of the on-board poses and of the inclinometers' vertical."""
     states, poses = flight.states, flight.poses
     first, second = (
         (pose.world_from_body.rotation * state.attitude.inv()).as_rotvec()

@@ -75,7 +75,7 @@ def compare_with_poses(
     images: Sequence[DetectorImage], pairs: Sequence[PairMatches], poses: Sequence[RigidTransform]
 ) -> list[PairAgreement]:
     """Compare the matches of a case's pictures with the body's pose at each picture."""
-    cameras = [image.camera.moved(pose) for image, pose in zip(images, poses, strict=True)]
+    cameras = [image.camera.transform(pose) for image, pose in zip(images, poses, strict=True)]
     return [
         PairAgreement(one, offsets_px(before, after, one.pixels[0], one.pixels[1]))
         for one, (before, after) in zip(pairs, itertools.pairwise(cameras), strict=True)

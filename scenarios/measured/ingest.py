@@ -30,7 +30,7 @@ from marsyard.scenarios.measured.layout import (
     read_ingest_file,
     read_table,
 )
-from marsyard.scenarios.system import Ingested
+from marsyard.scenarios.systems import Ingested
 from marsyard.scenarios.template import toml_environment
 from marsyard.scenarios.user_files import format_problems
 from marsyard.sim.camera import CameraModel, mount_looking_down, read_cameras, read_pds3_product
@@ -121,9 +121,9 @@ def infer_summed_rows(camera: CameraModel) -> int:
     Returns 1 where the ratio is near no whole number: the pixels are not sums of square ones.
     """
     ratio = camera.focal_lengths[0] / camera.focal_lengths[1]
-    whole = round(ratio)
-    is_whole = 1 < whole <= _MAX_SUMMED_ROWS and abs(ratio - whole) <= _RATIO_TOLERANCE * whole
-    return whole if is_whole else 1
+    divisor = round(ratio)
+    is_whole = 1 < divisor <= _MAX_SUMMED_ROWS and abs(ratio - divisor) <= _RATIO_TOLERANCE * divisor
+    return divisor if is_whole else 1
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,6 @@ class _FolderReader:
     def _body_pose(
         self, row: PictureRow, rotation: Rotation, position: Float64[np.ndarray, "n"] | None
     ) -> tuple[Rotation, Float64[np.ndarray, "3"] | None]:
-        """Convert a recorded pose to the attitude and position of the body."""
         poses = self.file.poses
         if poses is None:
             raise row.error(f"quaternions are given, but {INGEST_FILE} has no [poses] that says in which axes")
@@ -228,7 +227,6 @@ class _FolderReader:
         return poses.bodies(vehicle), np.asarray(poses.world.apply(position) + poses.levers(vehicle))
 
     def _to_world(self, row: PictureRow, vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
-        """Rotate a vector of the table to east, north, up."""
         if self.file.poses is None:
             raise row.error(f"vectors are given, but {INGEST_FILE} has no [poses] that says in which axes")
         return np.asarray(self.file.poses.world.apply(vector))

@@ -9,7 +9,7 @@ import itertools
 import re
 import struct
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -20,18 +20,10 @@ from jaxtyping import Float64, UInt16
 from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.recorded_axes import RecordedAxes
-from marsyard.scenarios.user_files import (
-    cells_by_column,
-    check_together,
-    finite_number,
-    format_problems,
-    header_problems,
-    read_lines,
-)
+from marsyard.scenarios.user_files import RecordedAxes, check_together, finite_number, format_problems, parse_table
 from marsyard.sim.files import check_regular, npy_header, open_regular
 from marsyard.sim.frames import direction
-from marsyard.sim.parameters import Parameters
+from marsyard.sim.parameters import Parameters, bounded_field
 
 #: The two files of every folder.
 INGEST_FILE, TABLE_FILE = "ingest.toml", "pictures.csv"
@@ -76,7 +68,7 @@ class DetectorTable(Parameters):
         float, Field(ge=0.0, le=1.0, description="frame transfer: time under each row while shifted out; 0: none")
     ] = 0.0
     clear_row_s: Annotated[
-        float, Field(ge=0.0, le=1.0, description="frame transfer: time under each row while cleared; 0: none")
+        float, bounded_field(0.0, 1.0, "frame transfer: time under each row while cleared; 0: none")
     ] = 0.0
     rows_summed: Annotated[
         int | None,
@@ -214,21 +206,14 @@ def read_table(path: Path, task: str) -> dict[str, list[PictureRow]]:
     """
     allowed = [column.name for column in COLUMNS if task in column.tasks]
     required = [column.name for column in COLUMNS if task in column.tasks and column.required == "every"]
+    hint = f"allowed for {task}: {', '.join(allowed)}"
     try:
-        header, lines = read_lines(path, _MAX_ROWS)
+        parsed, problems = parse_table(path, _MAX_ROWS, required, allowed, hint, _parse_row)
     except ValueError as error:
         raise IngestError(str(error)) from error
-    problems = list(header_problems(header, required, allowed, f"allowed for {task}: {', '.join(allowed)}"))
-    if problems:
-        raise IngestError(format_problems(path, problems))
     cases: dict[str, list[PictureRow]] = {}
-    for line, cells in lines:
-        try:
-            row = _parse_row(line, header, cells)
-        except ValueError as error:
-            problems.append(f"line {line}: {error}")
-        else:
-            cases.setdefault(row.texts["case"], []).append(row)
+    for row in parsed:
+        cases.setdefault(row.texts["case"], []).append(row)
     if not problems:
         low, high = PICTURES[task]
         number = str(low) if low == high else f"{low} to {high}"
@@ -256,8 +241,8 @@ def read_table(path: Path, task: str) -> dict[str, list[PictureRow]]:
     return cases
 
 
-def _parse_row(line: int, header: Sequence[str], cells: Sequence[str]) -> PictureRow:
-    filled = {name: cell for name, cell in cells_by_column(header, cells).items() if cell}
+def _parse_row(line: int, cells: Mapping[str, str]) -> PictureRow:
+    filled = {name: cell for name, cell in cells.items() if cell}
     numbers = {name: finite_number(name, cell) for name, cell in filled.items() if name not in _TEXT_COLUMNS}
     row = PictureRow(line, {name: filled[name] for name in _TEXT_COLUMNS if name in filled}, numbers)
     for name in _POSITIVE_COLUMNS:

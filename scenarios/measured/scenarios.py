@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -16,11 +15,11 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.dimes import DimesDetails, DimesOptions
 from marsyard.algorithms.hda import HdaDetails, HdaOptions, hda_products
-from marsyard.algorithms.hda.view import camera_pose
+from marsyard.algorithms.hda.motion import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate
-from marsyard.scenarios.algorithm_run import AlgorithmRun, case_result, run_algorithm_on_copy
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
+from marsyard.scenarios.algorithm_run import AlgorithmRun, AlgorithmSelection, case_result, run_algorithm_on_copy
 from marsyard.scenarios.base import BaseScenario, algorithm_result
+from marsyard.scenarios.conditions import hash_images
 from marsyard.scenarios.descent.parameters import check_binning
 from marsyard.scenarios.estimators import LANDING, VELOCITY
 from marsyard.scenarios.interface import CaseResult, Scalar, record_conditions
@@ -29,7 +28,7 @@ from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
 from marsyard.scenarios.measured.layout import TaskName
 from marsyard.scenarios.parts.named import SCORE, Kind
-from marsyard.scenarios.parts.scores import CustomScores, ScoredSite, ScoredVelocity, scored
+from marsyard.scenarios.parts.scores import CustomScores, ScoredSite, ScoredVelocity, compute_scores
 from marsyard.scenarios.velocity import check_last_interval, consistency_row, velocity_products, velocity_row
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DescentMeasurements, DetectorImage, LandingMeasurements
@@ -82,9 +81,7 @@ class MeasuredVelocityParameters(AlgorithmSelection, CustomScores, MeasuredParam
     task = VELOCITY
     scored = ScoredVelocity
 
-    algorithm: Annotated[str, Field(description="the velocity estimator under test, whose answers are judged")] = (
-        "dimes"
-    )
+    algorithm: str = Field(default="dimes", description="the velocity estimator under test, whose answers are judged")
     dimes: Annotated[DimesOptions, Field(description="options of DIMES")] = DimesOptions()
 
     @model_validator(mode="after")
@@ -155,7 +152,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
         measurements = store.descent_measurements(p.case, images)
         matches = match_images(images)
         axes = [
-            image.camera.moved(RigidTransform.from_rotation(attitude.world_from_body)).boresight()
+            image.camera.transform(RigidTransform.from_rotation(attitude.world_from_body)).boresight()
             for image, attitude in zip(images, measurements.attitudes, strict=True)
         ]
         conditions: dict[str, Scalar] = {
@@ -198,7 +195,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
                     answer=attempt.answer,
                     true_velocity_m_s=None if true_velocity is None else truth,
                 )
-                row |= scored(p.scores, case, {*row, *conditions})
+                row |= compute_scores(p.scores, case, {*row, *conditions})
             products = velocity_products([image.counts for image in images], attempt.answer, truth)
             return algorithm_result(
                 attempt, velocity is not None, row, {**products, **agreement_products(images, pairs)}
@@ -244,7 +241,7 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
             row |= attempt.row
             if attempt.answer is not None:
                 case = ScoredSite(measurements=measurements, answer=attempt.answer, true_poses=true_poses)
-                row |= scored(p.scores, case, {*row, *conditions})
+                row |= compute_scores(p.scores, case, {*row, *conditions})
             products = hda_products(details) if isinstance(details, HdaDetails) else {}
             converged = attempt.answer is not None and attempt.answer.outcome.converged
             return algorithm_result(attempt, converged, row, {**products, **agreement_products(images, pairs)})
@@ -264,9 +261,6 @@ def _run_algorithms(
 def _case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[str, Scalar]:
     """Return the columns of the case: name, pictures, and the largest motion of the camera between two pictures."""
     poses = [picture.pose * camera_pose(image.camera) for picture, image in zip(p.case.pictures, images, strict=True)]
-    digest = hashlib.sha256()
-    for image in images:
-        digest.update(np.ascontiguousarray(image.counts).tobytes())
     steps = [before.inv() * after for before, after in itertools.pairwise(poses)]
     has_positions = all(picture.position_m is not None for picture in p.case.pictures)
     return {
@@ -275,7 +269,7 @@ def _case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[st
         "duration_s": images[-1].time_s - images[0].time_s,
         "max_rotation_deg": max(float(np.degrees(step.rotation.magnitude())) for step in steps),
         "max_translation_m": max(float(np.linalg.norm(step.translation)) for step in steps) if has_positions else NAN,
-        "image_hash": digest.hexdigest(),
+        "image_hash": hash_images(image.counts for image in images),
     }
 
 

@@ -125,7 +125,6 @@ class CasesFile(UserFile):
 
 
 def _load(file: str) -> tuple[StoredCases, str]:
-    """Read the cases and the hash of the file; cached while the file does not change."""
     try:
         status = check_regular(file)
     except OSError as error:
@@ -172,7 +171,7 @@ def write_camera(folder: Path, number: int, camera: CameraModel) -> StoredFile:
     )
 
 
-def _unchanged(folder: Path, named: StoredFile) -> Path:
+def _check_unchanged(folder: Path, named: StoredFile) -> Path:
     """Return the file's path. Raises ValueError where the file is missing or has changed."""
     path = folder / named.file
     try:
@@ -188,14 +187,16 @@ def load_images(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]
     """Load the pictures of a case with their cameras in the body frame. Raises ValueError where a file has changed."""
     folder, images = Path(cases.file).parent, []
     for picture in case.pictures:
-        counts = read_picture(_unchanged(folder, picture.counts))
+        counts = read_picture(_check_unchanged(folder, picture.counts))
         flat = picture.flat_field
         calibration = DetectorCalibration(
-            flat_field=np.ones(counts.shape) if flat is None else np.load(_unchanged(folder, flat), allow_pickle=False),
+            flat_field=np.ones(counts.shape)
+            if flat is None
+            else np.load(_check_unchanged(folder, flat), allow_pickle=False),
             exposure_s=picture.exposure_s,
             **cases.stored.detector.model_dump(),
         )
-        camera = read_cahvor(_unchanged(folder, picture.camera))
+        camera = read_cahvor(_check_unchanged(folder, picture.camera))
         images.append(DetectorImage(counts, picture.time_s, camera, calibration))
     return tuple(images)
 

@@ -23,9 +23,9 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.named import DYNAMICS, CustomPart
-from marsyard.scenarios.recorded_axes import RecordedAxes
+from marsyard.scenarios.user_files import RecordedAxes
 from marsyard.sim.dynamics.recorded import RecordedMotion
-from marsyard.sim.parameters import bounded
+from marsyard.sim.parameters import bounded_field
 
 #: Tolerated deviation of a quaternion's length from 1.
 UNIT_TOLERANCE = 1e-6
@@ -76,7 +76,7 @@ class CustomMotion(CustomPart, RecordedAxes):
 
     motion: Annotated[str, Field(description="custom motion's class: module:Class, or an entry point's name")]
     axes: Annotated[Literal["enu", "ned"], Field(description="east, north, up; or north, east, down")] = "enu"
-    lead_s: Annotated[float, bounded(0.2, 30.0, "start of the navigation before the first picture")] = 5.0
+    lead_s: Annotated[float, bounded_field(0.2, 30.0, "start of the navigation before the first picture")] = 5.0
 
     def compute(
         self, place: DescentPlace, ground_m: Float[np.ndarray, "3"], rng: np.random.Generator

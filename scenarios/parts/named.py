@@ -18,8 +18,8 @@ from typing import Any, ClassVar
 
 from pydantic import BaseModel, Discriminator, Field, JsonValue, ValidationError, model_validator
 
-from marsyard.scenarios.import_path import import_object
 from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.user_files import import_object
 from marsyard.sim.parameters import Parameters
 
 
@@ -42,7 +42,7 @@ class Kind:
         """Import path ``module:name`` of a part. Raises ValueError for an unknown entry point."""
         if ":" in spec:
             return spec
-        names = installed(self.group)
+        names = list_installed(self.group)
         if spec in names:
             return names[spec]
         near = difflib.get_close_matches(spec, names, n=1)
@@ -85,7 +85,7 @@ KINDS: Mapping[str, Kind] = {kind.name: kind for kind in (DYNAMICS, INSTRUMENT, 
 
 
 @cache
-def installed(group: str) -> Mapping[str, str]:
+def list_installed(group: str) -> Mapping[str, str]:
     """Import paths in an entry point group of installed packages, by sorted names."""
     return {point.name: point.value for point in sorted(entry_points(group=group), key=lambda point: point.name)}
 

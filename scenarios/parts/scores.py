@@ -14,7 +14,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
@@ -143,9 +143,7 @@ class CustomScores(Parameters):
 
     scored: ClassVar[type[Any]]
 
-    scores: Annotated[
-        tuple[str, ...], Field(description="custom scores: module:function, or names of entry points")
-    ] = ()
+    scores: tuple[str, ...] = Field(default=(), description="custom scores: module:function, or names of entry points")
 
     @field_validator("scores")
     @classmethod
@@ -157,7 +155,7 @@ class CustomScores(Parameters):
         return specs
 
 
-def scored(specs: Sequence[str], case: ScoredCase, taken: Collection[str]) -> dict[str, Scalar]:
+def compute_scores(specs: Sequence[str], case: ScoredCase, taken: Collection[str]) -> dict[str, Scalar]:
     """Columns of all scores of a case. Raises ValueError for an invalid column, or one that the row has already."""
     row: dict[str, Scalar] = {}
     for spec, label in zip(specs, labels(specs), strict=True):

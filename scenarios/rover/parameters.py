@@ -10,14 +10,15 @@ from jaxtyping import Float64
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.vtt import VttOptions
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
+from marsyard.scenarios.algorithm_run import AlgorithmSelection
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.parts.scores import CustomScores, ScoredRun
+from marsyard.scenarios.terrain_files import check_site
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import SlipParameters
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import MastCalibration
-from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded
+from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.render import CloudParameters, Sun
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import (
@@ -33,7 +34,7 @@ from marsyard.sim.sensor import (
     preset,
     stereo_mast,
 )
-from marsyard.sim.terrain import site, sites
+from marsyard.sim.terrain import site
 
 #: Angles in degrees: relative, and azimuths.
 Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
@@ -51,14 +52,16 @@ class InclineParameters(Parameters):
 class WorldParameters(Parameters):
     """One terrain of a site's bank, cleared of rocks on the route."""
 
-    site: Annotated[str, Field(description="preset of terrain, rocks, texture and light")] = "mars-yard"
+    site: Annotated[
+        str, check_site("a rover", "ground"), Field(description="preset of terrain, rocks, texture and light")
+    ] = "mars-yard"
     bank: Annotated[int, Field(ge=1, le=100000, description="terrains in the bank")] = 8
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
     terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
     samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, 2.5 cm apart")] = 2048
     incline: InclineParameters = InclineParameters()
-    rms_slope_deg: Annotated[float | None, bounded(0.0, 30.0, "of rough ground; default: the site's")] = None
-    rock_abundance: Annotated[float | None, bounded(0.0, 0.4, "ground under rocks; default: the site's")] = None
+    rms_slope_deg: Annotated[float | None, bounded_field(0.0, 30.0, "of rough ground; default: the site's")] = None
+    rock_abundance: Annotated[float | None, bounded_field(0.0, 0.4, "ground under rocks; default: the site's")] = None
     largest_near_m: Annotated[NonNegative, Field(description="largest rock left on the route")] = 0.08
     east_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
     north_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
@@ -66,14 +69,6 @@ class WorldParameters(Parameters):
     background_half_deg: Annotated[Positive, Field(le=180.0, description="half angle behind the target with rocks")] = (
         50.0
     )
-
-    @field_validator("site")
-    @classmethod
-    def _check_site(cls, name: str) -> str:
-        allowed = [one.name for one in sites().values() if one.ground is not None]
-        if name not in allowed:
-            raise ValueError(f"no site for a rover is called '{name}'; allowed: {', '.join(allowed)}")
-        return name
 
     @model_validator(mode="after")
     def _check_terrain(self) -> WorldParameters:
@@ -133,16 +128,14 @@ class LegParameters(Parameters):
     """
 
     motion: Literal["stay", "approach", "back-off", "straight", "turn", "circle"] = "approach"
-    steps: Annotated[int, bounded(1, 200, "number of steps; the maximum of an approach or back-off")] = 60
+    steps: Annotated[int, bounded_field(1, 200, "number of steps; the maximum of an approach or back-off")] = 60
     step_fraction: float = Field(default=0.1, gt=0.0, le=0.9, description="step length over the camera's distance")
     step_m: Annotated[float | None, Field(description="length of a step instead; needed for straight")] = None
     step_deg: Annotated[Turn, Field(description="of a turn or circle")] = 5.0
     goal_m: Positive = Field(default=2.0, description="final horizontal distance of the rover's origin from the target")
     ends_with_steps: bool = Field(default=False, description="whether it may end short of goal_m, its steps done")
     offset_right_m: float = Field(default=0.0, description="offset of the goal to the right of the target's direction")
-    shuffle_m: Annotated[NonNegative, Field(description="drive of a step with a stuck motor, and back at the next")] = (
-        0.0
-    )
+    shuffle_m: NonNegative = Field(default=0.0, description="drive of a step with a stuck motor, and back at the next")
     visual_odometry: Annotated[bool, Field(description="whether the pose is corrected by visual odometry")] = False
     visual_odometry_step_m: Positive = Field(default=0.75, description="longest drive between pictures (60 % overlap)")
     autonav: bool = Field(default=False, description="whether the navigator avoids rocks in its map")
@@ -165,7 +158,7 @@ class SunParameters(Parameters):
 
     azimuth_deg: Annotated[Azimuth, Field(description="clockwise from north")] = 225.0
     elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="above the horizon")] = 45.0
-    hour_angle_deg_min: Annotated[float, bounded(-1.0, 1.0, "about the pole: 16 deg in 66 min (Table IV)")] = (
+    hour_angle_deg_min: Annotated[float, bounded_field(-1.0, 1.0, "about the pole: 16 deg in 66 min (Table IV)")] = (
         16.0 / 66.0
     )
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0, description="elevation of the pole")] = -2.0
@@ -225,9 +218,7 @@ class CustomPair(Parameters):
 class CameraParameters(Parameters):
     """The stereo pair on the mast."""
 
-    preset: Annotated[str, Field(description="key of `marsyard.sim.sensor.mast.MASTS`: pair, mast, rover")] = (
-        "mer-navcam"
-    )
+    preset: str = Field(default="mer-navcam", description="key of `marsyard.sim.sensor.mast.MASTS`: pair, mast, rover")
     custom: Annotated[CustomPair | None, Field(description="a custom pair on the preset's mast")] = None
     detector: DetectorChoice | None = Field(default=None, description="of both cameras; by default the preset's")
     detector_noise: Annotated[bool, Field(description="whether pictures have detector noise and response")] = True

@@ -24,8 +24,7 @@ from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.rover.parameters import LegParameters, RoverScenarioParameters
 from marsyard.scenarios.rover.points import cast_rover_shadow
-from marsyard.scenarios.rover.stops import RunOutcome, StereoCamera, Stop, View
-from marsyard.scenarios.rover.target import DesignatedTarget, choose_target
+from marsyard.scenarios.rover.stops import DesignatedTarget, RunOutcome, StereoCamera, Stop, View, choose_target
 from marsyard.scenarios.rover.world import TARGET, Rig, RunWorld, Vehicle
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.dynamics import Drive
@@ -360,4 +359,4 @@ def map_terrain(p: RoverScenarioParameters, run: Run, leg: LegParameters, target
             middle = float(towards + (number - 0.5 * (leg.wedges - 1)) * MAST_SPACING_RAD)
             wedges.append(Wedge(position.copy(), middle, MAST_HALF_RAD, MAST_MIN_M, MAST_MAX_M))
     for wedge in wedges:
-        run.terrain = run.terrain.sensed(wedge, tuple(obstacles))
+        run.terrain = run.terrain.add_wedge(wedge, tuple(obstacles))

@@ -25,16 +25,15 @@ from marsyard.algorithms.interface import TrackingState
 from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm
 from marsyard.scenarios.base import LoadGround, TerrainScenario
-from marsyard.scenarios.conditions import picture_columns_of_hash
+from marsyard.scenarios.conditions import picture_columns
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import SCORE, Kind
-from marsyard.scenarios.parts.scores import scored
+from marsyard.scenarios.parts.scores import compute_scores
 from marsyard.scenarios.rover import score
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.run import Run, Setup, TrackerGuide, TruthGuide, drive_legs, prepare_run, track_target
-from marsyard.scenarios.rover.stops import RunOutcome, View
-from marsyard.scenarios.rover.target import Visibility, evaluate_visibility, pick_target
+from marsyard.scenarios.rover.stops import RunOutcome, View, Visibility, evaluate_visibility, pick_target
 from marsyard.scenarios.rover.world import terrain_parameters
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.parameters import Parameters
@@ -206,8 +205,6 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
     name = "rover"
     parameters_type = RoverScenarioParameters
     task = TRACKING
-    algorithm_table = ()
-    part_keys: Mapping[str, Kind] = {"scores": SCORE}
 
     def __init__(self) -> None:
         super().__init__(CACHED_GROUNDS)
@@ -326,8 +323,8 @@ def _judge(
     if judged:
         digest = hashlib.sha256(b"".join(stop.pictures.digest for stop in run.stops)).hexdigest()
         row |= {**score.stored_updates(run, p.score.stored_updates), **score.run_conditions(p, run)}
-        row |= picture_columns_of_hash(p.backend, digest)
-    row |= scored(p.scores, score.scored_run(run), {*row, *known})
+        row |= picture_columns(p.backend, digest)
+    row |= compute_scores(p.scores, score.scored_run(run), {*row, *known})
     return CaseResult(
         run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, score.products(p, run) if judged else {}
     )

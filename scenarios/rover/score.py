@@ -10,13 +10,13 @@ from jaxtyping import Float64
 
 from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, stereo_range_error_m
 from marsyard.algorithms.vtt.stereo import disparity_px_m
+from marsyard.scenarios.conditions import sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.scores import ScoredRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import rover_shades_patch, template_patch
 from marsyard.scenarios.rover.run import Run
-from marsyard.scenarios.rover.stops import RunOutcome
-from marsyard.scenarios.rover.target import evaluate_visibility
+from marsyard.scenarios.rover.stops import RunOutcome, evaluate_visibility
 from marsyard.sim.measurements import RoverMeasurements
 
 NAN = float("nan")
@@ -93,18 +93,18 @@ def _max(values: Float64[np.ndarray, "n"]) -> float:
 def tracking(run: Run) -> dict[str, Scalar]:
     """Table III's figures at their extremes, and the tracker's corrections."""
     figures = update_figures(run)
-    found = [one for one in run.stops if one.update.found]
+    sighted = [one for one in run.stops if one.update.found]
     drift_m = seed_error = seed_3_sigma = NAN
-    if found:
+    if sighted:
         seed, last = (
-            one.estimated.apply(np.asarray(one.update.position_rover).copy()) for one in (found[0], found[-1])
+            one.estimated.apply(np.asarray(one.update.position_rover).copy()) for one in (sighted[0], sighted[-1])
         )
-        drift_m, seed_error = float(np.linalg.norm(last - seed)), float(np.linalg.norm(found[0].error_m()))
+        drift_m, seed_error = float(np.linalg.norm(last - seed)), float(np.linalg.norm(sighted[0].error_m()))
         scale = disparity_px_m(run.rig.calibrated.left, run.rig.calibrated.right)
-        seed_3_sigma = stereo_range_error_m(found[0].range_m, scale, 1.0)
+        seed_3_sigma = stereo_range_error_m(sighted[0].range_m, scale, 1.0)
     return {
         "updates": len(run.stops),
-        "lost_updates": len(run.stops) - len(found),
+        "lost_updates": len(run.stops) - len(sighted),
         "visual_odometry_updates": run.visual_odometry_updates,
         "autonav_updates": run.autonav_updates,
         **{
@@ -122,8 +122,8 @@ def tracking(run: Run) -> dict[str, Scalar]:
 
 def update_figures(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
     """Figures of every update, one array each; NaN where a tracker reports no details, of a match also at the seed."""
-    figures = {name: np.full(len(run.stops), np.nan) for name in FIGURES}
-    for number, (stop, error) in enumerate(zip(run.stops, errors_px(run), strict=True)):
+    rows = []
+    for stop, error in zip(run.stops, errors_px(run), strict=True):
         azimuth, elevation = np.degrees(stop.angles_rad)
         row = {
             "range_m": stop.range_m,
@@ -146,9 +146,8 @@ def update_figures(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
             row["match_score"] = details.match.score
             if details.predicted_pixel is not None:
                 row["correction_px"] = float(np.max(np.abs(details.match.pixel - details.predicted_pixel)))
-        for name, value in row.items():
-            figures[name][number] = value
-    return figures
+        rows.append(row)
+    return {name: np.array([row.get(name, NAN) for row in rows], dtype=np.float64) for name in FIGURES}
 
 
 def stored_updates(run: Run, count: int) -> dict[str, Scalar]:
@@ -224,8 +223,7 @@ def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "pose_error_m": pose_error,
         "pose_error_fraction": pose_error / driven if driven > 0.0 else NAN,
         "duration_min": times[1] / 60.0,
-        "sun_azimuth_deg": float(np.degrees(np.arctan2(sun[0][0], sun[0][1])) % 360.0),
-        "sun_elevation_deg": float(np.degrees(np.arcsin(sun[0][2]))),
+        **sun_columns(sun[0]),
         "sun_motion_deg": float(np.degrees(np.arccos(np.clip(sun[0] @ sun[1], -1.0, 1.0)))),
         "exposure_min_s": -_max(-exposures),
         "exposure_max_s": _max(exposures),
@@ -282,18 +280,18 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
     arrays: dict[str, object] = {}
     for number, stop in enumerate(stops, start=1):
         left, right, details = stop.pictures.left, stop.pictures.right, stop.details
-        window, found = np.full(4, np.nan), np.full((2, 2), np.nan)
+        window, matched_px = np.full(4, np.nan), np.full((2, 2), np.nan)
         if details is not None and details.window is not None and details.window_corner is not None:
             window = np.array([*details.window_corner, *details.window.shape[::-1]], dtype=np.float64)
-        found[0] = stop.found_px(run.rig.calibrated)
+        matched_px[0] = stop.found_px(run.rig.calibrated)
         if details is not None and details.stereo is not None and stop.update.found:
-            found[1] = details.stereo.pixel
+            matched_px[1] = details.stereo.pixel
         of_stop = {
             "left": left.counts,
             "right": right.counts,
             "corners": np.array([left.corner, right.corner], dtype=np.float64),
             "window": window,
-            "found": found,
+            "found": matched_px,
             "point": stop.point_px,
         }
         arrays |= {f"stop_{number}_{name}": values for name, values in of_stop.items()}

@@ -54,7 +54,7 @@ def terrain_parameters(w: WorldParameters) -> TerrainParameters:
     if w.incline.slope_deg:
         length_m = RAMP_FRACTION * w.samples * base.spacing_m
         changes["ramp"] = Ramp(slope_deg=w.incline.slope_deg, length_m=length_m).model_dump()
-    return base.changed(changes)
+    return base.with_changes(changes)
 
 
 @dataclass
@@ -148,7 +148,6 @@ def place_rocks(p: RoverScenarioParameters, bare: SiteGround, rng: np.random.Gen
 
 
 def _distances(rocks: RockField, position: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "rocks"]:
-    """Horizontal distances of rocks from a position on the periodic ground."""
     away = rocks.position_m[:, :2] - position
     away -= rocks.period_m * np.round(away / rocks.period_m)
     return np.asarray(np.hypot(away[:, 0], away[:, 1]))
@@ -170,8 +169,8 @@ class Rig:
     def of(cls, p: RoverScenarioParameters, streams: Streams) -> Rig:
         """Draw the errors of a run's mast and pair."""
         design = p.camera.mast()
-        head = StereoHead.drawn(design, p.stereo, streams.generator("stereo calibration"))
-        mast = Mast.drawn(p.pointing, design.geometry, streams.generator("mast zeros"))
+        head = StereoHead.draw(design, p.stereo, streams.generator("stereo calibration"))
+        mast = Mast.draw(p.pointing, design.geometry, streams.generator("mast zeros"))
         left, right, motors = head.true.left, head.true.right, streams.generator("mast motors")
         return cls(head, head.calibrated, left, right, mast, mast.rest, motors)
 
@@ -197,7 +196,7 @@ class Rig:
 
     def range_m(self, position_rover: Float64[np.ndarray, "3"]) -> float:
         """Estimated distance of a position from the left camera."""
-        camera = self.calibrated.left.moved(self.calibrated.geometry.rover_from_head(*self.state.readings_rad))
+        camera = self.calibrated.left.transform(self.calibrated.geometry.rover_from_head(*self.state.readings_rad))
         return float(np.linalg.norm(position_rover - camera.c))
 
 
@@ -231,7 +230,7 @@ class Vehicle:
             half = p.start.distance_m + ROUTE_MARGIN_M
             ground = RockyGround.of(ground, world.base.objects.triangles, (p.world.east_m, p.world.north_m), half)
         stance = settle(rover, ground, float(position[0]), float(position[1]), float(azimuth))
-        odometer = Odometer.drawn(p.odometry, stance.world_from_rover, streams.generator("odometry"))
+        odometer = Odometer.draw(p.odometry, stance.world_from_rover, streams.generator("odometry"))
         soil = Soil.draw(p.slip, streams.generator("soil"))
         generators = streams.generator("slip"), streams.generator("odometry noise")
         return cls(rover, ground, soil, stance, odometer, odometer.first, *generators)

@@ -132,7 +132,7 @@ class CameraModel(ABC):
         columns, rows = self.size
         return np.stack(np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64)), axis=-1)
 
-    def moved(self: M, new_from_old: RigidTransform) -> M:
+    def transform(self: M, new_from_old: RigidTransform) -> M:
         """The camera after a rigid motion: ``moved(T).project(T.apply(points))`` equals ``project(points)``.
 
         With the camera in the body frame, ``moved(world_from_body)`` is the camera in the world frame. Raises
@@ -144,7 +144,7 @@ class CameraModel(ABC):
         rotated = {name: matrix[:3, :3] @ getattr(self, name) for name in ("a", "h", "v", "o") if hasattr(self, name)}
         return self._with(c=matrix[:3, :3] @ self.c + matrix[:3, 3], **rotated)
 
-    def binned(self: M, columns: int, rows: int) -> M:
+    def bin(self: M, columns: int, rows: int) -> M:
         """The camera of an image in which blocks of `columns` x `rows` pixels are summed or averaged into one.
 
         Column u becomes (u - (columns - 1) / 2) / columns, and rows likewise. Raises ValueError if a factor is not
@@ -159,7 +159,7 @@ class CameraModel(ABC):
             (self.size[0] // columns, self.size[1] // rows),
         )
 
-    def scaled(self: M, factor: Real) -> M:
+    def scale(self: M, factor: Real) -> M:
         """The camera of the resized image: u becomes (u + 0.5) * factor - 0.5. ValueError unless factor is positive."""
         if not (np.isfinite(factor) and factor > 0):
             raise ValueError(f"an image is scaled by a positive, finite factor, not {factor}")
@@ -167,20 +167,20 @@ class CameraModel(ABC):
         shift = 0.5 * scale - 0.5
         return self._with_image_map((scale, scale), (shift, shift), (round(columns * factor), round(rows * factor)))
 
-    def cropped(self: M, column: int, row: int, size: tuple[int, int]) -> M:
+    def crop(self: M, column: int, row: int, size: tuple[int, int]) -> M:
         """The camera of a part of the image, by upper left pixel and size. Raises ValueError outside the frame."""
         if column < 0 or row < 0 or column + size[0] > self.size[0] or row + size[1] > self.size[1]:
             crop, frame = (f"{columns} x {rows}" for columns, rows in (size, self.size))
             raise ValueError(f"a crop of {crop} pixels at ({column}, {row}) leaves the frame of {frame}")
         return self._with_image_map((1.0, 1.0), (-float(column), -float(row)), size)
 
-    def magnified(self: M, factor: Real) -> M:
+    def magnify(self: M, factor: Real) -> M:
         """The camera with its focal lengths scaled about its image centre."""
         column, row = self.image_centre
         h = self.h + (factor - 1.0) * (self.h - column * self.a)
         return self._with(h=h, v=self.v + (factor - 1.0) * (self.v - row * self.a))
 
-    def recentred(self: M, columns: Real, rows: Real) -> M:
+    def recentre(self: M, columns: Real, rows: Real) -> M:
         """The camera whose pictures are shifted to the right and down by a number of pixels."""
         return self._with(h=self.h + columns * self.a, v=self.v + rows * self.a)
 
@@ -298,7 +298,7 @@ def mount_looking_down(camera: CameraModel) -> CameraModel:
     axis = _unit(camera.a)
     right = _unit(camera.right - (camera.right @ axis) * axis)
     rotation = Rotation.from_matrix(np.stack([right, np.cross(right, axis), -axis]))
-    return camera.moved(RigidTransform.from_components(-rotation.apply(camera.c.copy()), rotation))
+    return camera.transform(RigidTransform.from_components(-rotation.apply(camera.c.copy()), rotation))
 
 
 def dot(vector: Vector, x: Vector, y: Vector, z: Vector) -> Vector:

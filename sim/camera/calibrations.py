@@ -278,7 +278,7 @@ def from_opencv(
     perpendicular = np.cross(linear.a, np.eye(3)[np.argmin(np.abs(linear.a))])
     perpendicular /= np.linalg.norm(perpendicular)
     tilt_axes = np.stack([perpendicular, np.cross(linear.a, perpendicular)])
-    points = _undistorted(distorted, coefficients)
+    points = _undistort(distorted, coefficients)
     directions = _in_world(np.concatenate([points, np.ones((len(points), 1))], axis=1), camera_from_world)
     start = Cahvor.from_cahv(linear, r=(0.0, coefficients[0], coefficients[1]))
 
@@ -380,7 +380,6 @@ def _fisheye_directions(points: Array, coefficients: Array) -> Array:
 
 
 def _in_world(directions: Array, camera_from_world: RigidTransform | None) -> Array:
-    """Rotate directions from OpenCV's axes to the camera's frame of reference."""
     return directions if camera_from_world is None else directions @ camera_from_world.as_matrix()[:3, :3]
 
 
@@ -388,22 +387,22 @@ def _far_pixels(camera: CameraModel, directions: Array) -> Array:
     return camera.project(camera.c + directions)[0]
 
 
-def _undistorted(distorted: Array, coefficients: Array) -> Array:
+def _undistort(distorted: Array, coefficients: Array) -> Array:
     """Invert the pinhole distortion by Newton's method in two dimensions."""
     points = distorted.copy()
     for _ in range(50):
-        image, slope = _distorted(points, coefficients)
+        image, slope = _distort(points, coefficients)
         step = np.linalg.solve(slope, (image - distorted)[..., np.newaxis])[..., 0]
         points -= step
         if np.max(np.abs(step)) < 1e-14:
             break
-    image, slope = _distorted(points, coefficients)
+    image, slope = _distort(points, coefficients)
     if not (np.max(np.abs(image - distorted)) < 1e-9 and np.all(np.linalg.det(slope) > 0)):
         raise ValueError("the distortion folds over within the frame: some pixels have no direction, or several")
     return points
 
 
-def _distorted(points: Array, coefficients: Array) -> tuple[Array, Array]:
+def _distort(points: Array, coefficients: Array) -> tuple[Array, Array]:
     """OpenCV's pinhole distortion of (x, y), shape (n, 2), and its derivative, shape (n, 2, 2)."""
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients
     x, y = points.T

@@ -173,7 +173,6 @@ class RadialModel(CameraModel):
 
     @cached_property
     def _axis_image(self) -> tuple[float, float, float]:
-        """(O.H, O.V, O.A)."""
         return float(self._axis @ self.h), float(self._axis @ self.v), float(self._axis @ self.a)
 
     @cached_property
@@ -338,14 +337,12 @@ class Cahvore(RadialModel):
         return np.sin(scale * theta) / scale if scale < -_ZERO_LINEARITY else theta
 
     def _theta(self, chi: Vector) -> Vector:
-        """Inverse of `_chi`; beyond the end of its range, the angle at the end."""
         scale = self.linearity
         if scale > _ZERO_LINEARITY:
             return np.arctan(scale * chi) / scale
         return np.arcsin(np.maximum(scale * chi, -1)) / scale if scale < -_ZERO_LINEARITY else chi
 
     def _pupil(self, theta: Vector) -> tuple[Vector, Vector]:
-        """e0 + e1 theta^2 + e2 theta^4 and its derivative."""
         square = theta * theta
         series = self.e[0] + square * (self.e[1] + square * self.e[2])
         return series, theta * (2 * self.e[1] + 4 * self.e[2] * square)

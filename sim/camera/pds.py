@@ -146,7 +146,6 @@ def is_pds3(head: bytes) -> bool:
 
 
 def _label_text(source: Source) -> str:
-    """Read the text of a PDS3 label up to its END."""
     for count in (_FIRST_BYTES, MAX_BYTES):
         head = source.head(count)
         if not is_pds3(head):
@@ -184,7 +183,6 @@ def _parse_blocks(text: str, names: Sequence[str], source: Source) -> Any:
 
 
 def _picture_size(label: Any, source: Source) -> tuple[int, int]:
-    """(columns, rows) of the label's IMAGE object."""
     if "IMAGE" not in label or not isinstance(label["IMAGE"], Mapping):
         raise source.error("IMAGE", "missing", "an object with LINES and LINE_SAMPLES")
     image = label["IMAGE"]
@@ -245,7 +243,6 @@ def _fault(value: Any) -> str:
 
 
 def _read_counts(text: str, image: Any, size: tuple[int, int], source: Source) -> UInt16[np.ndarray, "rows columns"]:
-    """Read the picture from the label's file, or from one next to it."""
     pointer = _POINTER.search(text)
     if pointer is None:
         raise source.error("^IMAGE", "missing, or of another form", 'a record, bytes, or ("FILE", record)')
@@ -336,7 +333,6 @@ def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[Ca
 
 
 def _local(element: ElementTree.Element) -> str:
-    """An element's name without its namespace."""
     return element.tag.rpartition("}")[2] if isinstance(element.tag, str) else ""
 
 
@@ -383,7 +379,6 @@ def _pds4_camera(element: ElementTree.Element, size: tuple[int, int], source: So
 
 
 def _number(element: ElementTree.Element, name: str, field: str, source: Source) -> float | None:
-    """A number of an element; None if missing."""
     child = _child(element, name)
     if child is None:
         return None

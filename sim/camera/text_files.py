@@ -88,12 +88,12 @@ def read_cahvor(path: str | Path, *, size: tuple[int, int] | None = None) -> Cam
         if match is not None:
             lines[match["name"]] = match["value"], number
 
-    def required(name: str) -> tuple[str, int]:
+    def require(name: str) -> tuple[str, int]:
         if name not in lines:
             raise source.error(name, "missing", f"a line '{name} = ...'")
         return lines[name]
 
-    value, number = required("Model")
+    value, number = require("Model")
     model = _MODEL.match(value)
     if model is None:
         allowed = "CAHV, CAHVOR, CAHVORE1, CAHVORE2 or CAHVORE3,<linearity>"
@@ -108,7 +108,7 @@ def read_cahvor(path: str | Path, *, size: tuple[int, int] | None = None) -> Cam
     size = _read_size(lines.get("Dimensions"), size, source)
     vectors = {}
     for letter in name:
-        value, number = required(letter)
+        value, number = require(letter)
         words = value.split()
         if len(words) != 3:
             raise source.error(letter, f"{len(words)} words in line {number}", "three finite numbers")

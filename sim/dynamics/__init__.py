@@ -3,8 +3,7 @@
 from marsyard.sim.dynamics.driving import Drive, DriveStep, SlipParameters, Soil, drive
 from marsyard.sim.dynamics.rover import MER, ROCKY_8, Ground, RockyGround, RoverParameters, Stance, settle
 from marsyard.sim.dynamics.swing import SwingDescent, SwingParameters
-from marsyard.sim.dynamics.trajectory import Motion, Resting, State, Trajectory
-from marsyard.sim.dynamics.wind import Wind, WindParameters
+from marsyard.sim.dynamics.trajectory import Motion, Resting, State, Trajectory, Wind, WindParameters
 
 __all__ = [
     "MER", "ROCKY_8", "Drive", "DriveStep", "Ground", "Motion", "Resting", "RockyGround", "RoverParameters",

@@ -29,7 +29,7 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.sim.dynamics.rover import Ground, RoverParameters, Stance, settle
 from marsyard.sim.frames import compose, turn_matrix
 from marsyard.sim.measurements import DriveCommand
-from marsyard.sim.parameters import Fraction, Parameters, bounded
+from marsyard.sim.parameters import Fraction, Parameters, bounded_field
 
 #: Longest step of a command: metres of path, and radians of turn.
 STEP_M, STEP_RAD = 0.2, np.radians(5.0)
@@ -44,14 +44,16 @@ class SlipParameters(Parameters):
 
     flat: Annotated[Fraction, Field(description="fraction of the path lost on level ground")] = 0.01
     full_slope_deg: Annotated[float, Field(gt=0.0, lt=90.0, description="slope of 100 % slip, deg")] = 20.0
-    exponent: Annotated[float, bounded(1.0, 100.0, "exponent of the slope in the curve")] = 2.4
+    exponent: Annotated[float, bounded_field(1.0, 100.0, "exponent of the slope in the curve")] = 2.4
     downhill: Annotated[Fraction, Field(description="path gained downhill over path lost uphill")] = 0.3
     across: Annotated[Fraction, Field(description="sideways sliding on a cross slope over path lost uphill")] = 0.5
     turn: Annotated[Fraction, Field(description="fraction of a turn lost to scrubbing wheels on level ground")] = 0.03
     turn_slope: Annotated[Fraction, Field(description="turn lost on a slope over path lost uphill")] = 0.5
     soil_spread: Annotated[Spread, Field(description="RMS of the logarithm of the soil factor, common to a run")] = 0.15
     step_spread: Annotated[Spread, Field(description="RMS of the logarithm of each command's own factor")] = 0.15
-    wander_deg_m: Annotated[float, bounded(0.0, 10.0, "RMS random turn on 1 m, growing as the root of the path")] = 0.3
+    wander_deg_m: Annotated[
+        float, bounded_field(0.0, 10.0, "RMS random turn on 1 m, growing as the root of the path")
+    ] = 0.3
 
     def slip_fraction(self, slope_rad: float) -> float:
         """The curve s at a slope, without soil and command factors."""

@@ -21,7 +21,7 @@ from pydantic import Field, model_validator
 from scipy.interpolate import BPoly
 
 from marsyard.sim.dynamics.trajectory import Motion, Trajectory, attitudes_and_body_rates, check_times
-from marsyard.sim.parameters import Fraction, Parameters, Positive, bounded
+from marsyard.sim.parameters import Fraction, Parameters, Positive, bounded_field
 
 Vector = Float64[np.ndarray, "3"]
 Angle = Annotated[float, Field(ge=0.0, le=45.0)]
@@ -37,22 +37,22 @@ class HelicopterParameters(Parameters):
     1 to 2 m/s, about 30 min of pictures, and about 40 min between the passes over the targets.
     """
 
-    passes: Annotated[int, bounded(1, 100, "passes along the line")] = 10
+    passes: Annotated[int, bounded_field(1, 100, "passes along the line")] = 10
     pass_s: Annotated[Positive, Field(le=1000.0, description="duration of a pass (assumed)")] = 100.0
     turn_s: Annotated[Positive, Field(le=1000.0, description="duration of a turn (assumed)")] = 60.0
     speed_m_s: Annotated[Positive, Field(le=100.0, description="mean speed along a pass")] = 30.0
-    speed_change_m_s: Annotated[float, bounded(0.0, 10.0, "RMS change of speed within a pass (assumed)")] = 1.0
+    speed_change_m_s: Annotated[float, bounded_field(0.0, 10.0, "RMS change of speed within a pass (assumed)")] = 1.0
     lowest_m: Annotated[Positive, Field(description="initial height of the first pass above the line's ground")] = (
         1000.0
     )
-    climb_m_s: Annotated[float, bounded(0.0, 10.0, "climb on a pass")] = 1.0
-    wander_m: Annotated[float, bounded(0.0, 200.0, "RMS distance from the line (assumed)")] = 8.0
+    climb_m_s: Annotated[float, bounded_field(0.0, 10.0, "climb on a pass")] = 1.0
+    wander_m: Annotated[float, bounded_field(0.0, 200.0, "RMS distance from the line (assumed)")] = 8.0
     pointing_deg: Annotated[Angle, Field(description="RMS tilt along and across (assumed)")] = 9.0
     max_tilt_deg: Annotated[Angle, Field(description="maximum tilt of the camera along and across")] = 30.0
     swinging_fraction: Annotated[Fraction, Field(description="of passes, with a swinging camera (assumed)")] = 0.5
-    swing_rate_deg_s: Annotated[float, bounded(0.0, 120.0, "maximum rate of the swinging")] = 60.0
+    swing_rate_deg_s: Annotated[float, bounded_field(0.0, 120.0, "maximum rate of the swinging")] = 60.0
     swing_hz: Annotated[Positive, Field(le=5.0, description="frequency of the swinging, 1/s (assumed)")] = 0.6
-    platform_deg: Annotated[float, bounded(0.0, 10.0, "RMS residual motion of the platform (assumed)")] = 0.2
+    platform_deg: Annotated[float, bounded_field(0.0, 10.0, "RMS residual motion of the platform (assumed)")] = 0.2
     turns_with_flight: Annotated[bool, Field(description="the platform rotates with the helicopter (assumed)")] = False
     fly_over_m: Annotated[Positive, Field(description="height of the passes over the targets (assumed)")] = 500.0
     fly_over_m_s: Annotated[Positive, Field(description="speed of the passes over the targets (assumed)")] = 3.0

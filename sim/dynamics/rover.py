@@ -28,7 +28,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.dynamics.kernels import suspension
 from marsyard.sim.frames import rigid, turn_matrix
-from marsyard.sim.parameters import Parameters, bounded
+from marsyard.sim.parameters import Parameters, bounded_field
 
 Metres = Annotated[float, Field(gt=0.0, le=5.0)]
 Six = Float64[np.ndarray, "6"]
@@ -132,9 +132,9 @@ class RoverParameters(Parameters):
     rear_m: Annotated[Metres, Field(description="distance of the rear wheels behind the middle wheels")] = 0.705
     half_track_m: Annotated[Metres, Field(description="|y| of the front and rear wheels")] = 0.53
     middle_half_track_m: Annotated[Metres, Field(description="|y| of the middle wheels")] = 0.61
-    rocker_pivot_x_m: Annotated[float, bounded(-2.0, 2.0, "x of the axis of rockers against the body")] = 0.08
+    rocker_pivot_x_m: Annotated[float, bounded_field(-2.0, 2.0, "x of the axis of rockers against the body")] = 0.08
     rocker_pivot_z_m: Annotated[Metres, Field(description="its height")] = 0.40
-    bogie_pivot_x_m: Annotated[float, bounded(-2.0, 2.0, "x of the axes of bogies against rockers")] = -0.35
+    bogie_pivot_x_m: Annotated[float, bounded_field(-2.0, 2.0, "x of the axes of bogies against rockers")] = -0.35
     bogie_pivot_z_m: Annotated[Metres, Field(description="their height")] = 0.28
     body_length_m: Annotated[Metres, Field(description="length of the body's deck")] = 1.6
     body_width_m: Annotated[Metres, Field(description="width of the deck with its panels")] = 2.3
@@ -308,10 +308,10 @@ class _StanceEquations:
         def gaps_of(x: Six) -> Six:
             return self._lowest_points(x)[0]
 
-        def jacobian_of(x: Six) -> Float64[np.ndarray, "6 6"]:
+        def jacobian(x: Six) -> Float64[np.ndarray, "6 6"]:
             return self._jacobian(x, self._lowest_points(x)[1])
 
-        solution = least_squares(gaps_of, start, jac=jacobian_of, method="lm", xtol=1e-8, ftol=1e-12)
+        solution = least_squares(gaps_of, start, jac=jacobian, method="lm", xtol=1e-8, ftol=1e-12)
         return solution.x, solution.fun
 
     def _jacobian(self, unknowns: Six, points: WheelPoints) -> Float64[np.ndarray, "6 6"]:
@@ -332,7 +332,6 @@ class _StanceEquations:
 
     @cached_property
     def _tread(self) -> Float64[np.ndarray, "points 3"]:
-        """Sample points of a wheel's tread, from its centre."""
         angle, line = np.meshgrid(_TREAD_RAD, _TREAD_LINES)
         radius, width = self.rover.wheel_radius_m, self.rover.wheel_width_m
         return np.stack([radius * np.sin(angle), width * line, -radius * np.cos(angle)], axis=-1).reshape(-1, 3)

@@ -52,9 +52,8 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics.kernels import swing as kernels
 from marsyard.sim.dynamics.kernels.swing import CANOPY, Chain
-from marsyard.sim.dynamics.trajectory import Motion, Trajectory, check_times
-from marsyard.sim.dynamics.wind import Wind, WindParameters
-from marsyard.sim.parameters import bounded
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory, Wind, WindParameters, check_times
+from marsyard.sim.parameters import bounded_field
 
 Vector = Float64[np.ndarray, "3"]
 StateVector = Float64[np.ndarray, "22"]
@@ -82,29 +81,39 @@ class SwingParameters(WindParameters):
 
     altitude_first_m: Annotated[float, Field(gt=100.0, le=10000.0, description="of the first picture")] = 2000.0
     interval_s: Annotated[float, Field(gt=0.1, le=60.0, description="time between pictures")] = 3.75
-    descent_rate_m_s: Annotated[float, bounded(20.0, 200.0, "descent rate of the canopy at the first picture")] = 75.0
-    density_scale_height_m: Annotated[float, bounded(5000.0, 20000.0, "of the atmosphere; CO2 at 220 K")] = 11200.0
-    cone_angle_deg: Annotated[float, bounded(0.0, 45.0, "largest angle of the coning lander from nadir")] = 15.0
-    cone_minor_fraction: Annotated[float, bounded(-1.0, 1.0, "minor over major half-axis; sign: sense")] = 0.5
+    descent_rate_m_s: Annotated[
+        float, bounded_field(20.0, 200.0, "descent rate of the canopy at the first picture")
+    ] = 75.0
+    density_scale_height_m: Annotated[float, bounded_field(5000.0, 20000.0, "of the atmosphere; CO2 at 220 K")] = (
+        11200.0
+    )
+    cone_angle_deg: Annotated[float, bounded_field(0.0, 45.0, "largest angle of the coning lander from nadir")] = 15.0
+    cone_minor_fraction: Annotated[float, bounded_field(-1.0, 1.0, "minor over major half-axis; sign: sense")] = 0.5
     cone_direction_deg: Annotated[Phase, Field(description="azimuth of the cone's major axis")] = 0.0
     cone_phase_deg: Annotated[Phase, Field(description="phase of the coning at the first picture")] = 0.0
-    cone_damping_ratio: Annotated[float, bounded(-0.05, 0.2, "damping of small coning over critical (assumed)")] = 0.01
-    nod_rate_deg_s: Annotated[float, bounded(0.0, 120.0, "largest rate of the nodding")] = 20.0
+    cone_damping_ratio: Annotated[
+        float, bounded_field(-0.05, 0.2, "damping of small coning over critical (assumed)")
+    ] = 0.01
+    nod_rate_deg_s: Annotated[float, bounded_field(0.0, 120.0, "largest rate of the nodding")] = 20.0
     nod_direction_deg: Annotated[Phase, Field(description="azimuth of the nodding, relative to the cone's axis")] = 0.0
     nod_phase_deg: Annotated[Phase, Field(description="phase of the nodding at the first picture")] = 0.0
-    nod_damping_ratio: Annotated[float, bounded(0.0, 0.5, "damping of small nodding by the bridle (assumed)")] = 0.002
+    nod_damping_ratio: Annotated[float, bounded_field(0.0, 0.5, "damping of small nodding by the bridle (assumed)")] = (
+        0.002
+    )
     heading_deg: Annotated[Phase, Field(description="rotation about the lander's axis at the first picture")] = 0.0
-    spin_rate_deg_s: Annotated[float, bounded(-30.0, 30.0, "rate of this rotation at that time")] = 0.0
-    line_length_m: Annotated[float, bounded(10.0, 200.0, "canopy to hinge; bridle 20 m, rest assumed")] = 47.0
-    bridle_length_m: Annotated[float, bounded(1.0, 100.0, "from the backshell to the hinge")] = 20.0
-    canopy_mass_kg: Annotated[float, bounded(1.0, 1000.0, "with lines and entrained air (assumed)")] = 30.0
-    backshell_mass_kg: Annotated[float, bounded(0.0, 5000.0, "backshell without canopy")] = 179.0
-    lander_mass_kg: Annotated[float, bounded(1.0, 5000.0, "lander with rover")] = 533.0
-    mass_centre_m: Annotated[float, bounded(0.1, 10.0, "hinge to the lander's centre of mass (assumed)")] = 1.5
+    spin_rate_deg_s: Annotated[float, bounded_field(-30.0, 30.0, "rate of this rotation at that time")] = 0.0
+    line_length_m: Annotated[float, bounded_field(10.0, 200.0, "canopy to hinge; bridle 20 m, rest assumed")] = 47.0
+    bridle_length_m: Annotated[float, bounded_field(1.0, 100.0, "from the backshell to the hinge")] = 20.0
+    canopy_mass_kg: Annotated[float, bounded_field(1.0, 1000.0, "with lines and entrained air (assumed)")] = 30.0
+    backshell_mass_kg: Annotated[float, bounded_field(0.0, 5000.0, "backshell without canopy")] = 179.0
+    lander_mass_kg: Annotated[float, bounded_field(1.0, 5000.0, "lander with rover")] = 533.0
+    mass_centre_m: Annotated[float, bounded_field(0.1, 10.0, "hinge to the lander's centre of mass (assumed)")] = 1.5
     gyration_transverse_m: Annotated[Gyration, Field(description="radius across the lander's axis (assumed)")] = 0.5
     gyration_axial_m: Annotated[Gyration, Field(description="radius about the lander's axis (assumed)")] = 0.5
-    arm_length_m: Annotated[float, bounded(0.0, 10.0, "from the hinge to the camera (assumed)")] = 1.5
-    thruster_firing_m: Annotated[float, bounded(0.0, 1000.0, "height above ground of the thrusters' firing")] = 100.0
+    arm_length_m: Annotated[float, bounded_field(0.0, 10.0, "from the hinge to the camera (assumed)")] = 1.5
+    thruster_firing_m: Annotated[float, bounded_field(0.0, 1000.0, "height above ground of the thrusters' firing")] = (
+        100.0
+    )
 
     @model_validator(mode="after")
     def _bridle_is_part_of_line(self) -> SwingParameters:
@@ -185,7 +194,7 @@ class Modes:
         )
 
 
-def chain_of(p: SwingParameters, modes: Modes, gravity_m_s2: float, canopy_height_m: float) -> Chain:
+def build_chain(p: SwingParameters, modes: Modes, gravity_m_s2: float, canopy_height_m: float) -> Chain:
     """Constants of the equations of motion; `canopy_height_m` is the canopy's world z at the first picture."""
     first, second = p._moments(p.line_length_m)
     largest_rad = np.radians(p.cone_angle_deg) / modes.lander_tilt_ratio
@@ -323,7 +332,7 @@ class SwingDescent(Trajectory):
         if p.nod_rate_deg_s >= loop_deg_s:
             raise ValueError(f"nod_rate_deg_s is {p.nod_rate_deg_s:.6g}; allowed: below {loop_deg_s:.6g}, a full loop")
         state = _initial_state(p, modes, wind, start_m)
-        chain = chain_of(p, modes, gravity_m_s2, float(state[CANOPY + 2]))
+        chain = build_chain(p, modes, gravity_m_s2, float(state[CANOPY + 2]))
 
         def height_left(_t: float, y: StateVector, *_constants: Float64[np.ndarray, "..."]) -> float:
             return _camera_height(y, chain) - lowest + BEYOND_FIRING_M

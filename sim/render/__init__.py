@@ -1,11 +1,9 @@
 """Pictures of the terrain through exact camera models, and their truth pixel by pixel."""
 
-from marsyard.sim.render.clouds import CloudLayer, CloudParameters
-from marsyard.sim.render.objects import Objects
-from marsyard.sim.render.photometry import DustySky, Photometry, Sun, Texture
+from marsyard.sim.render.objects import Objects, may_cast_shadow, rover_objects, rover_sphere
+from marsyard.sim.render.photometry import CloudLayer, CloudParameters, DustySky, Photometry, Sun, Texture
 from marsyard.sim.render.rays import PixelRays
 from marsyard.sim.render.renderer import Frame, Renderer, process_renderer
-from marsyard.sim.render.rover import may_cast_shadow, rover_objects, rover_sphere
 from marsyard.sim.render.scene import Scene
 
 __all__ = [

@@ -124,7 +124,6 @@ class DepthRenderer:
             ) from error
 
     def _prepare_context(self) -> None:
-        """Create the program and the buffers in the current context."""
         from OpenGL import GL
 
         self._gl = GL

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
+from scipy.spatial.transform import RigidTransform
 
+from marsyard.sim.dynamics.rover import RoverParameters, Stance, bogie_pivots, wheel_centres
+from marsyard.sim.measurements import MastGeometry
 from marsyard.sim.render.kernels.hierarchy import Hierarchy, body_spheres, morton_codes, node_boxes, select_facing
 
 #: Triangle numbers are drawn as colours of 24 bits, of which 0 is the ground.
@@ -58,7 +61,7 @@ class Objects:
         )
 
     @classmethod
-    def joined(cls, parts: Sequence[Objects]) -> Objects:
+    def join(cls, parts: Sequence[Objects]) -> Objects:
         """Join the bodies of several sets."""
         names = ("triangles", "normals", "albedo", "names", "spheres")
         arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
@@ -139,3 +142,136 @@ def spheres_in_cone(
     off_axis = np.arccos(np.clip(away @ axis / distance, -1.0, 1.0))
     widening = np.where(distance <= radius, np.pi, np.arcsin(np.clip(radius / distance, 0.0, 1.0)))
     return np.asarray(off_axis <= half_angle_rad + widening)
+
+
+#: Albedo of everything: bright metal and glass under dust. Assumed.
+ALBEDO = 0.25
+#: Number of the rover's body; rocks have numbers from 0.
+ROVER_NAME = -1
+#: Sizes that matter to shadows only, assumed: widths of legs and mast, thickness of the deck, m, and the body's
+#: fraction of the deck's length and width.
+_LEG_M, _MAST_RADIUS_M, _DECK_M, _BODY_FRACTION = 0.05, 0.05, 0.04, (0.65, 0.4)
+#: The head: depth, height, how much wider than the cameras' baseline, and how far behind their centres it ends, m.
+_HEAD_M, _BEHIND_M = (0.12, 0.12, 0.12), 0.04
+_SIDES = 24
+
+Triangles = Float64[np.ndarray, "triangles 3 3"]
+
+
+def rover_objects(
+    rover: RoverParameters,
+    stance: Stance,
+    mast: MastGeometry,
+    azimuth_rad: float,
+    elevation_rad: float,
+    baseline_m: float = 0.3,
+) -> Objects:
+    """Build the rover as one body in its stance, its mast at its true angles.
+
+    Join it with a scene's rocks: ``Objects.joined([scene.objects, rover_objects(...)])``. `baseline_m` is the distance
+    of the widest pair of cameras: the head is a little wider.
+    """
+    length, width = _BODY_FRACTION[0] * rover.body_length_m, _BODY_FRACTION[1] * rover.body_width_m
+    x, y, z = mast.base_m
+    parts = [
+        # body, deck, and mast up to the elbow
+        _box((length, width, rover.deck_m - rover.clearance_m), (0.0, 0.0, 0.5 * (rover.deck_m + rover.clearance_m))),
+        _box((rover.body_length_m, rover.body_width_m, _DECK_M), (0.0, 0.0, rover.deck_m)),
+        _rod((x, y, rover.deck_m), (x, y, z + mast.elbow_m[2]), _MAST_RADIUS_M),
+    ]
+    centres = wheel_centres(rover, stance.differential_rad, stance.bogies_rad)
+    for side, bogie in enumerate(bogie_pivots(rover, stance.differential_rad)):
+        front, middle, rear = centres[3 * side : 3 * side + 3]
+        rocker = np.array([rover.rocker_pivot_x_m, bogie[1], rover.rocker_pivot_z_m])
+        legs = ((rocker, front), (rocker, bogie), (bogie, middle), (bogie, rear))
+        parts += [_rod(start, end, 0.5 * _LEG_M) for start, end in legs]
+    half = np.array([0.0, 0.5 * rover.wheel_width_m, 0.0])
+    parts += [_rod(centre - half, centre + half, rover.wheel_radius_m) for centre in centres]
+    # the bar that carries the cameras, behind their centres, which lie on the y axis of the head's frame
+    depth, height, wider = _HEAD_M
+    rover_from_head = mast.rover_from_head(azimuth_rad, elevation_rad)
+    middle_of_head = (-_BEHIND_M - 0.5 * depth, 0.0, 0.0)
+    parts.append(_transform(_box((depth, baseline_m + wider, height), middle_of_head), rover_from_head))
+    # the elevation axis, from the elbow to the head's middle
+    elbow, end = rover_from_head.apply(np.array([-mast.head_m, middle_of_head]))
+    parts.append(_rod(elbow, end, _MAST_RADIUS_M))
+    triangles = _transform(np.concatenate(parts), stance.world_from_rover)
+    across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals = across / np.linalg.norm(across, axis=1, keepdims=True)
+    faces = np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3)
+    names = np.full(len(triangles), ROVER_NAME, dtype=np.int32)
+    return Objects.of_mesh(triangles.reshape(-1, 3), np.repeat(normals, 3, axis=0), faces, names, ALBEDO)
+
+
+def rover_sphere(
+    rover: RoverParameters, stance: Stance, mast: MastGeometry, baseline_m: float = 0.3
+) -> Float64[np.ndarray, "1 4"]:
+    """Centre and radius of a sphere that contains `rover_objects` for all angles of suspension and mast.
+
+    Joints rotate about axes, so no part is farther away than the sum of the links that carry it.
+    """
+    front, middle, rear = wheel_centres(rover, 0.0, (0.0, 0.0))[:3]
+    bogie = bogie_pivots(rover, 0.0)[0]
+    rocker = np.array([rover.rocker_pivot_x_m, bogie[1], rover.rocker_pivot_z_m])
+    wheel = rover.wheel_radius_m + 0.5 * rover.wheel_width_m + _LEG_M
+    behind = _length(bogie - rocker) + max(_length(middle - bogie), _length(rear - bogie))
+    legs = _length(rocker) + max(_length(front - rocker), behind) + wheel
+    depth, height, wider = _HEAD_M
+    head = _length(_BEHIND_M + depth, 0.5 * (baseline_m + wider), 0.5 * height)
+    top = _length(mast.base_m) + _length(mast.elbow_m) + _length(mast.head_m) + head + _MAST_RADIUS_M
+    body = _length(0.5 * rover.body_length_m, 0.5 * rover.body_width_m, rover.deck_m + _DECK_M)
+    return np.array([[*stance.world_from_rover.translation, max(legs, top, body)]])
+
+
+def may_cast_shadow(
+    spheres: Float64[np.ndarray, "bodies 4"],
+    sun_direction: Float64[np.ndarray, "3"],
+    position_m: Float64[np.ndarray, "3"],
+    radius_m: float,
+) -> bool:
+    """Whether bodies in spheres may hide the sun from a point within a radius of a position; False is exact."""
+    away = spheres[:, :3] - position_m
+    along = away @ sun_direction
+    distance = spheres[:, 3] + radius_m
+    across = np.linalg.norm(away - along[:, None] * sun_direction, axis=1)
+    return bool(np.any((across <= distance) & (along >= -distance)))
+
+
+def _length(*parts: float | Float64[np.ndarray, "3"]) -> float:
+    return float(np.linalg.norm(np.hstack(parts)))
+
+
+def _box(size_m: tuple[float, float, float], middle_m: tuple[float, float, float]) -> Triangles:
+    return np.asarray(_unit_box() * np.array(size_m) + np.array(middle_m))
+
+
+@cache
+def _unit_box() -> Triangles:
+    import trimesh  # here and below, as it is slow to import
+
+    return np.asarray(trimesh.creation.box().triangles, dtype=np.float64)
+
+
+@cache
+def _unit_rod() -> Triangles:
+    import trimesh
+
+    rod = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=_SIDES)
+    return np.asarray(rod.triangles + np.array([0.0, 0.0, 0.5]), dtype=np.float64)
+
+
+def _rod(
+    start: Float64[np.ndarray, "3"] | tuple[float, float, float],
+    end: Float64[np.ndarray, "3"] | tuple[float, float, float],
+    radius_m: float,
+) -> Triangles:
+    along = np.subtract(end, start)
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(along)))], along)
+    x /= np.linalg.norm(x)
+    y = np.cross(along / float(np.linalg.norm(along)), x)
+    axes = np.stack([radius_m * x, radius_m * y, along], axis=1)
+    return np.asarray(np.asarray(start) + _unit_rod() @ axes.T)
+
+
+def _transform(triangles: Triangles, new_from_old: RigidTransform) -> Triangles:
+    return np.asarray(new_from_old.apply(triangles.reshape(-1, 3))).reshape(-1, 3, 3)

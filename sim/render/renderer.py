@@ -170,7 +170,6 @@ class Renderer:
         return self._views[side_px]
 
     def _draw_views(self, scene: Scene, rays: PixelRays, pose: Pose, clearance_m: float) -> Views:
-        """Depth and triangle numbers of the camera's pinhole views."""
         if self._last is not scene:
             self._last = scene
             self._scenes += 1
@@ -212,7 +211,6 @@ class Renderer:
 
 
 def _empty_hits(count: int, scene: Scene) -> Hits:
-    """Output arrays for the hits of so many rays."""
     weighted = count if len(scene.objects) > 0 else 0
     return Hits(
         np.empty(count), np.empty(count, np.int32), np.empty((weighted, 2), np.float32), np.empty(count, np.int8)
@@ -224,7 +222,6 @@ def _part(arrays: Iterable[NDArray[Any]], part: slice) -> list[NDArray[Any]]:
 
 
 def _shade(scene: Scene, ground: Ground, pose: Pose, rays: Rays, hits: Hits, light: Light) -> Picture:
-    """Compute radiance factor, body number and normal at hits."""
     count = len(rays.directions)
     picture = Picture(np.empty(count, np.float32), np.empty(count, np.int32), np.empty((count, 3), np.float32))
     occluders, materials = scene.occluders, scene.materials

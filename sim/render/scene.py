@@ -11,14 +11,13 @@ from jaxtyping import Bool, Float, Float64
 from scipy.ndimage import binary_dilation
 from scipy.optimize import brentq
 
-from marsyard.sim.render.clouds import CloudLayer, no_cover
 from marsyard.sim.render.kernels.casters import Casters, list_casters
 from marsyard.sim.render.kernels.ground import height_range, max_rises
 from marsyard.sim.render.kernels.shading import Occluders
 from marsyard.sim.render.kernels.structs import Bounds, Extent, Footprint, GroundShadow, Light, Materials, MicroRelief
 from marsyard.sim.render.kernels.sun import heights_in_rows, sweep_shadow
 from marsyard.sim.render.objects import Objects, spheres_in_cone
-from marsyard.sim.render.photometry import Photometry, Sun, Texture
+from marsyard.sim.render.photometry import CloudLayer, Photometry, Sun, Texture, no_cover
 from marsyard.sim.terrain import Surface
 
 #: Rounding of a mean of heights in single precision, metres, at a few km.

@@ -1,6 +1,5 @@
 """Instruments: measurements of the true state, with errors."""
 
-from marsyard.sim.sensor.custom_camera import CustomCamera, CustomCameraChoice, NamedOrCustomCamera
 from marsyard.sim.sensor.detector import AutoExposure, AutoExposureParameters, Detector, DetectorParameters, auto_expose
 from marsyard.sim.sensor.imu import Imu, ImuIncrements, ImuParameters, WarmUp
 from marsyard.sim.sensor.inertial import Approach, ApproachParameters, InertialSolution, NavigationErrors
@@ -15,10 +14,18 @@ from marsyard.sim.sensor.mast import (
     mount_on_head,
     stereo_mast,
 )
-from marsyard.sim.sensor.motion import ImageMotion
 from marsyard.sim.sensor.odometry import OdometryParameters
-from marsyard.sim.sensor.optics import natural_fall_off
-from marsyard.sim.sensor.presets import PRESETS, CameraDesign, DetectorChoice, preset, read_datasheet
+from marsyard.sim.sensor.optics import ImageMotion, natural_fall_off
+from marsyard.sim.sensor.presets import (
+    PRESETS,
+    CameraDesign,
+    CustomCamera,
+    CustomCameraChoice,
+    DetectorChoice,
+    NamedOrCustomCamera,
+    preset,
+    read_datasheet,
+)
 from marsyard.sim.sensor.ranging import LaserParameters, RadarAltimeter, RadarParameters, height_above_ground
 from marsyard.sim.sensor.satellite_navigation import Gps, GpsParameters
 

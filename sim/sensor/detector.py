@@ -19,8 +19,14 @@ from scipy.optimize import brentq
 
 from marsyard.sim.measurements import DetectorCalibration
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive
-from marsyard.sim.sensor.motion import ImageMotion, moving_exposure
-from marsyard.sim.sensor.optics import OpticsParameters, Picture, apply_point_spread, dust_transmission
+from marsyard.sim.sensor.optics import (
+    ImageMotion,
+    OpticsParameters,
+    Picture,
+    apply_point_spread,
+    dust_transmission,
+    moving_exposure,
+)
 
 CODES = 256
 _RelativeError = Annotated[float, Field(ge=0.0, le=0.1)]
@@ -131,7 +137,7 @@ class Detector:
     listed: Bool[np.ndarray, "delivered_rows columns"] | None = None
 
     @classmethod
-    def drawn(cls, fall_off: Picture, parameters: DetectorParameters, rng: np.random.Generator) -> Detector:
+    def draw(cls, fall_off: Picture, parameters: DetectorParameters, rng: np.random.Generator) -> Detector:
         """Draw pixel responses, defects and dust of a detector behind a lens with this fall-off."""
         p, rows = parameters, len(fall_off)
         if rows % p.rows_summed:

@@ -155,7 +155,7 @@ class Imu:
     clock: Clock
 
     @classmethod
-    def drawn(cls, parameters: ImuParameters, span_s: tuple[float, float], rng: np.random.Generator) -> Imu:
+    def draw(cls, parameters: ImuParameters, span_s: tuple[float, float], rng: np.random.Generator) -> Imu:
         """Draw the errors for use within a time span."""
         p = parameters
 
@@ -165,7 +165,7 @@ class Imu:
             return Triad(
                 bias=bias * rng.standard_normal(3),
                 bias_per_k=per_k * rng.standard_normal(3),
-                wander=GaussMarkov.drawn(np.full(3, wander), wander_s, span_s, rng),
+                wander=GaussMarkov.draw(np.full(3, wander), wander_s, span_s, rng),
                 warm_up=p.warm_up,
                 scale=1e-6 * getattr(p, f"{sensor}_scale_ppm") * rng.standard_normal(3),
                 misalignment=1e-3
@@ -181,7 +181,7 @@ class Imu:
         walk = 1e-3 * p.velocity_random_walk_ug_sqrt_hz * MILLI_G
         biases = tuple(force * MILLI_G for force in forces)
         accelerometer = triad("accelerometer", biases, p.accelerometer_wander_s, walk, p.accelerometer_count_m_s)
-        return cls(parameters, gyro, accelerometer, Clock.drawn(p.clock, rng))
+        return cls(parameters, gyro, accelerometer, Clock.draw(p.clock, rng))
 
     def boundaries(self, start_s: float, end_s: float) -> Boundaries:
         """Compute the true times of the sample boundaries from start to the last one not after the end."""

@@ -40,7 +40,7 @@ class Sampling:
     phase_s: float
 
     @classmethod
-    def drawn(cls, rate_hz: float, rng: Generator) -> Sampling:
+    def draw(cls, rate_hz: float, rng: Generator) -> Sampling:
         """Draw a uniformly distributed phase."""
         return cls(rate_hz, float(rng.random()) / rate_hz)
 
@@ -71,7 +71,7 @@ class Clock:
     offset_s: float
 
     @classmethod
-    def drawn(cls, parameters: ClockParameters, rng: Generator) -> Clock:
+    def draw(cls, parameters: ClockParameters, rng: Generator) -> Clock:
         """Draw the constant offset."""
         return cls(parameters, parameters.offset_s + parameters.offset_sd_s * float(rng.standard_normal()))
 
@@ -89,7 +89,7 @@ class GaussMarkov:
     values: Float64[np.ndarray, "knots channels"]
 
     @classmethod
-    def drawn(
+    def draw(
         cls, sd: Float64[np.ndarray, "channels"], correlation_s: float, span_s: tuple[float, float], rng: Generator
     ) -> GaussMarkov:
         """Draw a realisation by standard deviations and correlation time. Raises ValueError for an invalid span."""

@@ -101,7 +101,7 @@ class Mast:
     zeros_rad: Angles
 
     @classmethod
-    def drawn(cls, parameters: PointingParameters, geometry: MastGeometry, rng: np.random.Generator) -> Mast:
+    def draw(cls, parameters: PointingParameters, geometry: MastGeometry, rng: np.random.Generator) -> Mast:
         """Draw the errors of a run."""
         return cls(parameters, geometry, np.radians(parameters.zero_deg) * rng.standard_normal(2))
 
@@ -139,7 +139,7 @@ class StereoHead:
     calibrated: MastCalibration
 
     @classmethod
-    def drawn(cls, design: MastCalibration, p: StereoCalibrationParameters, rng: np.random.Generator) -> StereoHead:
+    def draw(cls, design: MastCalibration, p: StereoCalibrationParameters, rng: np.random.Generator) -> StereoHead:
         """Draw the calibration errors of a pair."""
         disparity = p.disparity_error_px * rng.uniform(-1.0, 1.0)
         across = p.epipolar_error_px * rng.standard_normal()
@@ -154,7 +154,7 @@ class StereoHead:
             rotation = Rotation.from_rotvec(turn)
             # about the camera's own centre
             pose = rigid(rotation, camera.c - rotation.apply(camera.c.copy()))
-            cameras.append(camera.magnified(float(scale)).moved(pose).moved(rigid(common, np.zeros(3))))
+            cameras.append(camera.magnify(float(scale)).transform(pose).transform(rigid(common, np.zeros(3))))
         return cls(design, replace(design, left=cameras[0], right=cameras[1]))
 
     def disparity_error_px(self, range_m: float) -> float:
@@ -178,7 +178,7 @@ def mount_on_head(
 
     def mount(camera: CameraModel, side: float) -> CameraModel:
         turn = Rotation.from_rotvec([0.0, 0.0, -side * np.radians(toe_in_deg)])
-        return camera.moved(rigid(turn * _HEAD_FROM_DOWN, np.array([0.0, 0.5 * side * baseline_m, 0.0])))
+        return camera.transform(rigid(turn * _HEAD_FROM_DOWN, np.array([0.0, 0.5 * side * baseline_m, 0.0])))
 
     return mount(left, 1.0), mount(right, -1.0)
 

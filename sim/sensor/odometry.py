@@ -109,7 +109,7 @@ class Odometer:
     misalignment: Rotation
 
     @classmethod
-    def drawn(cls, parameters: OdometryParameters, start: RigidTransform, rng: np.random.Generator) -> Odometer:
+    def draw(cls, parameters: OdometryParameters, start: RigidTransform, rng: np.random.Generator) -> Odometer:
         """Draw the constant errors; the estimate is exact at `start`."""
         p = parameters
         wheel, visual, heading, drift, *tilt = rng.standard_normal(6)

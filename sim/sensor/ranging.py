@@ -90,10 +90,10 @@ class RangingUnit:
     scale: float
 
     @classmethod
-    def drawn(cls, parameters: RangingParameters, rng: Generator) -> RangingUnit:
+    def draw(cls, parameters: RangingParameters, rng: Generator) -> RangingUnit:
         """Draw the constant errors."""
         p = parameters
-        sampling, clock = Sampling.drawn(p.rate_hz, rng), Clock.drawn(p.clock, rng)
+        sampling, clock = Sampling.draw(p.rate_hz, rng), Clock.draw(p.clock, rng)
         return cls(p, sampling, clock, 1.0 + p.scale_error * float(rng.standard_normal()))
 
     def readings(self, times_s: Times, ranges_m: Float64[np.ndarray, "n"], rng: Generator) -> Readings:
@@ -135,9 +135,9 @@ class RadarAltimeter:
     unit: RangingUnit
 
     @classmethod
-    def drawn(cls, parameters: RadarParameters, surface: Surface, rng: Generator) -> RadarAltimeter:
+    def draw(cls, parameters: RadarParameters, surface: Surface, rng: Generator) -> RadarAltimeter:
         """Draw the constant errors."""
-        return cls(parameters, surface, RangingUnit.drawn(parameters, rng))
+        return cls(parameters, surface, RangingUnit.draw(parameters, rng))
 
     @property
     def sampling(self) -> Sampling:

@@ -54,12 +54,12 @@ class Gps:
     wander: GaussMarkov
 
     @classmethod
-    def drawn(cls, parameters: GpsParameters, span_s: tuple[float, float], rng: Generator) -> Gps:
+    def draw(cls, parameters: GpsParameters, span_s: tuple[float, float], rng: Generator) -> Gps:
         """Draw the errors for use within a time span."""
         p = parameters
         sd = np.array([p.horizontal_wander_m, p.horizontal_wander_m, p.vertical_wander_m])
-        sampling, clock = Sampling.drawn(p.rate_hz, rng), Clock.drawn(p.clock, rng)
-        return cls(p, sampling, clock, GaussMarkov.drawn(sd, p.correlation_s, span_s, rng))
+        sampling, clock = Sampling.draw(p.rate_hz, rng), Clock.draw(p.clock, rng)
+        return cls(p, sampling, clock, GaussMarkov.draw(sd, p.correlation_s, span_s, rng))
 
     def measure(self, trajectory: Trajectory, times_s: Times, rng: Generator) -> Readings:
         """Measure one position per true time, world axes; it is delivered `latency_s` after that time."""
@@ -156,19 +156,19 @@ class RtkReceiver:
     reported_factor: float
 
     @classmethod
-    def drawn(cls, parameters: RtkParameters, span_s: tuple[float, float], rng: Generator) -> RtkReceiver:
+    def draw(cls, parameters: RtkParameters, span_s: tuple[float, float], rng: Generator) -> RtkReceiver:
         """Draw the errors for use within a time span."""
         p = parameters
         floating = bool(rng.random() < p.float_fraction)
         fixed, unfixed, velocity = (
-            GaussMarkov.drawn(np.array(sd), time, span_s, rng)
+            GaussMarkov.draw(np.array(sd), time, span_s, rng)
             for sd, time in (
                 (p.fixed.wander_m, p.fixed.correlation_s),
                 (p.floating.wander_m, p.floating.correlation_s),
                 (p.velocity_wander_m_s, p.velocity_correlation_s),
             )
         )
-        sampling, clock = Sampling.drawn(p.rate_hz, rng), Clock.drawn(p.clock, rng)
+        sampling, clock = Sampling.draw(p.rate_hz, rng), Clock.draw(p.clock, rng)
         changes = _draw_changes(p, floating, span_s, rng)
         factor = float(np.exp(p.reported_spread * rng.standard_normal()))
         return cls(p, sampling, clock, fixed, unfixed, velocity, floating, changes, factor)

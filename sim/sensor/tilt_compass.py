@@ -78,14 +78,14 @@ class TiltCompass:
     iron_rad: Float64[np.ndarray, "4"]
 
     @classmethod
-    def drawn(cls, parameters: TiltCompassParameters, rng: np.random.Generator) -> TiltCompass:
+    def draw(cls, parameters: TiltCompassParameters, rng: np.random.Generator) -> TiltCompass:
         """Draw the constant errors."""
         p = parameters
         iron = np.array([p.hard_iron_deg, p.hard_iron_deg, p.soft_iron_deg, p.soft_iron_deg])
         return cls(
             p,
-            Sampling.drawn(p.rate_hz, rng),
-            Clock.drawn(p.clock, rng),
+            Sampling.draw(p.rate_hz, rng),
+            Clock.draw(p.clock, rng),
             tilt_bias_rad=np.radians(p.tilt_bias_deg) * rng.standard_normal(2),
             heading_bias_rad=np.radians(p.heading_bias_deg) * float(rng.standard_normal()),
             iron_rad=np.radians(iron) * rng.standard_normal(4),
@@ -139,7 +139,6 @@ def _normalize(vectors: Vectors) -> Vectors:
 
 
 def _add_offset(up: Vectors, offset: Float64[np.ndarray, "*any 2"]) -> Vectors:
-    """Add an offset to the x and y components of unit vectors and normalise them."""
     tilted = up.copy()
     tilted[:, :2] += offset
     return _normalize(tilted)

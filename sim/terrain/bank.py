@@ -135,12 +135,10 @@ class TerrainBank:
         return cache_directory("terrain") / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.npy"
 
     def _sides(self) -> list[int]:
-        """Samples along a side of each level."""
         levels = (self.parameters.samples // SMALLEST_LEVEL).bit_length()
         return [self.parameters.samples >> level for level in range(levels)]
 
     def _size(self) -> int:
-        """Values in a terrain's file: height and albedo on every level, and three factors of its cover."""
         return 2 * sum(side**2 for side in self._sides()) + 3 * self._cover_side() ** 2
 
     def _cover_side(self) -> int:

@@ -140,12 +140,12 @@ def fill_holes(values: Grid) -> tuple[Grid, int]:
     if holes == 0:
         return values, 0
     nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
-    whole = values[tuple(nearest)]
+    nearest_value = values[tuple(nearest)]
     for _ in range(200):
-        padded = np.pad(whole, 1, mode="edge")
+        padded = np.pad(nearest_value, 1, mode="edge")
         around = 0.25 * (padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:])
-        whole[missing] = around[missing]
-    return whole, holes
+        nearest_value[missing] = around[missing]
+    return nearest_value, holes
 
 
 MEMBRANE_SIDE = 128  #: Side of the grid on which the surround is deformed to meet the real terrain.
@@ -300,11 +300,11 @@ def blend_into_ground(ground: Ground, real: Embedded, detail: Detail | None) -> 
     """
     height = real.height if detail is None else real.height + detail[0]
     step = max(ground.side // MEMBRANE_SIDE, 1)
-    known = np.zeros((ground.side, ground.side), dtype=bool)
-    known[real.rows, real.columns] = real.weight > 0.0
+    covered = np.zeros((ground.side, ground.side), dtype=bool)
+    covered[real.rows, real.columns] = real.weight > 0.0
     difference = np.zeros((ground.side, ground.side), dtype=np.float32)
     difference[real.rows, real.columns] = real.height - ground.height[real.rows, real.columns]
-    membrane = _membrane(difference[::step, ::step].astype(np.float64), known[::step, ::step])
+    membrane = _membrane(difference[::step, ::step].astype(np.float64), covered[::step, ::step])
     np.add(ground.height, refine(membrane.astype(np.float32), ground.side), out=ground.height)
     area = ground.height[real.rows, real.columns]
     area += real.weight * (height - area)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, get_args
 
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
-from marsyard.sim.parameters import Fraction, Parameters, Positive, bounded, merge_settings
+from marsyard.sim.parameters import Fraction, Parameters, Positive, bounded_field, merge_settings
 from marsyard.sim.terrain.imported import RealTerrain
 from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
@@ -20,10 +20,12 @@ class TerrainParameters(Parameters):
     samples: Annotated[int, Field(ge=64, le=8192, description="samples along each side, a power of two")] = 4096
     spacing_m: Annotated[float, Field(gt=0.0, le=100.0, description="distance between samples, m")] = 1.5
     hurst: Annotated[float, Field(gt=0.0, lt=1.0, description="Hurst exponent of the fractal ground's heights")] = 0.8
-    rms_slope_deg: Annotated[float, bounded(0.0, 30.0, "RMS slope along a line over the slope baseline, deg")] = 2.0
+    rms_slope_deg: Annotated[float, bounded_field(0.0, 30.0, "RMS slope along a line over the slope baseline, deg")] = (
+        2.0
+    )
     slope_baseline_m: Annotated[Positive, Field(description="baseline of the RMS slope, m")] = 30.0
     outer_scale_m: Annotated[Positive, Field(description="wavelength above which relief stops growing, m")] = 3000.0
-    craters_per_km2: Annotated[float, bounded(0.0, 2.0e6, "craters above the smallest diameter per km2")] = 60.0
+    craters_per_km2: Annotated[float, bounded_field(0.0, 2.0e6, "craters above the smallest diameter per km2")] = 60.0
     crater_exponent: Annotated[Positive, Field(description="exponent of the cumulative size-frequency power law")] = 2.0
     crater_knee_m: Annotated[Positive, Field(description="diameter above which production, not saturation, limits")] = (
         1e4
@@ -60,7 +62,7 @@ class TerrainParameters(Parameters):
             raise ValueError(f"{samples} is not a power of two")
         return samples
 
-    def changed(self, changes: Mapping[str, Any]) -> TerrainParameters:
+    def with_changes(self, changes: Mapping[str, Any]) -> TerrainParameters:
         """Return these parameters with some changed, validated.
 
         Changes are nested as in a file: ``{"samples": 2048, "rocks": {"abundance": 0.1}}`` keeps all other values of

@@ -124,7 +124,7 @@ class Site(Parameters):
         terrain = (self.descent or self.ground) if scale is None else getattr(self, scale)
         if not isinstance(terrain, TerrainParameters):
             raise ValueError(f"site {self.name} has no terrain at the scale '{scale}'")
-        return terrain.changed(changes) if changes else terrain
+        return terrain.with_changes(changes) if changes else terrain
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ PAPER: dict[str, PaperFigures] = {
 def sites() -> dict[str, Site]:
     """Return all sites of ``sites.toml`` by name."""
     tables = tomllib.loads(Path(__file__).with_name("sites.toml").read_text("utf-8"))
-    found = {}
+    loaded = {}
     for name, entry in tables["sites"].items():
         entry["environment"] = _with_base(tables["environments"][entry["environment"]], tables["environments"])
         for scale in {"descent", "ground"} & set(entry):
@@ -163,8 +163,8 @@ def sites() -> dict[str, Site]:
             octaves = range(int(np.log2(coarsest_m / 0.001)) + 1)
             amplitudes = tuple(round(strongest * decay**n, 5) for n in octaves)
             entry[texture] = SiteTexture(coarsest_m=coarsest_m, amplitudes=amplitudes)
-        found[name] = Site(name=name, **entry)
-    return found
+        loaded[name] = Site(name=name, **entry)
+    return loaded
 
 
 def _with_base(entry: dict[str, Any], bases: dict[str, dict[str, Any]]) -> dict[str, Any]:

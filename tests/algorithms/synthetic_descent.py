@@ -1,7 +1,5 @@
-"""A descent over a flat, textured plane, rendered exactly: every physical pixel's ray is cast to the ground.
-
-Independent of what it tests: it goes from pixels to ground (DIMES goes the other way) and follows every physical row of
-the detector through clearing, exposure and transfer.
+"""A descent over a flat textured plane: the ray of each physical pixel is intersected with the ground. DIMES projects
+in the opposite direction. Each physical row is followed through clearing, exposure and transfer.
 """
 
 from __future__ import annotations
@@ -40,7 +38,7 @@ INTERVAL_S = 3.75
 
 @dataclass(frozen=True)
 class Texture:
-    """Brightness of the plane, a periodic bilinear surface; `values[i, j]` lies at north = -i step, east = j step."""
+    """Brightness of the plane, a periodic bilinear surface; `values[i, j]` is at north = -i step, east = j step."""
 
     values: np.ndarray
     step_m: float
@@ -55,10 +53,10 @@ class Texture:
 
 
 @cache
-def terrain(
+def draw_terrain(
     seed: int = 1, contrast: float = 0.15, slope: float = 1.2, size: int = 2048, step_m: float = 1.5
 ) -> Texture:
-    """Random texture of mean 1 and RMS `contrast`, amplitudes falling as frequency to the power `slope`."""
+    """Random texture with mean 1, RMS `contrast` and amplitudes proportional to frequency to the power -`slope`."""
     rng = np.random.default_rng(seed)
     frequency = np.hypot(*np.meshgrid(fft.fftfreq(size), fft.rfftfreq(size), indexing="ij"))
     frequency[0, 0] = np.inf
@@ -67,8 +65,8 @@ def terrain(
     return Texture((1.0 + contrast * values / values.std()).astype(np.float32), step_m)
 
 
-def waves(wavelength_m: float, contrast: float = 0.2, size: int = 2048, step_m: float = 1.5) -> Texture:
-    """Repetitive terrain: two crossed waves of about this length (a whole number of them per period)."""
+def make_waves(wavelength_m: float, contrast: float = 0.2, size: int = 2048, step_m: float = 1.5) -> Texture:
+    """Repetitive terrain: two crossed waves near this length (a whole number of waves per period)."""
     turns = 2.0 * np.pi * np.round(size * step_m / wavelength_m) * np.arange(size) / size
     values = 1.0 + contrast * (np.sin(turns)[:, None] + np.sin(turns)[None, :]) / 2.0
     return Texture(values.astype(np.float32), step_m)
@@ -103,32 +101,32 @@ def calibration(transfer_row_s: float = 5e-6, clear_row_s: float = 2e-6) -> Dete
     )
 
 
-def scene(texture: Texture, world_from_body: Rotation, position: np.ndarray) -> np.ndarray:
-    """Radiance of every physical pixel, shape (1024, 1024); the sky is black."""
+def trace_scene(texture: Texture, world_from_body: Rotation, position: np.ndarray) -> np.ndarray:
+    """Radiance of each physical pixel, shape (1024, 1024); the sky is black."""
     rays = np.tensordot(world_from_body.as_matrix().astype(np.float32), body_rays(), 1)
     down = rays[2] < -0.05
     slant = np.where(down, np.float32(-position[2]) / np.where(down, rays[2], np.float32(-1.0)), np.float32(0.0))
     return np.where(down, texture(slant * rays[0], slant * rays[1], position), np.float32(0.0))
 
 
-def delivered(
-    radiance: np.ndarray, known: DetectorCalibration, noise: np.random.Generator | None = None, level: float = 1600.0
+def expose_scene(
+    radiance: np.ndarray, detector: DetectorCalibration, noise: np.random.Generator | None = None, level: float = 1600.0
 ) -> np.ndarray:
-    """Counts of a still scene; `level` counts for radiance 1 on the axis. Noise is that of 11,000 electrons at 1600."""
+    """Counts of a static scene; radiance 1 on the axis gives `level` counts. Noise: 11,000 electrons at 1600 counts."""
     rate = radiance * fall_off()
-    before = np.cumsum(rate, axis=0) - rate  # in float64, as the fall-off is
+    before = np.cumsum(rate, axis=0) - rate  # float64, as the fall-off
     after = rate.sum(axis=0) - before - rate
-    charge = rate + (known.transfer_row_s * before + known.clear_row_s * after) / known.exposure_s
-    counts = level * charge.reshape(-1, known.rows_summed, charge.shape[1]).mean(axis=1)
+    charge = rate + (detector.transfer_row_s * before + detector.clear_row_s * after) / detector.exposure_s
+    counts = level * charge.reshape(-1, detector.rows_summed, charge.shape[1]).mean(axis=1)
     if noise is not None:
         electrons = noise.poisson(counts * 11000.0 / 1600.0) + 50.0 * noise.standard_normal(counts.shape)
         counts = electrons * 1600.0 / 11000.0
-    return np.asarray(np.clip(np.rint(counts + known.offset_dn), 0, known.full_scale_dn).astype(np.uint16))
+    return np.asarray(np.clip(np.rint(counts + detector.offset_dn), 0, detector.full_scale_dn).astype(np.uint16))
 
 
 @dataclass(frozen=True)
 class Flight:
-    """A triple: true positions (3, 3), attitudes, and the sun."""
+    """Three images: true positions (3, 3), attitudes and the sun."""
 
     positions: np.ndarray
     attitudes: tuple[Rotation, Rotation, Rotation]
@@ -140,14 +138,14 @@ class Flight:
         return np.diff(self.positions, axis=0) / INTERVAL_S
 
 
-def tilted(tilt_deg: float, azimuth_deg: float, roll_deg: float) -> Rotation:
-    """Body that leans by `tilt_deg` after a roll about its own vertical."""
+def tilt_body(tilt_deg: float, azimuth_deg: float, roll_deg: float) -> Rotation:
+    """Attitude of a body tilted by `tilt_deg` after a roll about its own vertical."""
     lean = Rotation.from_euler("ZYZ", [azimuth_deg, tilt_deg, -azimuth_deg], degrees=True)
     return lean * Rotation.from_euler("z", roll_deg, degrees=True)
 
 
-def flight(rng: np.random.Generator, max_tilt_deg: float = 25.0, max_wind: float = 30.0) -> Flight:
-    """Random rolls, leans that wander by a few degrees about a random one, any wind with a change of it."""
+def draw_flight(rng: np.random.Generator, max_tilt_deg: float = 25.0, max_wind: float = 30.0) -> Flight:
+    """Random rolls, tilts within a few degrees of a random tilt, and a random wind that changes."""
     wind = max_wind * np.sqrt(rng.uniform()) * np.array([*_unit(rng), 0.0])
     change = np.array([*rng.normal(0.0, 1.0, 2), 0.0])
     first = np.array([*rng.uniform(0.0, 3000.0, 2), rng.uniform(1900.0, 2100.0)])
@@ -157,14 +155,16 @@ def flight(rng: np.random.Generator, max_tilt_deg: float = 25.0, max_wind: float
     attitudes = []
     for _ in range(3):
         x, y = base + rng.uniform(-5.0, 5.0, 2)
-        attitudes.append(tilted(np.hypot(x, y), np.degrees(np.arctan2(y, x)), rng.uniform(0.0, 360.0)))
+        attitudes.append(tilt_body(np.hypot(x, y), np.degrees(np.arctan2(y, x)), rng.uniform(0.0, 360.0)))
     return Flight(first + INTERVAL_S * steps, (attitudes[0], attitudes[1], attitudes[2]))
 
 
 LEVEL_FLIGHT = (Rotation.identity(), Rotation.identity(), Rotation.identity())
 
 
-def flown(velocity: tuple[float, float], attitudes: tuple[Rotation, Rotation, Rotation] = LEVEL_FLIGHT) -> Flight:
+def fly_steadily(
+    velocity: tuple[float, float], attitudes: tuple[Rotation, Rotation, Rotation] = LEVEL_FLIGHT
+) -> Flight:
     """A descent at 75 m/s with a steady horizontal velocity (east, north)."""
     step = INTERVAL_S * np.array([*velocity, -75.0])
     return Flight(np.array([900.0, 1400.0, 2000.0]) + np.outer(np.arange(3), step), attitudes)
@@ -175,30 +175,30 @@ def _unit(rng: np.random.Generator) -> np.ndarray:
     return np.array([np.cos(angle), np.sin(angle)])
 
 
-def measurements_of(flown: Flight, counts: list[np.ndarray], known: DetectorCalibration) -> DescentMeasurements:
-    """Exact measurements of a flight with these pictures; the inertial velocities carry a common error of (40, -25)."""
-    camera = CAMERA.binned(1, known.rows_summed)
+def measurements_of(path: Flight, counts: list[np.ndarray], detector: DetectorCalibration) -> DescentMeasurements:
+    """Exact measurements of a flight with these images; the inertial velocities have a common error of (40, -25)."""
+    camera = CAMERA.bin(1, detector.rows_summed)
     times = [100.0 + INTERVAL_S * i for i in range(3)]
     return DescentMeasurements(
-        images=tuple(DetectorImage(c, t, camera, known) for c, t in zip(counts, times, strict=True)),
-        attitudes=tuple(AttitudeMeasurement(a, t) for a, t in zip(flown.attitudes, times, strict=True)),
-        altitudes=tuple(AltitudeMeasurement(float(p[2]), t) for p, t in zip(flown.positions, times, strict=True)),
-        interval_velocities_m_s=flown.velocities + np.array([40.0, -25.0, 0.0]),
-        sun_direction=flown.sun,
+        images=tuple(DetectorImage(c, t, camera, detector) for c, t in zip(counts, times, strict=True)),
+        attitudes=tuple(AttitudeMeasurement(a, t) for a, t in zip(path.attitudes, times, strict=True)),
+        altitudes=tuple(AltitudeMeasurement(float(p[2]), t) for p, t in zip(path.positions, times, strict=True)),
+        interval_velocities_m_s=path.velocities + np.array([40.0, -25.0, 0.0]),
+        sun_direction=path.sun,
     )
 
 
 def render(
-    flown: Flight, texture: Texture | None = None, noise: np.random.Generator | None = None, level: float = 1600.0
+    path: Flight, texture: Texture | None = None, noise: np.random.Generator | None = None, level: float = 1600.0
 ) -> DescentMeasurements:
-    """The three pictures of a flight with exact measurements."""
-    known = calibration()
-    ground = terrain() if texture is None else texture
+    """Images and exact measurements of a flight."""
+    detector = calibration()
+    ground = draw_terrain() if texture is None else texture
     counts = [
-        delivered(scene(ground, attitude, position), known, noise, level)
-        for attitude, position in zip(flown.attitudes, flown.positions, strict=True)
+        expose_scene(trace_scene(ground, attitude, position), detector, noise, level)
+        for attitude, position in zip(path.attitudes, path.positions, strict=True)
     ]
-    return measurements_of(flown, counts, known)
+    return measurements_of(path, counts, detector)
 
 
 def velocity_of(answer: VelocityEstimate) -> np.ndarray:

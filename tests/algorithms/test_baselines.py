@@ -1,4 +1,4 @@
-"""The baselines on rendered descents with exact truth, and against trouble: same bar of honesty as DIMES."""
+"""Tests of the baseline velocity estimators on rendered descents, with valid and invalid inputs."""
 
 from __future__ import annotations
 
@@ -15,34 +15,42 @@ from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
 from marsyard.algorithms.dimes.binning import inside_frame, square, usable_views
 from marsyard.algorithms.interface import VelocityEstimator, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
-from tests.algorithms.synthetic_descent import flight, flown, render, terrain, tilted, velocity_of, waves
+from tests.algorithms.synthetic_descent import (
+    draw_flight,
+    draw_terrain,
+    fly_steadily,
+    make_waves,
+    render,
+    tilt_body,
+    velocity_of,
+)
 
 ESTIMATORS: dict[str, VelocityEstimator] = {"phase": PhaseCorrelationEstimator(), "homography": HomographyEstimator()}
 both = pytest.mark.parametrize("name", ESTIMATORS)
 and_dimes = pytest.mark.parametrize("estimator", [*ESTIMATORS.values(), DimesEstimator()], ids=[*ESTIMATORS, "dimes"])
 
 
-ATTITUDES = (tilted(3.0, 0.0, 0.0), tilted(5.0, 90.0, 120.0), tilted(4.0, 200.0, 250.0))
+ATTITUDES = (tilt_body(3.0, 0.0, 0.0), tilt_body(5.0, 90.0, 120.0), tilt_body(4.0, 200.0, 250.0))
 
 
 @pytest.fixture(scope="module")
-def ordinary() -> DescentMeasurements:
-    return render(flown((10.0, 5.0), ATTITUDES), noise=np.random.default_rng(1))
+def measurements() -> DescentMeasurements:
+    return render(fly_steadily((10.0, 5.0), ATTITUDES), noise=np.random.default_rng(1))
 
 
 @both
 @pytest.mark.parametrize("velocity", [(12.0, 0.0), (0.0, 12.0), (-8.0, 9.0)])
 def test_east_is_east_and_north_is_north(name: str, velocity: tuple[float, float]) -> None:
-    answer = ESTIMATORS[name].estimate(render(flown(velocity, ATTITUDES)))
+    answer = ESTIMATORS[name].estimate(render(fly_steadily(velocity, ATTITUDES)))
     assert answer.outcome is VelocityOutcome.VALID
     # Half a rectified pixel is 0.6 m/s.
     np.testing.assert_allclose(velocity_of(answer), velocity, atol=0.3)
 
 
 @both
-def test_descents_with_exact_measurements(name: str) -> None:
+def test_exact_measurements_give_accurate_velocity(name: str) -> None:
     rng = np.random.default_rng(5)
-    flights = [flight(rng, max_tilt_deg=10.0, max_wind=15.0) for _ in range(5)]
+    flights = [draw_flight(rng, max_tilt_deg=10.0, max_wind=15.0) for _ in range(5)]
     answers = [ESTIMATORS[name].estimate(render(truth, noise=rng)) for truth in flights]
     errors = [
         np.hypot(*(answer.velocity_m_s - truth.velocities[1, :2]))
@@ -54,27 +62,27 @@ def test_descents_with_exact_measurements(name: str) -> None:
 
 
 @and_dimes
-def test_pictures_of_different_ground_give_no_velocity(estimator: VelocityEstimator) -> None:
+def test_images_of_different_ground_give_no_velocity(estimator: VelocityEstimator) -> None:
     rng = np.random.default_rng(10)
     for _ in range(3):
-        truth = flight(rng, max_tilt_deg=10.0)
-        first, other = render(truth, terrain(1), rng), render(truth, terrain(2), rng)
+        truth = draw_flight(rng, max_tilt_deg=10.0)
+        first, other = render(truth, draw_terrain(1), rng), render(truth, draw_terrain(2), rng)
         mixed = replace(first, images=(first.images[0], other.images[1], first.images[2]))
         answer = estimator.estimate(mixed)
         assert answer.outcome in (VelocityOutcome.NO_VALID_TRACK, VelocityOutcome.IMU_MISMATCH)
 
 
 @both
-def test_imu_that_disagrees_is_believed(name: str, ordinary: DescentMeasurements) -> None:
-    velocities = ordinary.interval_velocities_m_s + np.array([[0.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
-    answer = ESTIMATORS[name].estimate(replace(ordinary, interval_velocities_m_s=velocities))
+def test_disagreement_with_imu_rejects_the_velocity(name: str, measurements: DescentMeasurements) -> None:
+    velocities = measurements.interval_velocities_m_s + np.array([[0.0, 0.0, 0.0], [0.0, 10.0, 0.0]])
+    answer = ESTIMATORS[name].estimate(replace(measurements, interval_velocities_m_s=velocities))
     assert answer.outcome is VelocityOutcome.IMU_MISMATCH
     assert answer.velocity_m_s is None
 
 
 @and_dimes
-def test_motion_beyond_the_largest_speed_is_not_reported(estimator: VelocityEstimator) -> None:
-    assert estimator.estimate(render(flown((45.0, 0.0), ATTITUDES))).outcome is not VelocityOutcome.VALID
+def test_motion_above_max_speed_is_not_reported(estimator: VelocityEstimator) -> None:
+    assert estimator.estimate(render(fly_steadily((45.0, 0.0), ATTITUDES))).outcome is not VelocityOutcome.VALID
 
 
 @both
@@ -87,67 +95,70 @@ def test_motion_beyond_the_largest_speed_is_not_reported(estimator: VelocityEsti
         lambda c: np.where(np.arange(c.shape[1]) % 2 == 0, 0, 4095).astype(np.uint16) + np.zeros_like(c),
     ],
 )
-def test_any_picture_gives_an_answer(
-    name: str, paint: Callable[[np.ndarray], np.ndarray], ordinary: DescentMeasurements
+def test_any_image_gives_an_estimate(
+    name: str, paint: Callable[[np.ndarray], np.ndarray], measurements: DescentMeasurements
 ) -> None:
-    images = tuple(replace(image, counts=paint(image.counts)) for image in ordinary.images)
-    answer = ESTIMATORS[name].estimate(replace(ordinary, images=images))
-    # Pictures that are all alike and as sharp as pixels could be matched in place; nothing moves then.
+    images = tuple(replace(image, counts=paint(image.counts)) for image in measurements.images)
+    answer = ESTIMATORS[name].estimate(replace(measurements, images=images))
+    # Identical images with pixel-scale texture match at zero motion.
     assert answer.outcome in (VelocityOutcome.NO_VALID_TRACK, VelocityOutcome.IMU_MISMATCH)
 
 
 @both
 @pytest.mark.parametrize("altitude_m", [-10.0, 1e-3, 3.0, 2e4, np.nan, np.inf])
-def test_any_altitude_gives_an_answer(name: str, altitude_m: float, ordinary: DescentMeasurements) -> None:
-    altitudes = tuple(replace(one, altitude_m=altitude_m) for one in ordinary.altitudes)
-    assert ESTIMATORS[name].estimate(replace(ordinary, altitudes=altitudes)).outcome is not VelocityOutcome.VALID
+def test_any_altitude_gives_an_estimate(name: str, altitude_m: float, measurements: DescentMeasurements) -> None:
+    altitudes = tuple(replace(one, altitude_m=altitude_m) for one in measurements.altitudes)
+    assert ESTIMATORS[name].estimate(replace(measurements, altitudes=altitudes)).outcome is not VelocityOutcome.VALID
 
 
-def test_distortion_is_the_largest_change_of_length() -> None:
-    # Projective: about (100, 50) lengths change as finite differences say.
+def test_distortion_is_the_largest_relative_length_change() -> None:
+    # Projective distortion near (100, 50) agrees with finite differences.
     homography = np.array([[1.02, 0.01, 3.0], [-0.02, 0.97, 5.0], [1e-4, -2e-4, 1.0]])
 
-    def mapped(point: np.ndarray) -> np.ndarray:
+    def apply_homography(point: np.ndarray) -> np.ndarray:
         x, y, w = homography @ np.array([*point, 1.0])
         return np.array([x / w, y / w])
 
     middle, step = np.array([100.0, 50.0]), 1e-4
     angles = np.linspace(0.0, np.pi, 2001)
     changes = [
-        np.hypot(*(mapped(middle + step * np.array([np.cos(a), np.sin(a)])) - mapped(middle))) / step - 1.0
+        np.hypot(*(apply_homography(middle + step * np.array([np.cos(a), np.sin(a)])) - apply_homography(middle)))
+        / step
+        - 1.0
         for a in angles
     ]
-    found = distortion(homography, float((homography @ np.array([*middle, 1.0]))[2]), mapped(middle))
-    assert found == pytest.approx(np.abs(changes).max(), abs=1e-4)
+    result = distortion(homography, float((homography @ np.array([*middle, 1.0]))[2]), apply_homography(middle))
+    assert result == pytest.approx(np.abs(changes).max(), abs=1e-4)
 
 
 @both
-def test_featureless_and_sky(name: str, ordinary: DescentMeasurements) -> None:
-    flat = render(flown((10.0, 0.0), ATTITUDES), terrain(3, 0.0), np.random.default_rng(4))
+def test_featureless_and_sky_images_are_rejected(name: str, measurements: DescentMeasurements) -> None:
+    flat = render(fly_steadily((10.0, 0.0), ATTITUDES), draw_terrain(3, 0.0), np.random.default_rng(4))
     assert ESTIMATORS[name].estimate(flat).outcome is not VelocityOutcome.VALID
-    up = tuple(replace(one, world_from_body=tilted(180.0, 0.0, 0.0)) for one in ordinary.attitudes)
-    assert ESTIMATORS[name].estimate(replace(ordinary, attitudes=up)).outcome is VelocityOutcome.NO_TEMPLATE_AREA
+    up = tuple(replace(one, world_from_body=tilt_body(180.0, 0.0, 0.0)) for one in measurements.attitudes)
+    assert ESTIMATORS[name].estimate(replace(measurements, attitudes=up)).outcome is VelocityOutcome.NO_TEMPLATE_AREA
 
 
 @both
-def test_answers_repeat_and_tell_their_matches(name: str, ordinary: DescentMeasurements) -> None:
-    one, other = (ESTIMATORS[name].estimate(ordinary) for _ in range(2))
+def test_estimates_repeat_and_report_matches(name: str, measurements: DescentMeasurements) -> None:
+    one, other = (ESTIMATORS[name].estimate(measurements) for _ in range(2))
     np.testing.assert_array_equal(one.velocity_m_s, other.velocity_m_s)
     assert isinstance(one.details, BaselineDetails)
     assert all(match is not None and match.valid for match in one.details.matches)
     assert all(isinstance(patches, PairPatches) for patches in one.details.patches)
 
 
-def test_common_square_is_seen_by_both_and_as_large_as_can_be() -> None:
-    triple = usable_views(render(flown((0.0, 0.0), ATTITUDES)), DimesOptions().binned_size)
+def test_common_square_is_the_largest_visible_in_both() -> None:
+    triple = usable_views(render(fly_steadily((0.0, 0.0), ATTITUDES)), DimesOptions().binned_size)
     assert triple is not None
-    found = find_common_square(triple[0], triple[1], replace(DEFAULT_COMMON_OPTIONS, max_side_px=1000))
-    assert found is not None
-    middle, side, gsd = found
+    result = find_common_square(triple[0], triple[1], replace(DEFAULT_COMMON_OPTIONS, max_side_px=1000))
+    assert result is not None
+    middle, side, gsd = result
     ground = middle + square(0.5 * side * gsd, 9)
     for view in triple[:2]:
         assert inside_frame(view, ground, 0.0, DEFAULT_COMMON_OPTIONS.max_off_nadir_rad).all()
-    # At nadir the second picture is 256 pixels on a side; turned by 120 deg and tilted, a square within is smaller.
+    # At nadir the second image has 256 pixels per side. After 120 deg of rotation and a tilt, the inner square is
+    # smaller.
     assert 140 <= side <= 230
     assert find_common_square(triple[0], triple[1], replace(DEFAULT_COMMON_OPTIONS, min_side_px=side + 16)) is None
     patches = rectify_pair(triple[0], triple[1], DEFAULT_COMMON_OPTIONS)
@@ -157,8 +168,8 @@ def test_common_square_is_seen_by_both_and_as_large_as_can_be() -> None:
 
 
 @pytest.mark.parametrize("velocity", [(10.0, 5.0), (0.0, 0.0), (-20.0, 12.0)])
-def test_repetitive_terrain_is_refused(velocity: tuple[float, float]) -> None:
-    """Waves of 80 m repeat within the search range: a shift by whole waves cannot be distinguished from none."""
-    measured = render(flown(velocity, ATTITUDES), waves(80.0), np.random.default_rng(4))
+def test_repetitive_terrain_is_rejected(velocity: tuple[float, float]) -> None:
+    """Waves of 80 m repeat within the search range: a shift by one wavelength cannot be distinguished from zero."""
+    measured = render(fly_steadily(velocity, ATTITUDES), make_waves(80.0), np.random.default_rng(4))
     for estimator in ESTIMATORS.values():
         assert estimator.estimate(measured).outcome is VelocityOutcome.NO_VALID_TRACK

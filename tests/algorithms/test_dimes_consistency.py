@@ -1,4 +1,4 @@
-"""The IMU check over combinations of tracks, and what its threshold is worth."""
+"""Tests of the IMU consistency check over combinations of tracks, and of its threshold."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from marsyard.algorithms.dimes.validity import (
     ValidityCheck,
     combinations,
     failed_checks,
-    propagated,
+    propagate_velocity,
     track_metrics,
 )
 from marsyard.algorithms.image.correlation import Peak
@@ -38,50 +38,52 @@ def track(pair: int, index: int, velocity: np.ndarray, failed: tuple[ValidityChe
 
 @cache
 def nadir_view() -> View:
-    picture = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, CAMERA.binned(1, ROWS_SUMMED), calibration())
+    picture = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, CAMERA.bin(1, ROWS_SUMMED), calibration())
     return build_view(picture, Rotation.identity(), 2000.0, (256, 256))
 
 
 def pair_of(*tracks: Track) -> PairDetails:
-    """Tracks of a pair; of its pictures nothing is asked."""
+    """Tracks of a pair; the images are not used."""
     nadir = nadir_view()
     return PairDetails(np.zeros((0, 2)), np.zeros((2, 2)), 5.0, 1, tracks, (nadir, nadir))
 
 
-def concluded(first: list[np.ndarray], second: list[np.ndarray], interval_velocities: np.ndarray) -> VelocityEstimate:
+def combine_tracks(
+    first: list[np.ndarray], second: list[np.ndarray], interval_velocities: np.ndarray
+) -> VelocityEstimate:
     pairs = [
         pair_of(*(track(p, k, v) for k, v in enumerate(velocities))) for p, velocities in enumerate((first, second))
     ]
     return conclude((pairs[0], pairs[1]), interval_velocities, THRESHOLD)
 
 
-def test_all_combinations_best_first() -> None:
+def test_combinations_are_sorted_by_consistency() -> None:
     velocities = np.array([[40.0, 0.0, -75.0], [41.0, 2.0, -75.0]])
     first = [(0, np.array([5.0, 5.0])), (1, np.array([9.0, 5.0]))]
-    found = combinations(first, [(1, np.array([6.0, 7.0]))], velocities)
-    assert [(c.first, c.second) for c in found] == [(0, 1), (1, 1)]
-    assert [c.discrepancy_m_s for c in found] == pytest.approx([0.0, 4.0])
+    result = combinations(first, [(1, np.array([6.0, 7.0]))], velocities)
+    assert [(c.first, c.second) for c in result] == [(0, 1), (1, 1)]
+    assert [c.discrepancy_m_s for c in result] == pytest.approx([0.0, 4.0])
 
 
-def test_reported_is_the_second_pairs_velocity_of_the_best_combination() -> None:
+def test_best_combination_reports_second_pair_velocity() -> None:
     velocities = np.array([[40.0, 0.0, -75.0], [41.0, 2.0, -70.0]])
-    answer = concluded(
+    answer = combine_tracks(
         [np.array([5.0, 5.0]), np.array([30.0, 5.0])], [np.array([6.5, 7.0]), np.array([6.1, 7.0])], velocities
     )
     assert answer.outcome is VelocityOutcome.VALID
     np.testing.assert_allclose(velocity_of(answer), [6.1, 7.0])
 
 
-def test_one_track_per_pair_is_enough_and_none_is_not() -> None:
+def test_each_pair_needs_one_track() -> None:
     velocities = np.zeros((2, 3))
     one = [np.array([5.0, 5.0])]
-    assert concluded(one, one, velocities).outcome is VelocityOutcome.VALID
-    assert concluded(one, [], velocities).outcome is VelocityOutcome.NO_TEMPLATE_AREA
-    assert concluded(one, [np.array([15.0, 5.0])], velocities).outcome is VelocityOutcome.IMU_MISMATCH
+    assert combine_tracks(one, one, velocities).outcome is VelocityOutcome.VALID
+    assert combine_tracks(one, [], velocities).outcome is VelocityOutcome.NO_TEMPLATE_AREA
+    assert combine_tracks(one, [np.array([15.0, 5.0])], velocities).outcome is VelocityOutcome.IMU_MISMATCH
 
 
 @pytest.mark.parametrize("broken", [0, 1])
-def test_invalid_tracks_take_no_part(broken: int) -> None:
+def test_invalid_tracks_are_ignored(broken: int) -> None:
     good, bad = np.array([5.0, 5.0]), np.array([25.0, 5.0])
     pairs = [
         pair_of(track(p, 0, bad, (ValidityCheck.PEAK_HEIGHT,)), track(p, 1, good if p != broken else bad))
@@ -95,12 +97,10 @@ def test_invalid_tracks_take_no_part(broken: int) -> None:
 
 
 def track_errors(rng: np.random.Generator, cases: int) -> np.ndarray:
-    """Velocity errors of four tracks per case by formula, m/s, shape (cases, pair, template, 2): no product code.
-
-    Altitude errors of 1 % (3 sigma), attitude errors of 0.03 deg (0.5 ms at 60 deg/s) and match errors of 0.1 m/s, all
-    new in each picture but common to the tracks in it; features anywhere within 39 deg of the nadir. A feature at r
-    from the nadir of a picture with relative altitude error e and tilt error (a, b) is misplaced by at most
-    e r + H (1 + r^2 / H^2) (a, b).
+    """Analytic velocity errors of four tracks per case, m/s, shape (cases, pair, template, 2). Errors per image,
+    common to its tracks: altitude 1 % (3 sigma), attitude 0.03 deg (0.5 ms at 60 deg/s), match 0.1 m/s. Features
+    lie within 39 deg of the nadir. A feature at distance r with relative altitude error e and tilt error (a, b) is
+    displaced by at most e r + H (1 + r^2 / H^2) (a, b).
     """
     heights = np.array([2000.0, 1719.0, 1438.0])
     scale = rng.normal(0.0, 0.01 / 3.0, (cases, 3))
@@ -109,19 +109,19 @@ def track_errors(rng: np.random.Generator, cases: int) -> np.ndarray:
     for pair in range(2):
         radius = 0.8 * heights[pair + 1] * np.sqrt(rng.uniform(0.0, 1.0, (cases, 2, 1)))
         angle = rng.uniform(0.0, 2.0 * np.pi, (cases, 2, 1))
-        place = radius * np.concatenate([np.cos(angle), np.sin(angle)], axis=2)
+        position = radius * np.concatenate([np.cos(angle), np.sin(angle)], axis=2)
         misplaced = []
         for k in (pair, pair + 1):
             stretch = heights[k] * (1.0 + (radius / heights[k]) ** 2)
-            misplaced.append(scale[:, k, None, None] * place + stretch * tilt[:, k, None, :])
+            misplaced.append(scale[:, k, None, None] * position + stretch * tilt[:, k, None, :])
         errors[:, pair] = (misplaced[0] - misplaced[1]) / 3.75 + rng.normal(0.0, 0.1, (cases, 2, 2))
     return errors
 
 
 @pytest.mark.parametrize("tracks_per_pair", [1, 2])
 @pytest.mark.parametrize("wrong_by", [10.0, 20.0, 55.0])
-def test_one_wrong_track_does_no_harm(tracks_per_pair: int, wrong_by: float) -> None:
-    # Issue bar: with one of four tracks wrong by 10 m/s or more, a right velocity or 'unsuccessful' in 99.5 % of cases.
+def test_one_wrong_track_rarely_gives_wrong_velocity(tracks_per_pair: int, wrong_by: float) -> None:
+    # With one of four tracks wrong by at least 10 m/s, 99.5 % of cases are correct or unsuccessful.
     rng = np.random.default_rng(12)
     cases = 1000
     errors = track_errors(rng, cases)[:, :, :tracks_per_pair]
@@ -133,16 +133,16 @@ def test_one_wrong_track_does_no_harm(tracks_per_pair: int, wrong_by: float) -> 
         truth, change = rng.uniform(-20.0, 20.0, 2), rng.normal(0.0, 1.0, 2)
         inertial = np.zeros((2, 3))
         inertial[:, :2] = truth + np.array([[7.0, -4.0]]) + np.array([[0.0, 0.0], change])
-        answer = concluded(list(truth + tracks[0]), list(truth + change + tracks[1]), inertial)
+        answer = combine_tracks(list(truth + tracks[0]), list(truth + change + tracks[1]), inertial)
         error = 0.0 if answer.velocity_m_s is None else np.hypot(*(answer.velocity_m_s - truth - change))
         harmless += bool(error <= 5.0)
     assert harmless >= 0.995 * cases
 
 
-def test_propagation_drops_the_inertial_bias() -> None:
+def test_propagation_removes_the_inertial_bias() -> None:
     bias = np.array([6.0, -3.0])
     at_pair, at_firing = np.array([10.0, 2.0]), np.array([14.0, -1.0])
-    np.testing.assert_allclose(propagated(at_pair, at_pair + bias, at_firing + bias), at_firing)
+    np.testing.assert_allclose(propagate_velocity(at_pair, at_pair + bias, at_firing + bias), at_firing)
 
 
 @pytest.mark.parametrize(
@@ -156,27 +156,27 @@ def test_propagation_drops_the_inertial_bias() -> None:
         ({"contrast": float("nan")}, ValidityCheck.CONTRAST),
     ],
 )
-def test_each_metric_has_its_check(change: dict[str, Any], check: ValidityCheck) -> None:
+def test_each_metric_has_a_check(change: dict[str, Any], check: ValidityCheck) -> None:
     assert failed_checks(METRICS, DimesOptions()) == ()
     assert failed_checks(replace(METRICS, **change), DimesOptions()) == (check,)
 
 
-def test_a_track_exactly_at_every_limit_is_valid() -> None:
+def test_track_at_each_limit_is_valid() -> None:
     o = DimesOptions()
     limit = TrackMetrics(o.min_contrast, o.min_peak, o.max_peak_width_px, o.max_second_peak_ratio, on_border=False)
     assert failed_checks(limit, o) == ()
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "invalid",
     [{"template_px": 30}, {"template_px": 3}, {"search_margin_px": 0}, {"grid_step_px": 0}, {"max_off_nadir_rad": 2.0}],
 )
-def test_options_say_what_is_wrong(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        DimesOptions(**wrong)
+def test_invalid_options_are_reported(invalid: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(invalid))):
+        DimesOptions(**invalid)
 
 
-def test_a_surface_without_a_positive_peak_has_no_distinct_one() -> None:
+def test_surface_without_positive_peak_has_no_distinct_peak() -> None:
     metrics = track_metrics(0.02, np.zeros((9, 9)), Peak(4, 4, 0.0, on_border=False), DimesOptions())
     assert metrics.second_peak_ratio == 1.0
     assert ValidityCheck.SECOND_PEAK in failed_checks(metrics, DimesOptions())

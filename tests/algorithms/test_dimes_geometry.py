@@ -1,4 +1,4 @@
-"""Geometry of DIMES: ground and pixels, overlap and feasible_overlap, zero-phase spot, rectification."""
+"""Tests of the geometry of DIMES: ground projection, image overlap, zero-phase spot and rectification."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from marsyard.algorithms.dimes.binning import (
     View,
     build_view,
     ground_from_pixels,
+    ground_lattice,
     inside_frame,
     pixel_angle_rad,
     pixels_from_ground,
+    rectify_patch,
     square,
     square_outline,
 )
@@ -30,7 +32,6 @@ from marsyard.algorithms.dimes.overlap import (
     template_candidates,
     zero_phase_pixel,
 )
-from marsyard.algorithms.dimes.rectification import ground_lattice, rectify_patch
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import DetectorImage
 from tests.algorithms.synthetic_descent import (
@@ -39,9 +40,9 @@ from tests.algorithms.synthetic_descent import (
     ROWS_SUMMED,
     Texture,
     calibration,
-    delivered,
-    scene,
-    tilted,
+    expose_scene,
+    tilt_body,
+    trace_scene,
 )
 
 OPTIONS = DimesOptions()
@@ -49,15 +50,19 @@ LIMIT = OPTIONS.max_off_nadir_rad
 NIGHT = direction(0.0, -1.0)  # the sun below the horizon: no zero-phase spot on the ground
 
 
-def blank(attitude: Rotation, altitude_m: float, time_s: float = 0.0, counts: np.ndarray | None = None) -> View:
+def make_blank_view(
+    attitude: Rotation, altitude_m: float, time_s: float = 0.0, counts: np.ndarray | None = None
+) -> View:
     picture = np.full((256, 1024), 1000, dtype=np.uint16) if counts is None else counts
     return build_view(
-        DetectorImage(picture, time_s, CAMERA.binned(1, ROWS_SUMMED), calibration()), attitude, altitude_m, (256, 256)
+        DetectorImage(picture, time_s, CAMERA.bin(1, ROWS_SUMMED), calibration()), attitude, altitude_m, (256, 256)
     )
 
 
-def pair(first: Rotation, second: Rotation, altitudes: tuple[float, float] = (2000.0, 1719.0)) -> tuple[View, View]:
-    return blank(first, altitudes[0]), blank(second, altitudes[1], INTERVAL_S)
+def make_views(
+    first: Rotation, second: Rotation, altitudes: tuple[float, float] = (2000.0, 1719.0)
+) -> tuple[View, View]:
+    return make_blank_view(first, altitudes[0]), make_blank_view(second, altitudes[1], INTERVAL_S)
 
 
 def candidates(first: View, second: View, sun: np.ndarray = NIGHT) -> Candidates:
@@ -65,83 +70,83 @@ def candidates(first: View, second: View, sun: np.ndarray = NIGHT) -> Candidates
 
 
 def test_ground_and_pixels_invert_each_other() -> None:
-    seen = blank(tilted(20.0, 70.0, 200.0), 1850.0)
-    pixels = grid_pixels(seen.size, 16)
-    ground, near = ground_from_pixels(seen, pixels, LIMIT)
-    back, visible = pixels_from_ground(seen, ground)
+    view = make_blank_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
+    pixels = grid_pixels(view.size, 16)
+    ground, near = ground_from_pixels(view, pixels, LIMIT)
+    back, visible = pixels_from_ground(view, ground)
     assert near.sum() > 200
     assert np.all(visible[near])
     np.testing.assert_allclose(back[near], pixels[near], atol=1e-6)
 
 
-def test_rays_beyond_the_limit_end_at_the_limit_in_their_own_azimuth() -> None:
-    seen = blank(tilted(80.0, 0.0, 0.0), 1500.0)  # leans so that half of the picture is sky
-    pixels = border_pixels(seen.size)
-    ground, near = ground_from_pixels(seen, pixels, LIMIT)
-    _, directions = seen.camera.rays(pixels)
+def test_distant_rays_end_at_limit_in_same_azimuth() -> None:
+    view = make_blank_view(tilt_body(80.0, 0.0, 0.0), 1500.0)  # tilted: half of the image is sky
+    pixels = border_pixels(view.size)
+    ground, near = ground_from_pixels(view, pixels, LIMIT)
+    _, directions = view.camera.rays(pixels)
     assert np.any(directions[:, 2] > 0.0)
     assert not near.all()
-    off_nadir = np.hypot(*ground.T) / seen.centre[2]
+    off_nadir = np.hypot(*ground.T) / view.centre[2]
     np.testing.assert_allclose(off_nadir[~near], np.tan(LIMIT))
     along = np.sum(ground * directions[:, :2], axis=1)
     np.testing.assert_allclose(along, np.hypot(*ground.T) * np.hypot(*directions[:, :2].T))
 
 
-def test_camera_stands_above_the_origin_whatever_its_place_in_the_body() -> None:
-    attitude = tilted(30.0, 45.0, 10.0)
+def test_camera_is_above_origin_for_any_mounting_position() -> None:
+    attitude = tilt_body(30.0, 45.0, 10.0)
     lever = np.array([0.5, -1.0, -2.0])
-    camera = CAMERA.binned(1, ROWS_SUMMED).moved(RigidTransform.from_translation(lever))
+    camera = CAMERA.bin(1, ROWS_SUMMED).transform(RigidTransform.from_translation(lever))
     image = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, camera, calibration())
-    seen = build_view(image, attitude, 1400.0, (256, 256))
-    np.testing.assert_allclose(seen.camera.c, seen.centre, atol=1e-9)
-    np.testing.assert_allclose(seen.centre, [0.0, 0.0, 1400.0 + attitude.apply(lever)[2]], atol=1e-9)
+    view = build_view(image, attitude, 1400.0, (256, 256))
+    np.testing.assert_allclose(view.camera.c, view.centre, atol=1e-9)
+    np.testing.assert_allclose(view.centre, [0.0, 0.0, 1400.0 + attitude.apply(lever)[2]], atol=1e-9)
 
 
 def test_pixel_angle_and_search_geometry() -> None:
-    first, second = pair(Rotation.identity(), Rotation.identity())
-    # 4 x 12 um / 14.67 mm = 3.272 mrad; distortion changes it by less than 0.1 % near the middle.
+    first, second = make_views(Rotation.identity(), Rotation.identity())
+    # 4 x 12 um / 14.67 mm = 3.272 mrad; distortion changes it by less than 0.1 % near the image centre.
     assert pixel_angle_rad(second) == pytest.approx(4 * 12e-6 / 0.01467, rel=2e-3)
     geometry = search_geometry(first, second, OPTIONS)
     assert geometry.gsd_m == pytest.approx(1719.0 * 3.272e-3, rel=2e-3)
-    # 30 m/s in 3.75 s: 112.5 m (the paper's "at least 110 m") are 20.003 px: 21, and the margin.
+    # 30 m/s in 3.75 s: 112.5 m (the paper's "at least 110 m") are 20.003 px, rounded up to 21, plus the margin.
     assert geometry.search_px == 21 + OPTIONS.search_margin_px
     assert geometry.window_px == OPTIONS.template_px + 2 * geometry.search_px
 
 
-def test_squares() -> None:
+def test_square_windows() -> None:
     assert square(3.0, 4).shape == (16, 2)
     outline = square_outline(3.0, 4)
     assert outline.shape == (12, 2)
     assert np.all(np.abs(outline).max(axis=1) == 3.0)
 
 
-def test_overlap_of_nadir_pictures_is_the_smaller_one_within() -> None:
-    first, second = pair(Rotation.identity(), Rotation.identity())
+def test_nadir_overlap_is_the_smaller_image() -> None:
+    first, second = make_views(Rotation.identity(), Rotation.identity())
     polygon = overlap_polygon(first, second, OPTIONS)
-    # Without distortion the second picture's border lies at 1719 / 2000 of the distance from the principal point.
+    # Without distortion the border of the second image is at 1719 / 2000 of the distance from the principal point.
     middle = np.array([(515.0 - 1.5) / 4, (508.5 - 1.5) / 4])
     expected = middle + (border_pixels(second.size) - middle) * 0.8595
     np.testing.assert_allclose(polygon, expected, atol=1.2)
 
 
 def test_candidates_lie_within_the_overlap_polygon() -> None:
-    first, second = pair(tilted(15.0, 10.0, 0.0), tilted(12.0, 120.0, 77.0))
+    first, second = make_views(tilt_body(15.0, 10.0, 0.0), tilt_body(12.0, 120.0, 77.0))
     polygon = overlap_polygon(first, second, OPTIONS).astype(np.float32)
-    places = candidates(first, second).pixels
-    assert len(places) > 20
-    inside = [cv2.pointPolygonTest(polygon, (float(u), float(v)), True) for u, v in places]
-    assert min(inside) > 0.5 * OPTIONS.template_px * 0.7  # the window's half, seen in the first picture, at the least
+    positions = candidates(first, second).pixels
+    assert len(positions) > 20
+    inside = [cv2.pointPolygonTest(polygon, (float(u), float(v)), True) for u, v in positions]
+    assert min(inside) > 0.5 * OPTIONS.template_px * 0.7  # half the window width in the first image
 
 
-def test_every_candidate_has_room_for_template_and_window() -> None:
+def test_each_candidate_fits_template_and_window() -> None:
     rng = np.random.default_rng(8)
     for _ in range(6):
-        attitudes = [tilted(*rng.uniform([0.0, 0.0, 0.0], [25.0, 360.0, 360.0])) for _ in range(2)]
-        first, second = pair(attitudes[0], attitudes[1])
+        attitudes = [tilt_body(*rng.uniform([0.0, 0.0, 0.0], [25.0, 360.0, 360.0])) for _ in range(2)]
+        first, second = make_views(attitudes[0], attitudes[1])
         geometry = search_geometry(first, second, OPTIONS)
-        found = candidates(first, second).ground
-        assert len(found) > 0
-        for ground in found:
+        result = candidates(first, second).ground
+        assert len(result) > 0
+        for ground in result:
             assert inside_frame(first, ground + square_outline(geometry.template_half_m, 15), 0.0, LIMIT).all()
             assert inside_frame(second, ground + square_outline(geometry.window_half_m, 15), 0.0, LIMIT).all()
 
@@ -149,44 +154,44 @@ def test_every_candidate_has_room_for_template_and_window() -> None:
 @pytest.mark.parametrize(
     ("first", "second"),
     [
-        (tilted(0.0, 0.0, 0.0), tilted(120.0, 0.0, 0.0)),  # the second looks at the sky
-        (tilted(180.0, 0.0, 0.0), tilted(0.0, 0.0, 0.0)),  # the first does
-        (tilted(35.0, 0.0, 0.0), tilted(35.0, 180.0, 0.0)),  # they look away from each other
+        (tilt_body(0.0, 0.0, 0.0), tilt_body(120.0, 0.0, 0.0)),  # the second image shows the sky
+        (tilt_body(180.0, 0.0, 0.0), tilt_body(0.0, 0.0, 0.0)),  # the first image shows the sky
+        (tilt_body(35.0, 0.0, 0.0), tilt_body(35.0, 180.0, 0.0)),  # opposite directions
     ],
 )
-def test_no_overlap_no_candidates(first: Rotation, second: Rotation) -> None:
-    assert len(candidates(*pair(first, second)).pixels) == 0
+def test_images_without_overlap_have_no_candidates(first: Rotation, second: Rotation) -> None:
+    assert len(candidates(*make_views(first, second)).pixels) == 0
 
 
-def test_zero_phase_spot_is_where_the_shadow_falls() -> None:
-    # Sun in the east 60 deg high: the shadow falls to the west, at altitude / tan 60 from the nadir.
+def test_zero_phase_spot_is_at_the_lander_shadow() -> None:
+    # The sun is in the east, 60 deg high: the shadow is in the west, at altitude / tan 60 from the nadir.
     sun = direction(np.radians(90.0), np.radians(60.0))
-    seen = blank(tilted(10.0, 200.0, 30.0), 2000.0)
+    view = make_blank_view(tilt_body(10.0, 200.0, 30.0), 2000.0)
     shadow = np.array([[-2000.0 / np.tan(np.radians(60.0)), 0.0]])
-    # A direction and a ground point on it project alike but for the rounding of 1e7 m.
-    np.testing.assert_allclose(zero_phase_pixel(seen, sun), pixels_from_ground(seen, shadow)[0][0], atol=1e-3)
-    assert np.all(np.isnan(zero_phase_pixel(seen, -sun)))
+    # A direction and a ground point in it project equally except for the rounding of 1e7 m.
+    np.testing.assert_allclose(zero_phase_pixel(view, sun), pixels_from_ground(view, shadow)[0][0], atol=1e-3)
+    assert np.all(np.isnan(zero_phase_pixel(view, -sun)))
 
 
-def test_no_template_and_if_possible_no_window_shows_the_spot() -> None:
+def test_templates_and_windows_avoid_zero_phase_spot() -> None:
     radius = OPTIONS.zero_phase_radius_rad
     for azimuth in np.radians([0.0, 100.0, 230.0]):
         sun = direction(azimuth, np.radians(80.0))
-        first, second = pair(tilted(5.0, 30.0, 0.0), tilted(8.0, 60.0, 140.0))
+        first, second = make_views(tilt_body(5.0, 30.0, 0.0), tilt_body(8.0, 60.0, 140.0))
         geometry = search_geometry(first, second, OPTIONS)
-        places = candidates(first, second, sun)
+        positions = candidates(first, second, sun)
         free = candidates(first, second)
-        assert 0 < len(places.pixels) < len(free.pixels)
-        assert 0 < places.preferred.sum() < len(places.pixels)
-        for seen in (first, second):
-            for ground, preferred in zip(places.ground, places.preferred, strict=True):
-                half = geometry.window_half_m if preferred and seen is second else geometry.template_half_m
-                points = np.column_stack([ground + square(half, 25), np.zeros(625)]) - seen.centre
+        assert 0 < len(positions.pixels) < len(free.pixels)
+        assert 0 < positions.preferred.sum() < len(positions.pixels)
+        for view in (first, second):
+            for ground, preferred in zip(positions.ground, positions.preferred, strict=True):
+                half = geometry.window_half_m if preferred and view is second else geometry.template_half_m
+                points = np.column_stack([ground + square(half, 25), np.zeros(625)]) - view.centre
                 cosines = points @ -sun / np.linalg.norm(points, axis=1)
-                # Between the points of the lattice that is tested the spot may reach in by a fraction of a degree.
+                # Between lattice points the spot may extend into the window by a fraction of a degree.
                 assert np.degrees(np.arccos(cosines.max())) > np.degrees(radius) - 0.6
-        chosen, _ = select_templates(first, places, OPTIONS)
-        assert all(places.preferred[k] for k in chosen)
+        chosen, _ = select_templates(first, positions, OPTIONS)
+        assert all(positions.preferred[k] for k in chosen)
 
 
 def test_grid_is_coarse_and_centred() -> None:
@@ -196,7 +201,7 @@ def test_grid_is_coarse_and_centred() -> None:
     assert pixels.max() == 251.0
 
 
-def test_best_candidates_are_taken_in_order_and_apart() -> None:
+def test_best_candidates_are_selected_with_min_spacing() -> None:
     pixels = np.array([[10.0, 10.0], [20.0, 12.0], [60.0, 10.0], [10.0, 90.0]])
     contrasts = np.array([0.9, 0.8, 0.1, 0.5])
     everywhere = np.ones(4, dtype=bool)
@@ -207,22 +212,22 @@ def test_best_candidates_are_taken_in_order_and_apart() -> None:
     assert best_candidates(np.zeros(0), np.zeros((0, 2)), np.zeros(0, dtype=bool), 2, 31.0) == []
 
 
-def test_selection_finds_the_only_textured_place() -> None:
+def test_selection_finds_the_only_textured_area() -> None:
     counts = np.full((256, 1024), 1000, dtype=np.uint16)
     rng = np.random.default_rng(6)
     counts[140:170, 4 * 60 : 4 * 90] = np.repeat(rng.integers(700, 1300, (30, 30), dtype=np.uint16), 4, axis=1)
-    seen = blank(Rotation.identity(), 2000.0, 0.0, counts)
-    pixels = grid_pixels(seen.size, OPTIONS.grid_step_px)
-    places = Candidates(pixels, pixels, np.ones(len(pixels), dtype=bool))
-    chosen, of_chosen = select_templates(seen, places, OPTIONS)
+    view = make_blank_view(Rotation.identity(), 2000.0, 0.0, counts)
+    pixels = grid_pixels(view.size, OPTIONS.grid_step_px)
+    positions = Candidates(pixels, pixels, np.ones(len(pixels), dtype=bool))
+    chosen, of_chosen = select_templates(view, positions, OPTIONS)
     np.testing.assert_allclose(pixels[chosen[0]], [75.0, 155.0], atol=OPTIONS.grid_step_px)
     assert of_chosen[0] > 0.02
     assert of_chosen[1] < 0.001
-    assert contrasts(seen, pixels, OPTIONS.template_px)[chosen[0]] == of_chosen[0]
+    assert contrasts(view, pixels, OPTIONS.template_px)[chosen[0]] == of_chosen[0]
 
 
-def chart() -> Texture:
-    """A smooth picture of which every point can be told analytically: waves of 60 to 200 m, and a ramp of none."""
+def make_chart() -> Texture:
+    """A smooth image that is known analytically: waves of 60 to 200 m without a ramp."""
     along_m = 1.5 * np.arange(2048)
     return Texture(chart_at(along_m[None, :], -along_m[:, None]).astype(np.float32), 1.5)
 
@@ -238,24 +243,26 @@ def test_ground_lattice_is_north_up() -> None:
     np.testing.assert_allclose(lattice[2, 1], [100.0, 190.0])
 
 
-@pytest.mark.parametrize("attitude", [tilted(0.0, 0.0, 0.0), tilted(18.0, 200.0, 140.0), tilted(25.0, 80.0, 300.0)])
-def test_rectified_patch_shows_the_ground_that_it_names(attitude: Rotation) -> None:
+@pytest.mark.parametrize(
+    "attitude", [tilt_body(0.0, 0.0, 0.0), tilt_body(18.0, 200.0, 140.0), tilt_body(25.0, 80.0, 300.0)]
+)
+def test_rectified_patch_shows_its_lattice_positions(attitude: Rotation) -> None:
     position = np.array([700.0, -300.0, 1700.0])
-    counts = delivered(scene(chart(), attitude, position), calibration(), level=1600.0)
-    seen = blank(attitude, 1700.0, 0.0, counts)
-    centre, near = ground_from_pixels(seen, np.array([[150.0, 90.0]]), LIMIT)
+    counts = expose_scene(trace_scene(make_chart(), attitude, position), calibration(), level=1600.0)
+    view = make_blank_view(attitude, 1700.0, 0.0, counts)
+    centre, near = ground_from_pixels(view, np.array([[150.0, 90.0]]), LIMIT)
     assert near[0]
-    patch = rectify_patch(seen, centre[0], 61, 5.5)
+    patch = rectify_patch(view, centre[0], 61, 5.5)
     lattice = ground_lattice(centre[0], 61, 5.5) + position[:2]
     expected = chart_at(lattice[..., 0], lattice[..., 1])
     shift = _shift(patch / 1600.0, expected, lattice)
-    # 0.01 px of a binned pixel: 0.06 m, or 0.015 m/s over 3.75 s.
+    # 0.01 of a binned pixel: 0.06 m, or 0.015 m/s over 3.75 s.
     assert np.abs(shift).max() < 0.06
     np.testing.assert_allclose(patch / 1600.0, expected, atol=0.02)
 
 
 def _shift(patch: np.ndarray, expected: np.ndarray, lattice: np.ndarray) -> np.ndarray:
-    """Mean displacement (east, north) of the patch against the chart, metres, by one least-squares step."""
+    """Mean displacement (east, north) of the patch relative to the chart, metres, by one least-squares step."""
     east, north = lattice[..., 0], lattice[..., 1]
     slopes = [
         (chart_at(east + dx, north + dy) - chart_at(east - dx, north - dy)) / 0.2 for dx, dy in ((0.1, 0.0), (0.0, 0.1))

@@ -1,4 +1,4 @@
-"""Radiometric corrections against a forward model that follows every physical row."""
+"""Tests of radiometric corrections against a forward model of each physical row."""
 
 from __future__ import annotations
 
@@ -8,18 +8,25 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.binning import View, bin_factors, bin_mean, build_view
-from marsyard.algorithms.dimes.rectification import correct_patch
+from marsyard.algorithms.dimes.binning import View, bin_factors, bin_mean, build_view, correct_patch
 from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
 from marsyard.sim.measurements import DetectorImage
-from tests.algorithms.synthetic_descent import CAMERA, ROWS_SUMMED, calibration, delivered, fall_off, scene, terrain
+from tests.algorithms.synthetic_descent import (
+    CAMERA,
+    ROWS_SUMMED,
+    calibration,
+    draw_terrain,
+    expose_scene,
+    fall_off,
+    trace_scene,
+)
 
 LEVEL = 1600.0
 TIMES = [(5e-6, 2e-6), (5e-6, 0.0), (0.0, 2e-6), (3e-6, 3e-6), (1e-6, 5e-6), (0.0, 0.0)]
 
 
-def transferred(rates: np.ndarray, exposure_s: float, transfer_row_s: float, clear_row_s: float) -> np.ndarray:
-    """Charge of every physical row, one loop over rows after the other: as a packet meets them."""
+def simulate_transfer(rates: np.ndarray, exposure_s: float, transfer_row_s: float, clear_row_s: float) -> np.ndarray:
+    """Charge of each physical row, by a loop over the rows that a charge packet passes."""
     charge = exposure_s * rates
     for r in range(len(rates)):
         for passed in range(len(rates) - 1, r, -1):
@@ -31,61 +38,61 @@ def transferred(rates: np.ndarray, exposure_s: float, transfer_row_s: float, cle
 
 @pytest.mark.parametrize("times", TIMES)
 @pytest.mark.parametrize("rows_summed", [1, 2, 4])
-def test_inversion_is_exact_where_summed_rows_are_alike(times: tuple[float, float], rows_summed: int) -> None:
+def test_inversion_is_exact_for_uniform_summed_rows(times: tuple[float, float], rows_summed: int) -> None:
     rng = np.random.default_rng(5)
     rates = np.repeat(rng.uniform(0.0, 1e6, (16, 3)), rows_summed, axis=0)
-    # An exposure shorter than usual makes the ramp as strong as the picture.
-    known = replace(
+    # A short exposure makes the smear as strong as the image.
+    detector = replace(
         calibration(), exposure_s=1e-4, transfer_row_s=times[0], clear_row_s=times[1], rows_summed=rows_summed
     )
-    charge = transferred(rates, known.exposure_s, *times)
+    charge = simulate_transfer(rates, detector.exposure_s, *times)
     signal = charge.reshape(16, rows_summed, 3).mean(axis=1)
-    exposed = remove_frame_transfer(signal, known, rows_summed)
-    # Rounding only; the steepest case loses a factor of ten per row-block of its recursion at most.
-    np.testing.assert_allclose(exposed, known.exposure_s * rates[::rows_summed], rtol=1e-9, atol=1e-9)
+    exposed = remove_frame_transfer(signal, detector, rows_summed)
+    # Rounding only; in the steepest case the recursion loses at most a factor of ten per row block.
+    np.testing.assert_allclose(exposed, detector.exposure_s * rates[::rows_summed], rtol=1e-9, atol=1e-9)
 
 
-def test_exposure_shorter_than_the_transfer_is_refused_with_its_numbers() -> None:
-    known = replace(calibration(), exposure_s=1e-6)
+def test_exposure_shorter_than_transfer_is_rejected() -> None:
+    detector = replace(calibration(), exposure_s=1e-6)
     with pytest.raises(ValueError, match="1e-06 s is too short"):
-        remove_frame_transfer(np.ones((256, 4)), known, 4)
+        remove_frame_transfer(np.ones((256, 4)), detector, 4)
 
 
-def test_without_frame_transfer_the_exposure_need_not_be_known() -> None:
-    """Real pictures come without it, and there is nothing to take off."""
-    known = replace(calibration(0.0, 0.0), exposure_s=0.0)
+def test_exposure_is_optional_without_frame_transfer() -> None:
+    """Real images have no exposure metadata and need no smear correction."""
+    detector = replace(calibration(0.0, 0.0), exposure_s=0.0)
     signal = np.arange(12.0).reshape(4, 3)
-    np.testing.assert_array_equal(remove_frame_transfer(signal, known, 2), signal)
+    np.testing.assert_array_equal(remove_frame_transfer(signal, detector, 2), signal)
 
 
-def picture(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, View]:
-    """Radiance of a textured scene and the view that DIMES makes of its picture."""
+def render_view(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, View]:
+    """Radiance of a textured scene and the DIMES view of its image."""
     attitude = Rotation.from_euler("zy", [30.0, 12.0], degrees=True)
-    radiance = scene(terrain(), attitude, np.array([500.0, 300.0, 1700.0]))
-    known = calibration(transfer_row_s, clear_row_s)
-    image = DetectorImage(delivered(radiance, known, level=LEVEL), 0.0, CAMERA.binned(1, ROWS_SUMMED), known)
+    radiance = trace_scene(draw_terrain(), attitude, np.array([500.0, 300.0, 1700.0]))
+    detector = calibration(transfer_row_s, clear_row_s)
+    image = DetectorImage(expose_scene(radiance, detector, level=LEVEL), 0.0, CAMERA.bin(1, ROWS_SUMMED), detector)
     return radiance, build_view(image, attitude, 1700.0, (256, 256))
 
 
 @pytest.mark.parametrize("times", [(5e-6, 2e-6), (1e-6, 5e-6), (0.0, 0.0)])
-def test_still_scene_is_restored_to_a_thousandth_of_full_scale(times: tuple[float, float]) -> None:
-    radiance, seen = picture(*times)
+def test_static_scene_is_restored_within_tolerance(times: tuple[float, float]) -> None:
+    radiance, view = render_view(*times)
     irradiance = bin_mean(LEVEL * radiance * fall_off(), 4, 4)
-    restored = remove_frame_transfer(seen.signal, seen.calibration, seen.rows_summed)
-    assert np.abs(seen.signal - irradiance).max() > (0.1 * 4095 if times[0] else 0.0)  # there was something to remove
-    # Rows within a delivered row are not quite alike, counts are rounded: 0.2 % of full scale at worst, 0.1 % rms.
+    restored = remove_frame_transfer(view.signal, view.calibration, view.rows_summed)
+    assert np.abs(view.signal - irradiance).max() > (0.1 * 4095 if times[0] else 0.0)  # the smear is significant
+    # Rows within a delivered row differ slightly and counts are rounded: at most 0.2 % of full scale, 0.1 % rms.
     assert np.abs(restored - irradiance).max() < 0.002 * 4095
     assert np.sqrt(np.mean((restored - irradiance) ** 2)) < 0.001 * 4095
 
 
-def test_patch_is_corrected_for_fall_off_too() -> None:
-    radiance, seen = picture(5e-6, 2e-6)
-    patch = correct_patch(seen, slice(0, 60), slice(200, 256))  # a corner, where fall-off is to one half
+def test_patch_is_corrected_for_fall_off() -> None:
+    radiance, view = render_view(5e-6, 2e-6)
+    patch = correct_patch(view, slice(0, 60), slice(200, 256))  # a corner with a fall-off of one half
     expected = bin_mean(LEVEL * radiance, 4, 4)[0:60, 200:256]
     assert np.abs(patch - expected).max() < 0.004 * 4095
 
 
-def test_binning_averages_blocks_and_refuses_what_does_not_divide() -> None:
+def test_binning_averages_blocks_and_rejects_indivisible_sizes() -> None:
     image = np.arange(48.0).reshape(4, 12)
     np.testing.assert_allclose(bin_mean(image, 4, 2)[0, 0], image[:2, :4].mean())
     assert bin_factors((256, 1024), (256, 256)) == (4, 1)

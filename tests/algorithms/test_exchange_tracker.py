@@ -1,4 +1,4 @@
-"""Trackers that are programs: answers as if they were none, processes of their own or shared, and faults."""
+"""Tests of external programs as trackers: answers, separate and shared processes, and faults."""
 
 import gc
 import sys
@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.algorithms.answers import AlgorithmError, Fault
 from marsyard.algorithms.exchange import (
     ExecutableLimits,
     ExecutableTargetTracker,
@@ -21,7 +22,6 @@ from marsyard.algorithms.exchange import (
 )
 from marsyard.algorithms.exchange.files import encode_target, write_mast, write_stop
 from marsyard.algorithms.exchange.serving import end_persistent
-from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import TargetLoss, TargetTracker, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt import VisualTargetTracker, VttOptions
 from marsyard.scenarios.conformance import trackers
@@ -29,7 +29,7 @@ from marsyard.sim.measurements import PixelTarget, RoverTarget, SiteTarget, Targ
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "target_tracker.py"
 
-#: Serves Marsyard's own tracker over the exchange; its process says its number with every update.
+#: Serves Marsyard's tracker over the exchange; each update contains the process id.
 SERVER = """
 import json, os, sys
 from pathlib import Path
@@ -63,13 +63,13 @@ for line in sys.stdin:
 """
 
 
-def tracker(spec: str, time_s: float = 60.0) -> ExecutableTargetTracker:
+def make_tracker(spec: str, time_s: float = 60.0) -> ExecutableTargetTracker:
     command = parse_command(spec)
     assert command is not None
     return ExecutableTargetTracker(command, ExecutableLimits(time_s=time_s))
 
 
-def server(folder: Path, text: str = SERVER) -> str:
+def write_server(folder: Path, text: str = SERVER) -> str:
     path = folder / "tracker.py"
     path.write_text(text)
     return f"{sys.executable} {path}"
@@ -82,23 +82,23 @@ def process_of(update: TargetUpdate) -> int:
 
 @pytest.fixture
 def paths(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Programs find Marsyard's packages, as they do where it is installed."""
+    """Make Marsyard's packages importable in programs."""
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
 
 
 @pytest.mark.usefixtures("paths")
-def test_a_program_answers_as_the_same_tracker_in_python(tmp_path: Path) -> None:
-    own = VisualTargetTracker(VttOptions())
-    mine = trackers.drive(own)
-    program = tracker(f"serve:{server(tmp_path)}")
-    its = trackers.drive(program)
-    assert [one.state for one in its] == [TrackingState.NORMAL] * len(mine)
-    for one, other in zip(mine, its, strict=True):
+def test_program_matches_python_tracker(tmp_path: Path) -> None:
+    python_tracker = VisualTargetTracker(VttOptions())
+    reference = trackers.drive(python_tracker)
+    program = make_tracker(f"serve:{write_server(tmp_path)}")
+    actual = trackers.drive(program)
+    assert [one.state for one in actual] == [TrackingState.NORMAL] * len(reference)
+    for one, other in zip(reference, actual, strict=True):
         assert one.position_rover is not None
         assert other.position_rover is not None
-        # numbers go over as they are, quaternions normalised again
+        # Numbers are exchanged exactly; quaternions are normalised again.
         np.testing.assert_allclose(other.position_rover, one.position_rover, rtol=0.0, atol=1e-12)
-    lost, expected = (trackers.stop(one, trackers.pose(2.0), blank=0) for one in (program, own))
+    lost, expected = (trackers.stop(one, trackers.pose(2.0), blank=0) for one in (program, python_tracker))
     assert lost is not None
     assert expected is not None
     assert lost.state is program.state is TrackingState.LOST
@@ -110,36 +110,36 @@ def test_a_program_answers_as_the_same_tracker_in_python(tmp_path: Path) -> None
 
 
 @pytest.mark.usefixtures("paths")
-def test_a_process_for_one_run_or_for_many(tmp_path: Path) -> None:
-    words = server(tmp_path)
+def test_process_serves_one_run_or_many(tmp_path: Path) -> None:
+    words = write_server(tmp_path)
     for prefix, shared in (("serve", True), ("exec", False)):
         processes = []
         for _ in range(2):
-            one = tracker(f"{prefix}:{words}")
+            one = make_tracker(f"{prefix}:{words}")
             processes.append({process_of(update) for update in trackers.drive(one)})
             del one
             gc.collect()
-        assert all(len(mine) == 1 for mine in processes)
+        assert all(len(reference) == 1 for reference in processes)
         assert (processes[0] == processes[1]) is shared
     end_persistent()
-    gone = [one for found in processes for one in found if Path(f"/proc/{one}").exists()]
+    gone = [one for result in processes for one in result if Path(f"/proc/{one}").exists()]
     assert gone == []
 
 
 @pytest.mark.usefixtures("paths")
-def test_the_example_follows_the_target() -> None:
-    updates = trackers.drive(tracker(f"exec:{sys.executable} {EXAMPLE}"))
+def test_example_tracks_the_target() -> None:
+    updates = trackers.drive(make_tracker(f"exec:{sys.executable} {EXAMPLE}"))
     assert [update.state for update in updates] == [TrackingState.NORMAL] * 4
     for number, update in enumerate(updates):
         true = trackers.pose(0.4 * number).inv().apply(trackers.TARGET_M)
         assert update.position_rover is not None
-        # half a pixel of disparity at 8 m with 0.2 m of baseline is 0.13 m of range; across, it is 7 mm
+        # Half a pixel of disparity at 8 m with a baseline of 0.2 m is 0.13 m of range, and 7 mm across.
         assert np.abs(update.position_rover - true)[0] < 0.27
         assert np.abs(update.position_rover - true)[1:].max() < 0.05
 
 
 READY = 'import json, sys\nprint(json.dumps({"exchange": 1, "ready": True}), flush=True)\n'
-#: Gives the answers, whatever it is asked.
+#: Writes the answers without reading the requests.
 ANSWERING = (
     READY
     + """
@@ -160,7 +160,7 @@ for answer in ANSWERS:
     [
         ("['{}']", "exchange is None; allowed: 1"),
         ("['{\"exchange\": 1}']", "state is None; allowed: NO_TARGET, NORMAL"),
-        # which of both is seen depends on how soon it ends
+        # the reported fault depends on how soon the process ends
         ("[]", "its output ended before it had answered|it reads no more cases"),
         ('[OK, \'{"exchange": 1, "aim": 3}\']', "aim is 3; allowed: null"),
         ('[OK, \'{"exchange": 1, "aim": {"azimuth_rad": 0}}\']', "aim lacks an angle"),
@@ -179,42 +179,42 @@ for answer in ANSWERS:
         ),
     ],
 )
-def test_whatever_a_program_answers_wrong_is_a_fault(tmp_path: Path, answers: str, message: str) -> None:
+def test_invalid_answers_are_reported_as_faults(tmp_path: Path, answers: str, message: str) -> None:
     fault = Fault.CRASHED if answers == "[]" else Fault.BAD_ANSWER
     with pytest.raises(AlgorithmError, match=message) as caught:
-        trackers.drive(tracker(f"exec:{server(tmp_path, ANSWERING.replace('ANSWERS', answers))}"))
+        trackers.drive(make_tracker(f"exec:{write_server(tmp_path, ANSWERING.replace('ANSWERS', answers))}"))
     assert caught.value.fault is fault
     assert caught.value.stderr == ("" if fault is Fault.CRASHED else "hm\n")
 
 
-def test_a_program_that_hangs_is_ended(tmp_path: Path) -> None:
-    one = tracker(f"exec:{server(tmp_path, READY + 'import time; time.sleep(60)')}", time_s=1.0)
+def test_hanging_program_is_terminated(tmp_path: Path) -> None:
+    one = make_tracker(f"exec:{write_server(tmp_path, READY + 'import time; time.sleep(60)')}", time_s=1.0)
     with pytest.raises(AlgorithmError, match="no answer within 1 s") as caught:
         one.designate(trackers.designation(), trackers.pose(0.0))
     assert caught.value.fault is Fault.TIMED_OUT
 
 
-def test_what_a_tracker_is_given_comes_back_as_it_was(tmp_path: Path) -> None:
+def test_tracker_inputs_round_trip(tmp_path: Path) -> None:
     mast = trackers.mast()
     write_mast(tmp_path, mast)
-    known = read_mast(tmp_path)
-    assert known.geometry.azimuth_limits_rad == mast.geometry.azimuth_limits_rad
-    np.testing.assert_array_equal(known.geometry.head_m, mast.geometry.head_m)
-    for mine, its in ((mast.left, known.left), (mast.right, known.right)):
-        np.testing.assert_array_equal(mine.h, its.h)
-        assert mine.size == its.size
+    camera_pair = read_mast(tmp_path)
+    assert camera_pair.geometry.azimuth_limits_rad == mast.geometry.azimuth_limits_rad
+    np.testing.assert_array_equal(camera_pair.geometry.head_m, mast.geometry.head_m)
+    for reference, actual in ((mast.left, camera_pair.left), (mast.right, camera_pair.right)):
+        np.testing.assert_array_equal(reference.h, actual.h)
+        assert reference.size == actual.size
     aim = VisualTargetTracker(VttOptions())
     aim.designate(trackers.designation(), trackers.pose(0.0))
     reported = aim.aim(trackers.pose(0.0), mast)
     assert reported is not None
-    turned = RigidTransform.from_components([1.0, 2.0, 3.0], Rotation.from_rotvec([0.1, -0.2, 0.3]))
-    stop = replace(trackers.take_pictures(reported, trackers.pose(0.0)), world_from_rover=turned)
+    rotated = RigidTransform.from_components([1.0, 2.0, 3.0], Rotation.from_rotvec([0.1, -0.2, 0.3]))
+    stop = replace(trackers.take_pictures(reported, trackers.pose(0.0)), world_from_rover=rotated)
     write_stop(tmp_path, stop)
-    back = read_stop(tmp_path, known)
+    back = read_stop(tmp_path, camera_pair)
     np.testing.assert_array_equal(back.left.counts, stop.left.counts)
     assert (back.left.corner, back.right.corner) == (stop.left.corner, stop.right.corner)
     assert (back.azimuth_rad, back.elevation_rad) == (stop.azimuth_rad, stop.elevation_rad)
-    np.testing.assert_allclose(back.world_from_rover.as_matrix(), turned.as_matrix(), atol=1e-15)
+    np.testing.assert_allclose(back.world_from_rover.as_matrix(), rotated.as_matrix(), atol=1e-15)
     assert "true" not in (tmp_path / "stop.json").read_text()
     for path in ("mast.json", "stop.json"):
         (tmp_path / path).write_text("{}")
@@ -232,6 +232,6 @@ def test_what_a_tracker_is_given_comes_back_as_it_was(tmp_path: Path) -> None:
         SiteTarget(np.array([1.0, 2.0, -3.0])),
     ],
 )
-def test_targets_are_reported_in_each_of_the_three_ways(target: TargetDesignation) -> None:
+def test_all_three_target_designations_round_trip(target: TargetDesignation) -> None:
     assert encode_target(read_target(encode_target(target))) == encode_target(target)
     assert type(read_target(encode_target(target))) is type(target)

@@ -1,4 +1,4 @@
-"""Operators that find a template again, magnified, rolled or warped, against definitions and analytic pictures."""
+"""Tests of template matching under shift, scale, roll and warp against definitions and analytic images."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def brute_force(template: np.ndarray, window: np.ndarray) -> np.ndarray:
     return result
 
 
-def natural(seed: int, size: int, blur: float = 1.2) -> np.ndarray:
-    """Counts of a random texture of about 10 % contrast, blurred as by optics."""
+def draw_natural_image(seed: int, size: int, blur: float = 1.2) -> np.ndarray:
+    """Counts of a random texture with about 10 % contrast, blurred as by optics."""
     noise = np.random.default_rng(seed).normal(size=(size, size))
     image = ndimage.gaussian_filter(noise, blur) + 2.0 * ndimage.gaussian_filter(noise, 4.0 * blur)
     return np.asarray(1500.0 + 150.0 * image / image.std())
@@ -31,42 +31,42 @@ def natural(seed: int, size: int, blur: float = 1.2) -> np.ndarray:
 def test_correlation_equals_its_definition(n: int, m: int, rows: int, columns: int) -> None:
     rng = np.random.default_rng(n * rows)
     template, window = 1000.0 + 30.0 * rng.normal(size=(n, m)), 1500.0 + 50.0 * rng.normal(size=(rows, columns))
-    # Sums of products are float32: 1e-7 of about the energy itself.
+    # Sums of products are float32: 1e-7 of the energy.
     np.testing.assert_allclose(normalized_correlation(template, window), brute_force(template, window), atol=1e-5)
 
 
-def test_gain_and_offset_do_not_matter() -> None:
-    window = natural(1, 60)
+def test_correlation_ignores_gain_and_offset() -> None:
+    window = draw_natural_image(1, 60)
     surface = normalized_correlation(0.5 * window[7:28, 13:34] + 200.0, window)
     assert divmod(int(np.argmax(surface)), surface.shape[1]) == (7, 13)
     assert surface[7, 13] == pytest.approx(1.0, abs=1e-5)
 
 
-def test_flat_patches_correlate_with_nothing() -> None:
-    window = natural(2, 60)
+def test_uniform_patches_have_zero_correlation() -> None:
+    window = draw_natural_image(2, 60)
     window[20:50, 20:50] = 800.0
     surface = normalized_correlation(window[0:21, 0:21], window)
     assert np.all(surface[20:30, 20:30] == 0.0)
     assert np.all(normalized_correlation(np.full((5, 5), 7.0), window) == 0.0)
 
 
-def test_templates_larger_than_the_window_are_refused() -> None:
+def test_template_larger_than_window_is_rejected() -> None:
     with pytest.raises(ValueError, match="does not fit"):
         normalized_correlation(np.zeros((9, 9)), np.zeros((20, 8)))
     with pytest.raises(ValueError, match="halved"):
         coarse_to_fine_peak(np.zeros((5, 5)), np.zeros((20, 20)), 2, 3)
 
 
-def test_halving_averages() -> None:
+def test_halving_averages_pixels() -> None:
     image = np.arange(35.0).reshape(5, 7)
     np.testing.assert_allclose(halve(image), [[4.0, 6.0, 8.0], [18.0, 20.0, 22.0]])
 
 
-def test_coarse_to_fine_finds_what_the_full_search_finds() -> None:
-    # Even and odd places alike: the coarse template is aligned with the coarse window in a quarter of them only.
+def test_coarse_to_fine_search_equals_full_search() -> None:
+    # Even and odd positions: the coarse template is aligned with the coarse window in only a quarter of them.
     rng = np.random.default_rng(5)
     for trial in range(40):
-        window = natural(trial, 121)
+        window = draw_natural_image(trial, 121)
         row, column = rng.integers(0, 100, 2)
         template = window[row : row + 21, column : column + 21] + rng.normal(0.0, 40.0, (21, 21))
         full = coarse_to_fine_peak(template, window, 0, 1)
@@ -77,8 +77,8 @@ def test_coarse_to_fine_finds_what_the_full_search_finds() -> None:
         assert quick.on_border == full.on_border
 
 
-def blobs(seed: int, points: np.ndarray, width: float = 2.0) -> np.ndarray:
-    """An analytic picture at points (..., 2) of (u, v): a sum of Gaussians."""
+def render_blobs(seed: int, points: np.ndarray, width: float = 2.0) -> np.ndarray:
+    """An analytic image at points (..., 2) of (u, v): a sum of Gaussians."""
     rng = np.random.default_rng(seed)
     image = np.zeros(points.shape[:-1])
     for (u, v), height in zip(rng.uniform(-10.0, 90.0, (600, 2)), rng.normal(size=600), strict=True):
@@ -86,80 +86,82 @@ def blobs(seed: int, points: np.ndarray, width: float = 2.0) -> np.ndarray:
     return image
 
 
-def grid(size: int) -> np.ndarray:
+def pixel_grid(size: int) -> np.ndarray:
     return np.stack(np.meshgrid(np.arange(float(size)), np.arange(float(size))), axis=-1)
 
 
-def test_patches_at_whole_pixels_are_the_picture() -> None:
-    image = natural(3, 60)
+def test_patches_at_whole_pixels_equal_the_image() -> None:
+    image = draw_natural_image(3, 60)
     np.testing.assert_allclose(similarity_patch(image, np.array([31.0, 27.0]), 21), image[17:38, 21:42], atol=1e-8)
 
 
 @pytest.mark.parametrize(
     ("magnification", "roll_deg"), [(1.0, 0.0), (1.13, 0.0), (0.9, 0.0), (1.0, 30.0), (1.1, -12.0)]
 )
-def test_patches_are_magnified_and_rolled_about_the_point(magnification: float, roll_deg: float) -> None:
-    image, centre = blobs(4, grid(80)), np.array([40.37, 38.81])
+def test_patches_are_scaled_and_rolled_about_the_point(magnification: float, roll_deg: float) -> None:
+    image, centre = render_blobs(4, pixel_grid(80)), np.array([40.37, 38.81])
     patch = similarity_patch(image, centre, 21, magnification, np.deg2rad(roll_deg))
-    offsets = (grid(21) - 10.0) / magnification
-    # What is now to the right of the middle was, before a clockwise turn, above and to the right.
+    offsets = (pixel_grid(21) - 10.0) / magnification
+    # Before a clockwise roll, the content right of the centre was above and to the right.
     turn = np.deg2rad(roll_deg)
     back = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    np.testing.assert_allclose(patch, blobs(4, centre + offsets @ back.T), atol=2e-3 * image.std())
+    np.testing.assert_allclose(patch, render_blobs(4, centre + offsets @ back.T), atol=2e-3 * image.std())
 
 
-def test_registration_finds_shifts_to_thousandths() -> None:
-    image = blobs(6, grid(80))
+def test_registration_finds_subpixel_shifts() -> None:
+    image = render_blobs(6, pixel_grid(80))
     for centre in np.random.default_rng(1).uniform(35.0, 45.0, (10, 2)):
-        template = 0.7 * blobs(6, centre + grid(21) - 10.0) + 3.0
+        template = 0.7 * render_blobs(6, centre + pixel_grid(21) - 10.0) + 3.0
         start = np.rint(centre[::-1]) - 10.0
         for warp in WARPS:
-            found = register_template(template, image, start, warp)
-            assert found is not None
-            np.testing.assert_allclose(found.corner + 10.0, centre[::-1], atol=3e-3)
-            assert found.score > 0.9999
+            result = register_template(template, image, start, warp)
+            assert result is not None
+            np.testing.assert_allclose(result.corner + 10.0, centre[::-1], atol=3e-3)
+            assert result.score > 0.9999
 
 
-def test_without_stretch_a_stretched_picture_pulls_the_match_aside() -> None:
-    image = blobs(7, grid(80))
+def test_stretched_image_biases_match_without_stretch_model() -> None:
+    image = render_blobs(7, pixel_grid(80))
     stretch = np.array([[1.04, 0.05], [-0.03, 1.1]])
     errors: dict[Warp, list[float]] = {warp: [] for warp in WARPS}
     for centre in np.random.default_rng(2).uniform(35.0, 45.0, (20, 2)):
-        template = blobs(7, centre + (grid(21) - 10.0) @ np.linalg.inv(stretch).T)
-        for warp, found in errors.items():
+        template = render_blobs(7, centre + (pixel_grid(21) - 10.0) @ np.linalg.inv(stretch).T)
+        for warp, result in errors.items():
             match = register_template(template, image, centre[::-1] - 10.0, warp)
             assert match is not None
-            found.append(float(np.hypot(*(match.corner + 10.0 - centre[::-1]))))
+            result.append(float(np.hypot(*(match.corner + 10.0 - centre[::-1]))))
     assert np.max(errors["stretch"]) < 0.02
     assert np.max(errors["bend"]) < 0.02
     assert np.sqrt(np.mean(np.square(errors["shift"]))) > 0.05
 
 
-def test_without_bend_a_bent_picture_pulls_the_match_aside() -> None:
-    """As a round rock's does by 0.04 px a step, always to the same side: the border moves down by half a pixel."""
-    image, offsets = blobs(11, grid(80)), grid(21) - 10.0
+def test_bent_image_biases_match_without_bend_model() -> None:
+    """A round rock bends the image by 0.04 px per step in one direction: the border moves by half a pixel."""
+    image, offsets = render_blobs(11, pixel_grid(80)), pixel_grid(21) - 10.0
     bent = offsets + 0.005 * np.stack([np.zeros_like(offsets[..., 0]), (offsets**2).sum(axis=-1)], axis=-1)
     errors: dict[Warp, list[float]] = {"stretch": [], "bend": []}
     for centre in np.random.default_rng(4).uniform(35.0, 45.0, (20, 2)):
-        template = blobs(11, centre + bent)
-        for warp, found in errors.items():
+        template = render_blobs(11, centre + bent)
+        for warp, result in errors.items():
             match = register_template(template, image, centre[::-1] - 10.0, warp)
             assert match is not None
-            found.append(float(match.corner[0] + 10.0 - centre[1]))
+            result.append(float(match.corner[0] + 10.0 - centre[1]))
     assert np.max(np.abs(errors["bend"])) < 0.02
     assert np.mean(errors["stretch"]) > 0.2
 
 
-def test_registration_refuses_what_it_cannot_determine() -> None:
-    image = blobs(8, grid(80))
+def test_registration_rejects_undetermined_shifts() -> None:
+    image = render_blobs(8, pixel_grid(80))
     template = image[30:51, 30:51]
     assert register_template(np.full((21, 21), 5.0), image, np.array([30.0, 30.0]), "shift") is None
     stripes = np.broadcast_to(np.sin(0.4 * np.arange(80.0)), (80, 80)).copy()
     assert (
         register_template(stripes[30:51, 30:51], stripes, np.array([30.0, 30.0]), "shift") is None
-    )  # free along the stripes
-    assert register_template(template, image, np.array([26.0, 27.0]), "shift") is None  # further away than the limit
+    )  # undetermined along the stripes
+    assert register_template(template, image, np.array([26.0, 27.0]), "shift") is None  # beyond the limit
     assert (
         register_template(image[:21, :21], image, np.array([0.0, 0.0]), "shift") is None
     )  # the spline needs neighbours
-    assert register_template(template, -image, np.array([30.0, 30.0]), "shift") is None  # only its negative is there
+    assert (
+        register_template(template, -image, np.array([30.0, 30.0]), "shift") is None
+    )  # only the negative image is present

@@ -1,4 +1,4 @@
-"""Operators on plain arrays, against brute force and closed forms."""
+"""Tests of image operators against brute force and closed forms."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def brute_force(template: np.ndarray, window: np.ndarray) -> np.ndarray:
 def test_correlation_equals_its_definition(n: int, m: int, rows: int, columns: int) -> None:
     rng = np.random.default_rng(n * rows)
     template, window = 1000.0 + rng.normal(size=(n, m)), 1500.0 + 3.0 * rng.normal(size=(rows, columns))
-    # Rounding: values of 1e3 with deviations of 1 leave about 1e-16 * 1e6 of the squares.
+    # Values of 1e3 with deviations of 1 leave about 1e-16 * 1e6 of the squares.
     np.testing.assert_allclose(
         pseudo_normalized_correlation(template, window), brute_force(template, window), atol=1e-10
     )
 
 
-def test_correlation_is_one_where_the_template_was_cut_out_whatever_is_added() -> None:
+def test_correlation_is_one_at_template_position_for_any_offset() -> None:
     window = np.random.default_rng(2).normal(size=(40, 50))
     surface = pseudo_normalized_correlation(window[7:22, 13:28] + 500.0, window)
     assert surface.shape == (26, 36)
@@ -54,14 +54,14 @@ def test_correlation_is_one_where_the_template_was_cut_out_whatever_is_added() -
     assert peak.value == pytest.approx(1.0, abs=1e-12)
 
 
-def test_correlation_falls_when_contrasts_differ() -> None:
-    # 2 g / (1 + g^2) for a gain g: it is only pseudo-normalised.
+def test_correlation_decreases_with_contrast_difference() -> None:
+    # 2 g / (1 + g^2) for a gain g: the correlation is only pseudo-normalised.
     patch = np.random.default_rng(3).normal(size=(9, 9))
     assert pseudo_normalized_correlation(patch, 3.0 * patch)[0, 0] == pytest.approx(0.6, abs=1e-12)
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-3, 4095.0])
-def test_correlation_of_flat_patches_is_zero(value: float) -> None:
+def test_uniform_patches_have_zero_correlation(value: float) -> None:
     assert np.all(pseudo_normalized_correlation(np.full((7, 7), value), np.full((20, 20), value)) == 0.0)
 
 
@@ -72,8 +72,8 @@ def test_correlation_is_bounded_and_finite(window: np.ndarray, n: int, m: int) -
     assert np.all(np.abs(surface) <= 1.0)
 
 
-def blobs(seed: int, shift: tuple[float, float] = (0.0, 0.0), size: int = 55, width: float = 1.2) -> np.ndarray:
-    """An analytic picture: a sum of Gaussians, moved by `shift` (row, column)."""
+def render_blobs(seed: int, shift: tuple[float, float] = (0.0, 0.0), size: int = 55, width: float = 1.2) -> np.ndarray:
+    """An analytic image: a sum of Gaussians, shifted by `shift` (row, column)."""
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[:size, :size].astype(float)
     image = np.zeros((size, size))
@@ -83,45 +83,45 @@ def blobs(seed: int, shift: tuple[float, float] = (0.0, 0.0), size: int = 55, wi
 
 
 def subpixel_errors(align: bool) -> np.ndarray:
-    """Errors (row, column) of measured shifts over a table of fractions of a pixel."""
+    """Errors (row, column) of measured shifts for a table of fractions of a pixel."""
     fractions = np.linspace(-0.5, 0.5, 6)
     errors = []
     for k, (fy, fx) in enumerate((a, b) for a in fractions[::2] for b in fractions):
-        template = blobs(k % 2)[12:43, 12:43]
-        window = blobs(k % 2, (fy, fx))
+        template = render_blobs(k % 2)[12:43, 12:43]
+        window = render_blobs(k % 2, (fy, fx))
         surface = pseudo_normalized_correlation(template, window)
         peak = highest_peak(surface)
         start = np.array([peak.row, peak.column]) + biquadratic_offset(surface, peak)
-        found = refine_shift(template, window, start) if align else start
-        assert found is not None
-        errors.append(found - 12.0 - np.array([fy, fx]))
+        result = refine_shift(template, window, start) if align else start
+        assert result is not None
+        errors.append(result - 12.0 - np.array([fy, fx]))
     return np.array(errors)
 
 
-def test_subpixel_bias() -> None:
-    # The biquadratic leans towards whole pixels by up to 0.09 px on sharp texture (design notes); alignment on quintic
-    # splines must do better than 0.005 px there.
+def test_subpixel_bias_is_within_limits() -> None:
+    # The biquadratic fit is biased by up to 0.09 px on sharp texture (design notes). Alignment on quintic splines must
+    # be better than 0.005 px.
     assert np.abs(subpixel_errors(align=False)).max() < 0.12
     assert np.abs(subpixel_errors(align=True)).max() < 0.005
 
 
-def test_alignment_gives_up_rather_than_wander() -> None:
-    window = blobs(1)
-    template = blobs(2)[12:43, 12:43]
+def test_undetermined_alignment_returns_none() -> None:
+    window = render_blobs(1)
+    template = render_blobs(2)[12:43, 12:43]
     assert refine_shift(np.zeros((31, 31)), window, np.array([12.0, 12.0])) is None
-    assert refine_shift(window[12:43, 12:43], window, np.array([1.0, 12.0])) is None  # too near the border
+    assert refine_shift(window[12:43, 12:43], window, np.array([1.0, 12.0])) is None  # too close to the border
     edge = np.tile(np.linspace(0.0, 1.0, 55), (55, 1))
-    assert refine_shift(edge[12:43, 12:43], edge, np.array([12.0, 12.0])) is None  # slides along itself
-    found = refine_shift(template, window, np.array([12.0, 12.0]))
-    assert found is None or np.hypot(*(found - 12.0)) <= 1.5
+    assert refine_shift(edge[12:43, 12:43], edge, np.array([12.0, 12.0])) is None  # undetermined along the edge
+    result = refine_shift(template, window, np.array([12.0, 12.0]))
+    assert result is None or np.hypot(*(result - 12.0)) <= 1.5
 
 
 def test_shifted_patch_equals_scipys_spline() -> None:
-    image = blobs(4)
+    image = render_blobs(4)
     corner = np.array([20.3, 17.8])
     patch, by_row, by_column = shifted_patch(spline_coefficients(image), corner, (9, 11))
-    places = np.mgrid[:9, :11] + corner[:, None, None]
-    np.testing.assert_allclose(patch, ndimage.map_coordinates(image, places, order=5, mode="mirror"), atol=1e-12)
+    positions = np.mgrid[:9, :11] + corner[:, None, None]
+    np.testing.assert_allclose(patch, ndimage.map_coordinates(image, positions, order=5, mode="mirror"), atol=1e-12)
     step = 1e-4
     ahead = shifted_patch(spline_coefficients(image), corner + np.array([step, 0.0]), (9, 11))[0]
     right = shifted_patch(spline_coefficients(image), corner + np.array([0.0, step]), (9, 11))[0]
@@ -131,20 +131,20 @@ def test_shifted_patch_equals_scipys_spline() -> None:
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 3), (3, 2), (23, 17)])
 def test_cubic_sampling_equals_scipys(shape: tuple[int, int]) -> None:
-    """Of a part that begins at row 40 and column 30 of a picture, up to the middles of its outermost pixels."""
+    """A part of an image that starts at row 40 and column 30, up to the centres of its outermost pixels."""
     rng = np.random.default_rng(6)
     image = rng.normal(size=shape)
     ends = np.stack(np.meshgrid([0.0, shape[1] - 1.0], [0.0, shape[0] - 1.0]), axis=-1)
-    places = np.concatenate([ends, rng.uniform(0.0, 1.0, (2, 30, 2)) * (np.array(shape[::-1]) - 1.0)], axis=1)
-    found = np.empty(places.shape[:2])
+    positions = np.concatenate([ends, rng.uniform(0.0, 1.0, (2, 30, 2)) * (np.array(shape[::-1]) - 1.0)], axis=1)
+    result = np.empty(positions.shape[:2])
     coefficients = ndimage.spline_filter(image, order=3, mode="mirror")
-    cubic.sample(coefficients, places + np.array([30.0, 40.0]), 40, 30, found)
-    theirs = ndimage.map_coordinates(image, np.moveaxis(places, -1, 0)[::-1], order=3, mode="mirror")
-    # places up to 60 are rounded to 7e-15, slopes are a few units per pixel
-    np.testing.assert_allclose(found, theirs, rtol=0.0, atol=1e-12)
+    cubic.sample(coefficients, positions + np.array([30.0, 40.0]), 40, 30, result)
+    expected = ndimage.map_coordinates(image, np.moveaxis(positions, -1, 0)[::-1], order=3, mode="mirror")
+    # Positions up to 60 are rounded to 7e-15; gradients are a few units per pixel.
+    np.testing.assert_allclose(result, expected, rtol=0.0, atol=1e-12)
 
 
-def test_pixels_are_held_in_the_picture() -> None:
+def test_pixels_are_clamped_to_the_image() -> None:
     pixels = np.array([[[-3.0, 5.0], [12.5, 99.0]], [[np.nan, np.nan], [31.0, 2.0]]])
     extent = cubic.hold(pixels, np.array([[True, True], [False, True]]), 20, 10)
     np.testing.assert_array_equal(pixels, [[[0.0, 5.0], [12.5, 9.0]], [[0.0, 0.0], [19.0, 2.0]]])
@@ -157,7 +157,7 @@ def test_biquadratic_is_exact_on_a_quadric() -> None:
     np.testing.assert_allclose(biquadratic_offset(surface, highest_peak(surface)), [0.3, -0.2], atol=1e-12)
 
 
-def test_biquadratic_stays_put_without_a_maximum() -> None:
+def test_biquadratic_without_maximum_keeps_whole_pixel() -> None:
     rows, columns = np.mgrid[:9, :9].astype(float)
     saddle = (rows - 4.0) ** 2 - (columns - 4.0) ** 2
     assert np.all(biquadratic_offset(saddle, Peak(4, 4, 0.0, False)) == 0.0)
@@ -171,8 +171,8 @@ def gaussian(rows: float, columns: float, widths: tuple[float, float] = (1.5, 1.
     return np.asarray(np.exp(-((y - rows) ** 2) / (2 * widths[0] ** 2) - (x - columns) ** 2 / (2 * widths[1] ** 2)))
 
 
-def test_peak_width_is_that_of_the_longest_direction() -> None:
-    # A Gaussian of width s is above 3/4 within s sqrt(2 ln 4/3) = 0.759 s: full width 1.517 s. Pixels are whole.
+def test_peak_width_uses_the_widest_direction() -> None:
+    # A Gaussian of width s exceeds 3/4 within s sqrt(2 ln 4/3) = 0.759 s: full width 1.517 s, in whole pixels.
     for s in (2.0, 4.0, 6.0):
         surface = gaussian(20.0, 20.0, (2.0, s))
         assert peak_width(surface, highest_peak(surface)) == pytest.approx(1.517 * max(s, 2.0), abs=1.0)
@@ -182,9 +182,9 @@ def test_peak_width_is_that_of_the_longest_direction() -> None:
     assert peak_width(np.zeros((9, 9)), Peak(0, 0, 0.0, True)) > 9.0
 
 
-def test_second_peak_is_a_maximum_of_its_own() -> None:
+def test_second_peak_is_a_separate_maximum() -> None:
     one = gaussian(20.0, 20.0, (4.0, 4.0))
-    assert second_peak(one, highest_peak(one), 3.0) == 0.0  # its flanks are no second peak
+    assert second_peak(one, highest_peak(one), 3.0) == 0.0  # the flanks of a peak are not a second peak
     two = np.maximum(one, 0.7 * gaussian(31.0, 9.0))
     assert second_peak(two, highest_peak(two), 3.0) == pytest.approx(0.7)
     near = np.maximum(gaussian(20.0, 20.0), 0.9 * gaussian(20.0, 23.0))
@@ -192,17 +192,17 @@ def test_second_peak_is_a_maximum_of_its_own() -> None:
     assert second_peak(near, highest_peak(near), 2.0) == pytest.approx(0.9)
 
 
-def test_interest_asks_for_structure_in_both_directions() -> None:
+def test_interest_requires_gradients_in_both_directions() -> None:
     u, v = np.meshgrid(np.arange(64.0), np.arange(64.0))
     one_way, both_ways = 10.0 * np.sin(0.3 * u), 10.0 * (np.sin(0.3 * u) + np.sin(0.3 * v))
     interest = [harris_interest(*structure_tensor(image, 21)) for image in (one_way, both_ways)]
     assert interest[0][32, 32] < 0.05 * interest[1][32, 32]
-    # RMS gradient per axis is 10 * 0.3 / sqrt(2) = 2.12; Sobel's difference over two pixels damps by sin(0.3) / 0.3,
-    # and 21 pixels are one period of 20.9.
+    # The RMS gradient per axis is 10 * 0.3 / sqrt(2) = 2.12. Sobel's difference over two pixels attenuates by sin(0.3)
+    # / 0.3. 21 pixels are one period of 20.9.
     assert interest[1][32, 32] == pytest.approx(2.12 * np.sin(0.3) / 0.3, rel=0.02)
     assert np.all(harris_interest(*structure_tensor(np.full((64, 64), 7.0), 21)) == 0.0)
 
 
-def test_local_mean() -> None:
+def test_local_mean_matches_direct_average() -> None:
     image = np.arange(100.0).reshape(10, 10)
     assert local_mean(image, 3)[4, 4] == pytest.approx(44.0)

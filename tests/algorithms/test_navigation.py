@@ -1,4 +1,4 @@
-"""Steering to a goal: around obstacles, over mapped ground only."""
+"""Tests of navigation to a goal around obstacles and over mapped ground."""
 
 from __future__ import annotations
 
@@ -23,168 +23,172 @@ EAST, NAVCAM = 0.5 * np.pi, np.radians(45.0)
 EVERYWHERE = TerrainMap((Wedge(np.zeros(2), 0.0, np.pi, 0.0, 100.0),))
 
 
-def _pose(east: float, north: float, yaw_deg: float = 0.0) -> RigidTransform:
+def _make_pose(east: float, north: float, yaw_deg: float = 0.0) -> RigidTransform:
     return rigid(Rotation.from_euler("Z", yaw_deg, degrees=True), np.array([east, north, 0.0]))
 
 
-def _rock(east: float, north: float, radius: float = 0.25, height: float = 0.4, name: str = "rock") -> Obstacle:
+def _make_rock(east: float, north: float, radius: float = 0.25, height: float = 0.4, name: str = "rock") -> Obstacle:
     return Obstacle(name, np.array([east, north]), radius, height)
 
 
-def _after(pose: RigidTransform, command: DriveCommand) -> RigidTransform:
+def _apply_command(pose: RigidTransform, command: DriveCommand) -> RigidTransform:
     """The pose after a command on level ground, without slip."""
     moved = np.array([*command.displacement_m, 0.0])
     return pose * rigid(Rotation.from_rotvec([0.0, 0.0, command.turn_left_rad]), moved)
 
 
-def _driven(terrain: TerrainMap, pose: RigidTransform, goal: np.ndarray, step_m: float, **more: object) -> np.ndarray:
-    """Places (east, north) where the rover comes to stand, planning anew at each step, until it is at the goal."""
-    places = [pose.translation[:2]]
+def _drive_to_goal(
+    terrain: TerrainMap, pose: RigidTransform, goal: np.ndarray, step_m: float, **more: object
+) -> np.ndarray:
+    """Positions (east, north) of the rover with a new plan at each step, until it reaches the goal."""
+    positions = [pose.translation[:2]]
     for _ in range(60):
         plan = navigate(terrain, pose, goal, step_m, OPTIONS, **more)  # type: ignore[arg-type]
         if plan.outcome is NavigationOutcome.AT_GOAL:
-            return np.array(places)
+            return np.array(positions)
         assert plan.outcome is NavigationOutcome.PATH
         for command in plan.commands:
             for _ in range(10):
-                pose = _after(pose, command.part(0.1))
-                places.append(pose.translation[:2])
+                pose = _apply_command(pose, command.part(0.1))
+                positions.append(pose.translation[:2])
     raise AssertionError("the goal was not reached")
 
 
-def _length(plan: NavigationPlan) -> float:
+def _path_length_m(plan: NavigationPlan) -> float:
     return sum(command.length_m for command in plan.commands)
 
 
-def test_free_ground_is_crossed_straight() -> None:
-    plan = navigate(EVERYWHERE, _pose(0.0, 0.0), np.array([5.0, 0.0]), 0.5, OPTIONS)
+def test_free_ground_is_crossed_in_a_straight_line() -> None:
+    plan = navigate(EVERYWHERE, _make_pose(0.0, 0.0), np.array([5.0, 0.0]), 0.5, OPTIONS)
     assert plan.outcome is NavigationOutcome.PATH
     assert plan.commands == (DriveCommand(forward_m=0.5),)
     assert plan.path_m[-1] == pytest.approx([5.0, 0.0])
 
 
-def test_a_goal_aside_is_reached_along_gentle_arcs() -> None:
-    plan = navigate(EVERYWHERE, _pose(0.0, 0.0), np.array([4.0, 1.0]), 0.3, OPTIONS)
-    # the circle that leaves the origin along x and passes (4, 1) has the curvature 2 y / (x^2 + y^2) = 2 / 17; a pair
-    # of arcs may bend a little more at first, and less later
+def test_lateral_goal_is_reached_along_gentle_arcs() -> None:
+    plan = navigate(EVERYWHERE, _make_pose(0.0, 0.0), np.array([4.0, 1.0]), 0.3, OPTIONS)
+    # The circle through the origin along x and (4, 1) has the curvature 2 y / (x^2 + y^2) = 2 / 17. A pair of arcs may
+    # have more curvature first and less later.
     assert plan.commands[0].turn_left_rad / plan.commands[0].forward_m == pytest.approx(2.0 / 17.0, abs=0.05)
-    assert _driven(EVERYWHERE, _pose(0.0, 0.0), np.array([4.0, 1.0]), 0.3)[-1] == pytest.approx([4.0, 1.0], abs=0.02)
+    assert _drive_to_goal(EVERYWHERE, _make_pose(0.0, 0.0), np.array([4.0, 1.0]), 0.3)[-1] == pytest.approx(
+        [4.0, 1.0], abs=0.02
+    )
 
 
-def test_a_goal_behind_is_turned_to_in_place_or_reached_backwards() -> None:
+def test_goal_behind_requires_turn_or_reverse_drive() -> None:
     goal = np.array([-3.0, 0.0])
-    turned = navigate(EVERYWHERE, _pose(0.0, 0.0), goal, 0.5, OPTIONS)
-    assert turned.commands[0].length_m == 0.0
-    assert abs(turned.commands[0].turn_left_rad) > np.radians(90.0)
-    back = navigate(EVERYWHERE, _pose(0.0, 0.0), goal, 0.5, OPTIONS, backwards=True)
+    rotated = navigate(EVERYWHERE, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS)
+    assert rotated.commands[0].length_m == 0.0
+    assert abs(rotated.commands[0].turn_left_rad) > np.radians(90.0)
+    back = navigate(EVERYWHERE, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS, backwards=True)
     assert len(back.commands) == 1
     assert back.commands[0].forward_m == pytest.approx(-0.5)
     assert back.commands[0].turn_left_rad == pytest.approx(0.0)
-    aside = _driven(EVERYWHERE, _pose(0.0, 0.0), np.array([-3.0, 0.5]), 0.5, backwards=True)
+    aside = _drive_to_goal(EVERYWHERE, _make_pose(0.0, 0.0), np.array([-3.0, 0.5]), 0.5, backwards=True)
     assert aside[-1] == pytest.approx([-3.0, 0.5], abs=0.02)
 
 
 @pytest.mark.parametrize("aside", [-0.3, 0.0, 0.4])
 @pytest.mark.parametrize("yaw_deg", [0.0, 135.0])
-def test_an_obstacle_is_passed_with_room(aside: float, yaw_deg: float) -> None:
+def test_obstacle_is_passed_with_clearance(aside: float, yaw_deg: float) -> None:
     turn = Rotation.from_euler("Z", yaw_deg, degrees=True).as_matrix()[:2, :2]
-    rock = _rock(*(turn @ np.array([3.0, aside])).tolist())
+    rock = _make_rock(*(turn @ np.array([3.0, aside])).tolist())
     terrain = TerrainMap(EVERYWHERE.wedges, (rock,))
     goal = turn @ np.array([7.0, 0.0])
-    places = _driven(terrain, _pose(0.0, 0.0, yaw_deg), goal, 0.5)
-    assert places[-1] == pytest.approx(goal, abs=0.02)
-    closest = np.hypot(*(places - rock.place_m).T).min()
-    # paths are looked at every 0.1 m: they may come nearer by a hundredth between
+    positions = _drive_to_goal(terrain, _make_pose(0.0, 0.0, yaw_deg), goal, 0.5)
+    assert positions[-1] == pytest.approx(goal, abs=0.02)
+    closest = np.hypot(*(positions - rock.place_m).T).min()
+    # Paths are sampled every 0.1 m: between samples the clearance may be 0.01 m smaller.
     assert closest > OPTIONS.half_width_m + OPTIONS.margin_m + rock.radius_m - 0.01
-    way = np.hypot(*np.diff(places, axis=0).T).sum()
+    way = np.hypot(*np.diff(positions, axis=0).T).sum()
     assert way < 1.25 * 7.0
 
 
-def test_rocks_that_wheels_climb_are_driven_over() -> None:
-    terrain = TerrainMap(EVERYWHERE.wedges, (_rock(3.0, 0.0, 0.15, 0.1),))
-    assert navigate(terrain, _pose(0.0, 0.0), np.array([6.0, 0.0]), 0.5, OPTIONS).commands == (DriveCommand(0.5),)
+def test_small_rocks_are_driven_over() -> None:
+    terrain = TerrainMap(EVERYWHERE.wedges, (_make_rock(3.0, 0.0, 0.15, 0.1),))
+    assert navigate(terrain, _make_pose(0.0, 0.0), np.array([6.0, 0.0]), 0.5, OPTIONS).commands == (DriveCommand(0.5),)
 
 
-def test_a_target_on_a_large_rock_is_avoided_unless_it_is_named() -> None:
-    rock = _rock(6.0, 0.0, 0.6, 0.8, "target")
+def test_target_rock_is_avoided_unless_it_is_named() -> None:
+    rock = _make_rock(6.0, 0.0, 0.6, 0.8, "target")
     terrain = TerrainMap(EVERYWHERE.wedges, (rock,))
     goal = np.array([4.8, 0.0])
-    assert navigate(terrain, _pose(0.0, 0.0), goal, 6.0, OPTIONS).outcome is NavigationOutcome.PATH
-    near = _pose(3.0, 0.0)
+    assert navigate(terrain, _make_pose(0.0, 0.0), goal, 6.0, OPTIONS).outcome is NavigationOutcome.PATH
+    near = _make_pose(3.0, 0.0)
     assert navigate(terrain, near, goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
     named = navigate(terrain, near, goal, 0.5, OPTIONS, target="target")
     assert named.commands == (DriveCommand(forward_m=0.5),)
 
 
 def _is_mapped(apex_east: float, azimuths_deg: tuple[float, ...], rocks: tuple[Obstacle, ...]) -> TerrainMap:
-    """Navcam wedges, 45 deg wide, whose lower edges see the ground from 1.8 m on."""
+    """Wedges of navcam images, 45 deg wide, that show the ground from 1.8 m."""
     terrain = TerrainMap()
     for azimuth in azimuths_deg:
         wedge = Wedge(np.array([apex_east, 0.0]), float(np.radians(azimuth)), 0.5 * NAVCAM, 1.8, 20.0)
-        terrain = terrain.sensed(wedge, rocks)
+        terrain = terrain.add_wedge(wedge, rocks)
     return terrain
 
 
-def test_one_wedge_is_too_narrow_to_pass_an_obstacle_and_two_suffice() -> None:
-    # seen from the place where the map was begun, 2.6 m behind; the obstacle is 2 m ahead
-    rocks = (_rock(2.0, 0.0),)
+def test_passing_an_obstacle_needs_two_wedges() -> None:
+    # The wedges start 2.6 m behind the rover; the obstacle is 2 m ahead.
+    rocks = (_make_rock(2.0, 0.0),)
     goal = np.array([6.0, 0.0])
     one, two = (_is_mapped(-2.6, azimuths, rocks) for azimuths in ((90.0,), (70.0, 110.0)))
-    assert navigate(one, _pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
-    places = _driven(two, _pose(0.0, 0.0), goal, 0.5)
-    assert places[-1] == pytest.approx(goal, abs=0.02)
-    assert two.mapped(places).all()
-    # without the obstacle one is wide enough
+    assert navigate(one, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome is NavigationOutcome.NO_PATH
+    positions = _drive_to_goal(two, _make_pose(0.0, 0.0), goal, 0.5)
+    assert positions[-1] == pytest.approx(goal, abs=0.02)
+    assert two.contains(positions).all()
+    # Without the obstacle one wedge is wide enough.
     free = _is_mapped(-2.6, (90.0,), ())
-    assert navigate(free, _pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome is NavigationOutcome.PATH
+    assert navigate(free, _make_pose(0.0, 0.0), goal, 0.5, OPTIONS).outcome is NavigationOutcome.PATH
 
 
-def test_the_ground_before_the_mast_is_not_mapped_until_two_metres_were_driven() -> None:
+def test_ground_near_mast_is_mapped_after_two_metres() -> None:
     goal = np.array([7.0, 0.0])
     terrain = _is_mapped(0.0, (70.0, 110.0), ())
     outcomes = {
-        east: navigate(terrain, _pose(east, 0.0), goal, 0.5, OPTIONS).outcome for east in (0.0, 1.0, 2.0, 2.6, 3.0)
+        east: navigate(terrain, _make_pose(east, 0.0), goal, 0.5, OPTIONS).outcome for east in (0.0, 1.0, 2.0, 2.6, 3.0)
     }
     assert [east for east, one in outcomes.items() if one is NavigationOutcome.NOT_MAPPED] == [0.0, 1.0, 2.0]
     assert outcomes[2.6] is outcomes[3.0] is NavigationOutcome.PATH
 
 
-def test_paths_keep_to_mapped_ground() -> None:
+def test_paths_stay_on_mapped_ground() -> None:
     terrain = _is_mapped(-2.6, (90.0,), ())
-    adjacent = navigate(terrain, _pose(0.0, 0.0), np.array([2.2, 2.2]), 0.5, OPTIONS)
+    adjacent = navigate(terrain, _make_pose(0.0, 0.0), np.array([2.2, 2.2]), 0.5, OPTIONS)
     assert adjacent.outcome is NavigationOutcome.NO_PATH
 
 
-def test_only_rocks_in_a_wedge_are_seen_and_twice_is_once() -> None:
-    ahead, adjacent = _rock(5.0, 0.0, name="ahead"), _rock(0.0, 5.0, name="adjacent")
+def test_rocks_in_a_wedge_are_mapped_once() -> None:
+    ahead, adjacent = _make_rock(5.0, 0.0, name="ahead"), _make_rock(0.0, 5.0, name="adjacent")
     terrain = _is_mapped(0.0, (90.0,), (ahead, adjacent))
     assert [rock.name for rock in terrain.obstacles] == ["ahead"]
-    moved = _rock(5.2, 0.1, name="ahead")
-    again = terrain.sensed(terrain.wedges[0], (moved,))
-    assert len(again.wedges) == 2
-    assert again.obstacles == (moved,)
-    # a rock whose rim alone reaches into the wedge is seen
-    rim = _rock(5.0, 5.0 * np.tan(0.5 * NAVCAM) + 0.2, name="rim")
-    assert len(terrain.sensed(terrain.wedges[0], (rim,)).obstacles) == 2
+    moved = _make_rock(5.2, 0.1, name="ahead")
+    repeated = terrain.add_wedge(terrain.wedges[0], (moved,))
+    assert len(repeated.wedges) == 2
+    assert repeated.obstacles == (moved,)
+    # A rock is visible if only its rim is inside the wedge.
+    rim = _make_rock(5.0, 5.0 * np.tan(0.5 * NAVCAM) + 0.2, name="rim")
+    assert len(terrain.add_wedge(terrain.wedges[0], (rim,)).obstacles) == 2
 
 
-def test_wedges_are_counted_across_south() -> None:
+def test_wedges_across_south_are_handled() -> None:
     wedge = Wedge(np.zeros(2), np.pi, 0.3, 0.5, 5.0)
-    places = np.array([[0.1, -2.0], [-0.1, -2.0], [0.0, 2.0], [0.0, -0.4], [0.0, -5.1], [-2.0, -2.0]])
-    assert wedge.covers(places).tolist() == [True, True, False, False, False, False]
+    positions = np.array([[0.1, -2.0], [-0.1, -2.0], [0.0, 2.0], [0.0, -0.4], [0.0, -5.1], [-2.0, -2.0]])
+    assert wedge.covers(positions).tolist() == [True, True, False, False, False, False]
 
 
-def test_a_step_may_reach_over_both_arcs() -> None:
-    terrain = TerrainMap(EVERYWHERE.wedges, (_rock(3.0, 0.0),))
-    plan = navigate(terrain, _pose(0.0, 0.0), np.array([7.0, 0.0]), 100.0, OPTIONS)
-    pose = _pose(0.0, 0.0)
+def test_one_step_may_cover_both_arcs() -> None:
+    terrain = TerrainMap(EVERYWHERE.wedges, (_make_rock(3.0, 0.0),))
+    plan = navigate(terrain, _make_pose(0.0, 0.0), np.array([7.0, 0.0]), 100.0, OPTIONS)
+    pose = _make_pose(0.0, 0.0)
     for command in plan.commands:
-        pose = _after(pose, command)
+        pose = _apply_command(pose, command)
     assert pose.translation[:2] == pytest.approx([7.0, 0.0], abs=1e-9)
-    assert _length(plan) == pytest.approx(np.hypot(*np.diff(plan.path_m, axis=0).T).sum(), rel=1e-3)
+    assert _path_length_m(plan) == pytest.approx(np.hypot(*np.diff(plan.path_m, axis=0).T).sum(), rel=1e-3)
 
 
-def test_options_must_make_sense() -> None:
+def test_invalid_options_are_rejected() -> None:
     with pytest.raises(ValueError, match="half_width_m"):
         NavigationOptions(half_width_m=0.0)
     with pytest.raises(ValueError, match="margin_m"):

@@ -1,4 +1,4 @@
-"""Pictures one by one: what a stream gets, what is asked of its answers, and streams that are programs."""
+"""Tests of velocity streams: inputs per image, checks of answers, and programs as streams."""
 
 import importlib
 import sys
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.algorithms.answers import check_velocity
+from marsyard.algorithms.answers import AlgorithmError, Fault, check_velocity
 from marsyard.algorithms.dimes import DimesEstimator
 from marsyard.algorithms.exchange import (
     ExecutableLimits,
@@ -22,7 +22,6 @@ from marsyard.algorithms.exchange import (
     write_frame,
 )
 from marsyard.algorithms.exchange.serving import end_persistent
-from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.streams import StreamedEstimator, set_span
 from marsyard.scenarios.algorithm_run import hash_inputs
@@ -34,13 +33,13 @@ NOTHING = VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
 READY = "import json, os, sys, time\nprint(json.dumps({'exchange': 1, 'ready': True}), flush=True)\n"
 
 
-def valid(*span_s: float) -> VelocityEstimate:
+def make_estimate(*span_s: float) -> VelocityEstimate:
     span = (span_s[0], span_s[1]) if span_s else None
     return VelocityEstimate(VelocityOutcome.VALID, np.array([1.0, 2.0]), span_s=span)
 
 
 class Noting:
-    """Notes its calls; answers from the second picture on."""
+    """Records its calls; answers from the second image on."""
 
     def __init__(self) -> None:
         self.called: list[object] = []
@@ -50,49 +49,51 @@ class Noting:
 
     def picture(self, frame: DescentFrame) -> VelocityEstimate | None:
         self.called.append(frame)
-        return valid() if len(self.called) > 2 else None
+        return make_estimate() if len(self.called) > 2 else None
 
     def finish(self) -> VelocityEstimate:
         self.called.append("finish")
-        return valid(100.5, 101.0)
+        return make_estimate(100.5, 101.0)
 
 
-def test_a_stream_gets_what_came_with_each_picture() -> None:
-    given, stream = inputs.descent(5), Noting()
-    velocities = given.interval_velocities_m_s + np.arange(4.0)[:, None]
-    given = replace(given, interval_velocities_m_s=velocities)
-    answer = StreamedEstimator(stream).estimate(given)
+def test_stream_receives_measurements_of_each_image() -> None:
+    measurements, stream = inputs.descent(5), Noting()
+    velocities = measurements.interval_velocities_m_s + np.arange(4.0)[:, None]
+    measurements = replace(measurements, interval_velocities_m_s=velocities)
+    answer = StreamedEstimator(stream).estimate(measurements)
     assert (stream.called[0], stream.called[-1]) == ("start", "finish")
     frames = [one for one in stream.called if isinstance(one, DescentFrame)]
-    assert [frame.image for frame in frames] == list(given.images)
-    assert [frame.altitude for frame in frames] == list(given.altitudes)
-    assert [frame.attitude for frame in frames] == list(given.attitudes)
+    assert [frame.image for frame in frames] == list(measurements.images)
+    assert [frame.altitude for frame in frames] == list(measurements.altitudes)
+    assert [frame.attitude for frame in frames] == list(measurements.attitudes)
     assert frames[0].interval_velocity_m_s is None
     for before, frame in zip(velocities, frames[1:], strict=True):
         np.testing.assert_array_equal(frame.interval_velocity_m_s, before)
     assert answer.span_s == (100.5, 101.0)
-    # without a span the last interval of what had been taken by then is meant
+    # Without a span the answer is for the last interval.
     first, *later = answer.after_pictures
     assert first is None
-    tags = given.tags_s
+    tags = measurements.tags_s
     assert [one.span_s for one in later if one is not None] == list(pairwise(tags))
 
 
-def test_three_of_many_pictures_keep_the_motion_between_them() -> None:
-    given = inputs.descent(5)
+def test_selected_images_keep_intermediate_motion() -> None:
+    measurements = inputs.descent(5)
     velocities = np.arange(12.0).reshape(4, 3)
-    images = tuple(replace(one, time_s=tag) for one, tag in zip(given.images, (0.0, 1.0, 4.0, 6.0, 7.0), strict=True))
-    chosen = replace(given, images=images, interval_velocities_m_s=velocities).select((0, 2, 3))
+    images = tuple(
+        replace(one, time_s=tag) for one, tag in zip(measurements.images, (0.0, 1.0, 4.0, 6.0, 7.0), strict=True)
+    )
+    chosen = replace(measurements, images=images, interval_velocities_m_s=velocities).select((0, 2, 3))
     assert chosen.tags_s == (0.0, 4.0, 6.0)
-    # a second at the first interval's velocity and three at the second's; the third's alone, to the bit
+    # One second at the velocity of the first interval and three at that of the second; the third interval is exact.
     np.testing.assert_allclose(chosen.interval_velocities_m_s[0], (velocities[0] + 3.0 * velocities[1]) / 4.0)
     np.testing.assert_array_equal(chosen.interval_velocities_m_s[1], velocities[2])
-    assert chosen.attitudes == (given.attitudes[0], given.attitudes[2], given.attitudes[3])
-    np.testing.assert_array_equal(chosen.inertial_velocities_m_s, given.inertial_velocities_m_s[[0, 2, 3]])  # type: ignore[index]
-    assert len(given.select(()).frames()) == 0
+    assert chosen.attitudes == (measurements.attitudes[0], measurements.attitudes[2], measurements.attitudes[3])
+    np.testing.assert_array_equal(chosen.inertial_velocities_m_s, measurements.inertial_velocities_m_s[[0, 2, 3]])  # type: ignore[index]
+    assert len(measurements.select(()).frames()) == 0
 
 
-def test_an_estimator_of_three_takes_no_more() -> None:
+def test_three_image_estimator_rejects_more_images() -> None:
     with pytest.raises(ValueError, match="5 pictures are given; this estimator takes 3"):
         DimesEstimator().estimate(inputs.descent(5))
 
@@ -108,35 +109,35 @@ def test_an_estimator_of_three_takes_no_more() -> None:
         ((0.0, "1"), "a tuple of two time tags, or None"),
     ],
 )
-def test_spans_that_are_none(span: object, message: str) -> None:
-    answer = valid()
+def test_invalid_spans_are_rejected(span: object, message: str) -> None:
+    answer = make_estimate()
     object.__setattr__(answer, "span_s", span)
     with pytest.raises(AlgorithmError, match=message) as caught:
         check_velocity(answer, (0.0, 1.0, 2.0))
     assert caught.value.fault is Fault.BAD_ANSWER
 
 
-def test_what_an_answer_leaves_out_is_the_last_interval() -> None:
-    assert set_span(valid(), (0.0, 1.0, 3.0)).span_s == (1.0, 3.0)
-    assert set_span(valid(2.0, 2.0), (0.0, 3.0)).span_s == (2.0, 2.0)
+def test_missing_span_defaults_to_last_interval() -> None:
+    assert set_span(make_estimate(), (0.0, 1.0, 3.0)).span_s == (1.0, 3.0)
+    assert set_span(make_estimate(2.0, 2.0), (0.0, 3.0)).span_s == (2.0, 2.0)
     assert set_span(NOTHING, (0.0,)).span_s is None
     with pytest.raises(AlgorithmError, match="of one picture there is no last interval"):
-        set_span(valid(), (0.0,))
+        set_span(make_estimate(), (0.0,))
 
 
-def test_a_stream_does_not_write_its_own_history() -> None:
+def test_stream_cannot_set_its_own_history() -> None:
     class Claiming(Noting):
         def finish(self) -> VelocityEstimate:
-            return replace(valid(), after_pictures=(valid(),))
+            return replace(make_estimate(), after_pictures=(make_estimate(),))
 
     with pytest.raises(AlgorithmError, match="after_pictures is given"):
         StreamedEstimator(Claiming()).estimate(inputs.descent())
 
 
 @pytest.mark.parametrize("altitude_m", [1500.0, float("nan")])
-def test_a_frame_comes_back_as_it_was(tmp_path: Path, altitude_m: float) -> None:
-    given = inputs.descent()
-    frame = replace(given.frames()[1], altitude=replace(given.altitudes[1], altitude_m=altitude_m))
+def test_frame_files_round_trip(tmp_path: Path, altitude_m: float) -> None:
+    measurements = inputs.descent()
+    frame = replace(measurements.frames()[1], altitude=replace(measurements.altitudes[1], altitude_m=altitude_m))
     write_frame(tmp_path, frame)
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["camera_1.cahvor", "flat_field_1.f64", "frame.json", "image_1.pgm"]
@@ -153,50 +154,50 @@ def test_a_frame_comes_back_as_it_was(tmp_path: Path, altitude_m: float) -> None
 
 
 @pytest.mark.parametrize("number", [1, 5])
-def test_a_case_of_any_number_of_pictures_comes_back(tmp_path: Path, number: int) -> None:
-    given = inputs.descent(5).select(tuple(range(number)))
-    write_case(tmp_path, given)
+def test_cases_of_any_image_count_round_trip(tmp_path: Path, number: int) -> None:
+    measurements = inputs.descent(5).select(tuple(range(number)))
+    write_case(tmp_path, measurements)
     back = read_case(tmp_path)
     assert isinstance(back, DescentMeasurements)
-    assert hash_inputs([one.counts for one in back.images]) == hash_inputs([one.counts for one in given.images])
-    np.testing.assert_array_equal(back.interval_velocities_m_s, given.interval_velocities_m_s)
-    np.testing.assert_array_equal(back.inertial_velocities_m_s, given.inertial_velocities_m_s)
+    assert hash_inputs([one.counts for one in back.images]) == hash_inputs([one.counts for one in measurements.images])
+    np.testing.assert_array_equal(back.interval_velocities_m_s, measurements.interval_velocities_m_s)
+    np.testing.assert_array_equal(back.inertial_velocities_m_s, measurements.inertial_velocities_m_s)
 
 
-def program(spec: str, time_s: float = 60.0) -> StreamedEstimator:
+def make_stream(spec: str, time_s: float = 60.0) -> StreamedEstimator:
     command = parse_command(spec)
     assert command is not None
     assert command.stream
     return StreamedEstimator(ExecutableVelocityStream(command, ExecutableLimits(time_s=time_s)))
 
 
-def test_the_example_answers_alike_in_python_and_as_a_program(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_example_is_equal_in_python_and_as_program(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     monkeypatch.syspath_prepend(str(EXAMPLES))
     ChainedShifts = importlib.import_module("velocity_stream").ChainedShifts
 
-    given = inputs.descent(5)
-    mine = StreamedEstimator(ChainedShifts()).estimate(given)
-    assert mine.velocity_m_s is not None
-    error = mine.velocity_m_s - inputs.DESCENT_VELOCITY_M_S[:2]
-    # within three deviations of its own, which are below 1 m/s
-    assert mine.covariance_m2_s2 is not None
-    assert np.all(np.abs(error) < 3.0 * np.sqrt(np.diag(mine.covariance_m2_s2)))
-    assert np.all(np.diag(mine.covariance_m2_s2) < 1.0)
-    asked = program(f"serve-stream:{sys.executable} {EXAMPLES / 'velocity_stream.py'}")
+    measurements = inputs.descent(5)
+    reference = StreamedEstimator(ChainedShifts()).estimate(measurements)
+    assert reference.velocity_m_s is not None
+    error = reference.velocity_m_s - inputs.DESCENT_VELOCITY_M_S[:2]
+    # Errors are within three standard deviations, which are below 1 m/s.
+    assert reference.covariance_m2_s2 is not None
+    assert np.all(np.abs(error) < 3.0 * np.sqrt(np.diag(reference.covariance_m2_s2)))
+    assert np.all(np.diag(reference.covariance_m2_s2) < 1.0)
+    requested = make_stream(f"serve-stream:{sys.executable} {EXAMPLES / 'velocity_stream.py'}")
     for _ in range(2):
-        its = asked.estimate(given)
-        np.testing.assert_allclose(its.velocity_m_s, mine.velocity_m_s, rtol=0.0, atol=1e-9)  # type: ignore[arg-type]
-        np.testing.assert_allclose(its.covariance_m2_s2, mine.covariance_m2_s2, rtol=1e-12)  # type: ignore[arg-type]
-        assert its.span_s == mine.span_s == (107.5, 107.5)
-        assert [one is None for one in its.after_pictures] == [True, False, False, False, False]
-        assert isinstance(its.details, ProgramDetails)
-        assert its.details.time_s > 0.0
+        actual = requested.estimate(measurements)
+        np.testing.assert_allclose(actual.velocity_m_s, reference.velocity_m_s, rtol=0.0, atol=1e-9)  # type: ignore[arg-type]
+        np.testing.assert_allclose(actual.covariance_m2_s2, reference.covariance_m2_s2, rtol=1e-12)  # type: ignore[arg-type]
+        assert actual.span_s == reference.span_s == (107.5, 107.5)
+        assert [one is None for one in actual.after_pictures] == [True, False, False, False, False]
+        assert isinstance(actual.details, ProgramDetails)
+        assert actual.details.time_s > 0.0
     end_persistent()
 
 
-def answering(answers: list[str]) -> str:
-    """A program that gives these answers, whatever it is asked."""
+def format_server(answers: list[str]) -> str:
+    """A program with fixed answers that ignores its requests."""
     return f"{READY}for answer in {answers}:\n    sys.stdin.readline()\n    print(answer, flush=True)\n"
 
 
@@ -218,15 +219,15 @@ NONE_YET = '{"exchange": 1, "outcome": null}'
         ([NONE_YET] * 2, "its output ended before it had answered|it reads no more cases"),
     ],
 )
-def test_whatever_a_program_answers_wrong_is_a_fault(tmp_path: Path, answers: list[str], message: str) -> None:
-    (tmp_path / "stream.py").write_text(answering(answers))
+def test_invalid_answers_are_reported_as_faults(tmp_path: Path, answers: list[str], message: str) -> None:
+    (tmp_path / "stream.py").write_text(format_server(answers))
     with pytest.raises(AlgorithmError, match=message) as caught:
-        program(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}").estimate(inputs.descent())
+        make_stream(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}").estimate(inputs.descent())
     assert caught.value.fault is (Fault.CRASHED if answers == [NONE_YET] * 2 else Fault.BAD_ANSWER)
 
 
-def test_a_program_that_hangs_at_a_picture_is_ended(tmp_path: Path) -> None:
-    (tmp_path / "stream.py").write_text(answering([NONE_YET, NONE_YET]) + "time.sleep(60)\n")
+def test_program_hanging_at_an_image_is_terminated(tmp_path: Path) -> None:
+    (tmp_path / "stream.py").write_text(format_server([NONE_YET, NONE_YET]) + "time.sleep(60)\n")
     with pytest.raises(AlgorithmError, match="no answer within 3 s") as caught:
-        program(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}", 3.0).estimate(inputs.descent())
+        make_stream(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}", 3.0).estimate(inputs.descent())
     assert caught.value.fault is Fault.TIMED_OUT

@@ -12,7 +12,7 @@ from benchmarks.check import PAIRS, compare, log_ratios, select_slower
 PATHS = ("one", "two", "three", "four", "five", "six")
 
 
-def drawn(rng: np.random.Generator, spread: float, times: float = 1.0) -> dict[str, list[float]]:
+def draw(rng: np.random.Generator, spread: float, times: float = 1.0) -> dict[str, list[float]]:
     return {name: (np.log(times) + spread * rng.standard_normal(PAIRS)).tolist() for name in PATHS}
 
 
@@ -20,13 +20,13 @@ def drawn(rng: np.random.Generator, spread: float, times: float = 1.0) -> dict[s
 def test_noise_raises_no_alarm(spread: float) -> None:
     """At most 1 % of comparisons may call an unchanged program slower: more than 9 of 400 is less likely than 1 %."""
     rng = np.random.default_rng(1)
-    alarms = sum(bool(select_slower(compare(drawn(rng, spread), drawn(rng, spread)))) for _ in range(400))
+    alarms = sum(bool(select_slower(compare(draw(rng, spread), draw(rng, spread)))) for _ in range(400))
     assert alarms <= 9
 
 
 def test_growth_within_what_is_allowed_is_none() -> None:
     rng = np.random.default_rng(2)
-    alarms = sum(bool(select_slower(compare(drawn(rng, 0.05, 1.1), drawn(rng, 0.05)))) for _ in range(200))
+    alarms = sum(bool(select_slower(compare(draw(rng, 0.05, 1.1), draw(rng, 0.05)))) for _ in range(200))
     assert alarms <= 6
 
 
@@ -35,8 +35,8 @@ def test_a_slow_down_is_found(spread: float, times: float) -> None:
     rng = np.random.default_rng(3)
     found = 0
     for _ in range(100):
-        now = drawn(rng, spread) | {"three": drawn(rng, spread, times)["three"]}
-        found += [one.name for one in select_slower(compare(now, drawn(rng, spread)))] == ["three"]
+        now = draw(rng, spread) | {"three": draw(rng, spread, times)["three"]}
+        found += [one.name for one in select_slower(compare(now, draw(rng, spread)))] == ["three"]
     assert found >= 95
 
 

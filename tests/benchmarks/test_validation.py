@@ -109,7 +109,7 @@ def test_the_second_implementation_agrees_with_the_first_where_geometry_is_exact
     inputs = ThresholdInputs(
         altitude_sd=0.0, common_attitude_sd_deg=0.0, attitude_sd_deg=0.0, tag_sd_s=0.0, feature_height_sd_m=0.0
     )
-    found = Reference.drawn(inputs, 300, np.random.default_rng(1))
+    found = Reference.draw(inputs, 300, np.random.default_rng(1))
     np.testing.assert_allclose(found.tracks.std(), inputs.match_sd_m_s, rtol=0.1)
     # of two tracks and the IMU, by Rayleigh's median
     sd = math.sqrt(2.0 * inputs.match_sd_m_s**2 + inputs.imu_sd_m_s**2)

@@ -1,4 +1,4 @@
-"""A browser without a window: Debian's Chromium, driven by Playwright, which must fetch none of its own."""
+"""Fixtures of a headless browser: Debian's Chromium, driven by Playwright."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from playwright.sync_api import Browser, Page, Request, sync_playwright
 
 
 @dataclass
-class Seen:
-    """What a page asked for, and what it complained of."""
+class PageLog:
+    """Requested addresses of a page, and its error and console messages."""
 
     requests: list[str] = field(default_factory=list)
-    complaints: list[str] = field(default_factory=list)
+    messages: list[str] = field(default_factory=list)
 
 
-Open = Callable[..., tuple[Page, Seen]]
+Open = Callable[..., tuple[Page, PageLog]]
 
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
-    path = next((found for name in ("chromium", "chromium-browser") if (found := shutil.which(name))), None)
+    path = next((executable for name in ("chromium", "chromium-browser") if (executable := shutil.which(name))), None)
     assert path is not None, "these tests drive Debian's Chromium: apt-get install chromium"
     with sync_playwright() as playwright:
-        # a container's root has no sandbox to give; the pages are our own
+        # root in a container cannot start the sandbox; the pages are trusted
         launched = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"], timeout=120_000)
         yield launched
         launched.close()
@@ -35,24 +35,24 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def open_page(browser: Browser) -> Iterator[Open]:
-    """Opens a file in a window of its own; returns the page and what it asks for and complains of from then on."""
+    """Return a function that opens a file in a new window; it returns the page and its log."""
     contexts = []
 
-    def opened(path: Path, *, width: int = 1280, scheme: str = "light") -> tuple[Page, Seen]:
+    def open_file(path: Path, *, width: int = 1280, scheme: str = "light") -> tuple[Page, PageLog]:
         context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)  # type: ignore[arg-type]
         contexts.append(context)
         context.set_default_timeout(60_000)
-        page, seen = context.new_page(), Seen()
+        page, log = context.new_page(), PageLog()
 
-        def note(request: Request) -> None:
-            seen.requests.append(request.url)
+        def log_request(request: Request) -> None:
+            log.requests.append(request.url)
 
-        page.on("request", note)
-        page.on("console", lambda message: seen.complaints.append(message.text))
-        page.on("pageerror", lambda error: seen.complaints.append(str(error)))
+        page.on("request", log_request)
+        page.on("console", lambda message: log.messages.append(message.text))
+        page.on("pageerror", lambda error: log.messages.append(str(error)))
         page.goto(path.resolve().as_uri())
-        return page, seen
+        return page, log
 
-    yield opened
+    yield open_file
     for context in contexts:
         context.close()

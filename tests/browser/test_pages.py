@@ -1,4 +1,4 @@
-"""Reports and the dashboard in a browser: what a reader sees and does, and what leaves the page."""
+"""Tests of reports and dashboard in a browser: content, interaction, requests and accessibility."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from marsyard.reports.campaign import write_report
 from marsyard.reports.dashboard.site import write_site
 
 Open = Callable[..., tuple[Page, Any]]
-#: The success criteria of WCAG 2.2 of levels A and AA, as axe-core names its rules' sets.
+#: Rule sets of axe-core for WCAG 2.2, levels A and AA.
 LEVELS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22a", "wcag22aa"]
 
 
-def _made_up() -> ModuleType:
-    """The synthetic runs of the reports' own tests."""
+def _load_synthetic_runs() -> ModuleType:
+    """Import tests/reports/conftest.py, which writes synthetic runs."""
     path = Path(__file__).resolve().parents[1] / "reports" / "conftest.py"
-    spec = importlib.util.spec_from_file_location("made_up_runs", path)
+    spec = importlib.util.spec_from_file_location("synthetic_runs", path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -33,13 +33,13 @@ def _made_up() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def campaigns(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A site over three campaigns, one of them with pictures of a case."""
-    folder, made = tmp_path_factory.mktemp("campaigns"), _made_up()
+    """Write a dashboard of three campaigns, one of them with images of a case."""
+    folder, synthetic_runs = tmp_path_factory.mktemp("campaigns"), _load_synthetic_runs()
     for day, (site, cases) in enumerate((("gusev", 300), ("meridiani", 24), ("gusev", 24)), start=1):
-        frame = made.synthetic_frame(cases, terrains=1000, seed=day, crashed=day == 2)
-        products = made.synthetic_products() if day == 1 else None
+        frame = synthetic_runs.synthetic_frame(cases, terrains=1000, seed=day, crashed=day == 2)
+        products = synthetic_runs.synthetic_products() if day == 1 else None
         changes = {"started_utc": f"2026-01-0{day}T00:00:00Z", "name": f"dimes-{site}"}
-        directory = made.write_run(folder / f"run-{day}", frame, products=products, **changes)
+        directory = synthetic_runs.write_run(folder / f"run-{day}", frame, products=products, **changes)
         record = (directory / "campaign.json").read_text()
         directory.joinpath("campaign.json").write_text(
             record.replace('"configuration": {', f'"configuration": {{"parameters": {{"site": "{site}"}}, ', 1)
@@ -49,22 +49,22 @@ def campaigns(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def _report(campaigns: Path) -> Path:
+def _report_path(campaigns: Path) -> Path:
     return campaigns / "run-1" / "report.html"
 
 
-def _index(campaigns: Path) -> Path:
+def _index_path(campaigns: Path) -> Path:
     return campaigns / "site" / "index.html"
 
 
-def _violations(page: Page) -> list[str]:
-    """What axe-core finds against the levels A and AA."""
-    found = Axe().run(page, options={"runOnly": {"type": "tag", "values": LEVELS}}).response["violations"]
-    return [f"{one['id']}: {node['html']}" for one in found for node in one["nodes"]]
+def _find_violations(page: Page) -> list[str]:
+    """Violations of the levels A and AA that axe-core finds."""
+    violations = Axe().run(page, options={"runOnly": {"type": "tag", "values": LEVELS}}).response["violations"]
+    return [f"{violation['id']}: {node['html']}" for violation in violations for node in violation["nodes"]]
 
 
-def test_the_verdict_is_the_first_item_to_see(campaigns: Path, open_page: Open) -> None:
-    page, seen = open_page(_report(campaigns))
+def test_verdict_is_visible_without_scrolling(campaigns: Path, open_page: Open) -> None:
+    page, log = open_page(_report_path(campaigns))
     headline = page.locator(".headline")
     assert headline.is_visible()
     assert headline.inner_text().split()[0] in ("PASS", "FAIL", "INSUFFICIENT")
@@ -72,11 +72,11 @@ def test_the_verdict_is_the_first_item_to_see(campaigns: Path, open_page: Open) 
     assert box is not None
     assert box["y"] + box["height"] < 900
     assert "DIMES-VEL" in page.locator("table.verdicts").inner_text()
-    assert seen.complaints == []
+    assert log.messages == []
 
 
-def test_hovering_shows_a_case_and_a_click_opens_it(campaigns: Path, open_page: Open) -> None:
-    page, seen = open_page(_report(campaigns))
+def test_case_is_shown_on_hover_and_opened_by_click(campaigns: Path, open_page: Open) -> None:
+    page, log = open_page(_report_path(campaigns))
     point = page.locator(".explorer-plot circle.point").nth(5)
     point.scroll_into_view_if_needed()
     box = point.bounding_box()
@@ -85,15 +85,15 @@ def test_hovering_shows_a_case_and_a_click_opens_it(campaigns: Path, open_page: 
     tip = page.locator(".explorer-tip")
     assert tip.is_visible()
     assert tip.inner_text().startswith("Case ")
-    reported = tip.inner_text().split(":")[0]
+    case_name = tip.inner_text().split(":")[0]
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    assert page.locator(".explorer-detail h3").inner_text().startswith(reported)
+    assert page.locator(".explorer-detail h3").inner_text().startswith(case_name)
     assert "marsyard replay" in page.locator(".explorer-detail").inner_text()
-    assert seen.complaints == []
+    assert log.messages == []
 
 
-def test_a_case_is_opened_by_keyboard_alone(campaigns: Path, open_page: Open) -> None:
-    page, _ = open_page(_report(campaigns))
+def test_case_is_opened_by_keyboard(campaigns: Path, open_page: Open) -> None:
+    page, _ = open_page(_report_path(campaigns))
     page.locator("#explorer input").focus()
     page.keyboard.type("3")
     page.keyboard.press("Enter")
@@ -108,19 +108,19 @@ def test_a_case_is_opened_by_keyboard_alone(campaigns: Path, open_page: Open) ->
     assert "No such case" in page.locator(".explorer-detail").inner_text()
 
 
-def test_axes_are_chosen(campaigns: Path, open_page: Open) -> None:
-    page, seen = open_page(_report(campaigns))
-    across = page.locator("#explorer select").first
-    names = across.locator("option").all_inner_texts()
+def test_axes_of_the_explorer_are_selectable(campaigns: Path, open_page: Open) -> None:
+    page, log = open_page(_report_path(campaigns))
+    axis_select = page.locator("#explorer select").first
+    names = axis_select.locator("option").all_inner_texts()
     for name in names:
-        across.select_option(label=name)
+        axis_select.select_option(label=name)
         assert page.locator(".explorer-plot .point").count() > 250
         assert name in (page.locator(".explorer-plot").text_content() or "")
-    assert seen.complaints == []
+    assert log.messages == []
 
 
 def test_campaigns_are_filtered(campaigns: Path, open_page: Open) -> None:
-    page, seen = open_page(_index(campaigns))
+    page, log = open_page(_index_path(campaigns))
     rows = page.locator(".campaigns tbody tr:visible")
     latest = page.locator('tr[data-requirement="DIMES-VEL"] .evidence a').first
     assert (rows.count(), latest.inner_text()) == (3, "dimes-gusev")
@@ -136,69 +136,72 @@ def test_campaigns_are_filtered(campaigns: Path, open_page: Open) -> None:
     assert "no campaign fits" in page.locator('tr[data-requirement="DIMES-VEL"]').inner_text()
     page.get_by_role("button", name="Clear").click()
     page.wait_for_function("document.getElementById('count').textContent === '3 of 3 campaigns'")
-    # behind the latest verdict stand those of other campaigns
+    # verdicts of other campaigns follow the latest verdict
     others = page.locator('tr[data-requirement="DIMES-VEL"] .evidence li b')
     assert (others.count(), page.locator('tr[data-requirement="DIMES-VEL"] .evidence li').count()) == (1, 2)
-    assert seen.complaints == []
+    assert log.messages == []
 
 
-def test_trends_are_those_of_the_campaigns_that_are_left(campaigns: Path, open_page: Open) -> None:
-    page, seen = open_page(_index(campaigns))
+def test_trends_follow_the_filtered_campaigns(campaigns: Path, open_page: Open) -> None:
+    page, log = open_page(_index_path(campaigns))
     trend = page.locator('tr[data-requirement="DIMES-VEL"] .trend svg')
-    of_all = trend.get_attribute("aria-label")
+    label_of_all = trend.get_attribute("aria-label")
     page.locator("input[name=until]").fill("2026-01-01")
     assert trend.count() == 0
     page.locator("input[name=until]").fill("")
-    # drawn anew, it is what the page came with
-    assert (trend.count(), trend.get_attribute("aria-label")) == (1, of_all)
+    # drawn again, the trend equals the initial one
+    assert (trend.count(), trend.get_attribute("aria-label")) == (1, label_of_all)
     assert page.locator(".coverage").inner_text().count("NO CAMPAIGN") == 1
-    assert seen.complaints == []
+    assert log.messages == []
 
 
-def test_a_filter_stands_on_the_way_back(campaigns: Path, open_page: Open) -> None:
-    page, seen = open_page(_index(campaigns))
+def test_filter_is_consistent_after_going_back(campaigns: Path, open_page: Open) -> None:
+    page, log = open_page(_index_path(campaigns))
     page.locator("select[name=site]").select_option("meridiani")
     page.locator(".campaigns tbody tr:visible a").first.click()
     page.go_back()
-    chosen, shown = page.locator("select[name=site]").input_value(), page.locator(".campaigns tbody tr:visible").count()
-    assert (chosen, shown) in {("meridiani", 1), ("", 3)}
-    assert seen.complaints == []
+    selected, n_rows = (
+        page.locator("select[name=site]").input_value(),
+        page.locator(".campaigns tbody tr:visible").count(),
+    )
+    assert (selected, n_rows) in {("meridiani", 1), ("", 3)}
+    assert log.messages == []
 
 
-def test_two_clicks_lead_from_a_requirement_to_the_worst_cases_pictures(campaigns: Path, open_page: Open) -> None:
-    page, seen = open_page(_index(campaigns))
+def test_two_clicks_lead_to_images_of_the_worst_case(campaigns: Path, open_page: Open) -> None:
+    page, log = open_page(_index_path(campaigns))
     page.locator("input[name=until]").fill("2026-01-01")
     page.locator('tr[data-requirement="DIMES-VEL"] .evidence a').first.click()
     page.get_by_role("link", name="Case 3").click()
     assert page.locator("h1").inner_text().startswith("Case 3")
     assert page.locator("#main svg").count() > 0
     folder = (campaigns / "site").resolve().as_uri()
-    outside = [url for url in seen.requests if not url.startswith((folder, "data:"))]
+    outside = [url for url in log.requests if not url.startswith((folder, "data:"))]
     assert outside == []
-    assert seen.complaints == []
+    assert log.messages == []
 
 
-def test_nothing_is_asked_of_the_network(campaigns: Path, open_page: Open) -> None:
-    page, seen = open_page(_report(campaigns))
+def test_report_sends_no_network_requests(campaigns: Path, open_page: Open) -> None:
+    page, log = open_page(_report_path(campaigns))
     page.wait_for_load_state("networkidle")
-    assert [url for url in seen.requests if not url.startswith("data:")] == [_report(campaigns).resolve().as_uri()]
+    assert [url for url in log.requests if not url.startswith("data:")] == [_report_path(campaigns).resolve().as_uri()]
 
 
-# layout depends on the width alone and contrast on the scheme alone: two of the four pairs show both of each
+# layout depends on the width, contrast on the scheme: two of the four pairs cover both
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "dark"), (390, "light")])
-@pytest.mark.parametrize("what", ["report", "index", "campaign", "case"])
+@pytest.mark.parametrize("page_kind", ["report", "index", "campaign", "case"])
 def test_pages_are_accessible_and_fit_the_window(
-    campaigns: Path, open_page: Open, what: str, width: int, scheme: str
+    campaigns: Path, open_page: Open, page_kind: str, width: int, scheme: str
 ) -> None:
     site = campaigns / "site"
     case = next(site.rglob("case-3.html"))
     path = {
-        "report": _report(campaigns),
-        "index": _index(campaigns),
+        "report": _report_path(campaigns),
+        "index": _index_path(campaigns),
         "campaign": case.parent / "index.html",
         "case": case,
     }
-    page, seen = open_page(path[what], width=width, scheme=scheme)
-    assert _violations(page) == []
+    page, log = open_page(path[page_kind], width=width, scheme=scheme)
+    assert _find_violations(page) == []
     assert page.evaluate("document.documentElement.scrollWidth") <= width
-    assert seen.complaints == []
+    assert log.messages == []

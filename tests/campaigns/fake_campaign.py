@@ -1,4 +1,4 @@
-"""A campaign of the fake scenario, written to a file as a user writes it."""
+"""Write and run campaign files of the fake scenario."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ probability = 0.99
 confidence = 0.9
 """
 #: A case that raises, two that abort their process, one without an answer.
-TROUBLE = "raising_cases = [3]\naborting_cases = [5, 6]\nsilent_cases = [2]"
+FAILING_CASES = "raising_cases = [3]\naborting_cases = [5, 6]\nsilent_cases = [2]"
 
 
 def write_campaign(
@@ -52,8 +52,8 @@ def write_campaign(
     return path
 
 
-class Silence:
-    """A watch that only keeps what it is told."""
+class RecordingWatch:
+    """A progress watch that records stages, steps and notes without printing."""
 
     def __init__(self) -> None:
         self.notes: list[str] = []
@@ -71,10 +71,10 @@ class Silence:
         self.notes.append(text)
 
 
-def run(path: Path, directory: Path, watch: Silence, *overrides: str, jobs: int = 2) -> Path:
+def run(path: Path, directory: Path, watch: RecordingWatch, *overrides: str, jobs: int = 2) -> Path:
     run_campaign(load_campaign(str(path), overrides), directory, ExecutorConfig(jobs), watch)
     return directory
 
 
-def rows_of(directory: Path) -> list[dict[str, Any]]:
+def read_case_rows(directory: Path) -> list[dict[str, Any]]:
     return read_rows(directory / "cases.parquet")

@@ -1,4 +1,4 @@
-"""A scenario without a world: fast, exact, and able to fail in every way that a user's can."""
+"""A fast scenario without terrain and rendering; its parameters select the cases that fail, and how."""
 
 from __future__ import annotations
 
@@ -56,23 +56,23 @@ class FakeParameters(BaseModel):
         return (self.table,) if self.table else ()
 
     @model_validator(mode="after")
-    def _above_the_lowest(self) -> FakeParameters:
+    def _check_altitude(self) -> FakeParameters:
         if self.altitude_m < self.lowest_altitude_m:
             raise ValueError("altitude_m must be above lowest_altitude_m")
         return self
 
 
 def misbehave(parameters: FakeParameters, case: int) -> None:
-    """Does what a case must not, and does not return from most of it."""
+    """Loop, print, exit, fork, stop the parent or allocate memory without end, as the parameters select."""
     if case in parameters.looping_cases:
-        # in C, without letting go of the interpreter: two to the power of 64 ways to share the letters out
+        # backtracks 2^64 times in C without releasing the interpreter lock
         re.match("(a+)+$", "a" * 64 + "b")
     while case in parameters.chatting_cases:
-        os.write(1, b"and another thing\n" * 1000)
+        os.write(1, b"another line of text\n" * 1000)
     if case in parameters.leaving_cases:
         os._exit(0)
     if case in parameters.forking_cases and os.fork() == 0:
-        # holds every file of the worker, in a session of its own, and leaves something to be cleared up
+        # the child has its own session, keeps the worker's open files and leaves a temporary file
         os.setsid()
         Path(tempfile.gettempdir(), "left-behind").touch()
         time.sleep(3600)
@@ -80,9 +80,9 @@ def misbehave(parameters: FakeParameters, case: int) -> None:
         os.kill(os.getppid(), signal.SIGSTOP)
     if case in parameters.altering_cases:
         os.chdir("/")
-    hoard = []
+    arrays = []
     while case in parameters.swelling_cases:
-        hoard.append(np.ones(1_000_000))
+        arrays.append(np.ones(1_000_000))
 
 
 class FakeScenario:
@@ -105,7 +105,7 @@ class FakeScenario:
             os.abort()
         misbehave(parameters, streams.case)
         answered = streams.case not in parameters.silent_cases
-        # what no campaign states stands for an algorithm's code that was changed
+        # the environment variable imitates a change of the algorithm's code
         scale = parameters.error_scale * float(os.environ.get("FAKE_ERROR_SCALE", "1"))
         error = scale * streams.generator("noise").normal(size=2) if answered else np.full(2, np.nan)
         row = {
@@ -120,12 +120,13 @@ class FakeScenario:
             "hash_of_text": hash("marsyard") % 2**31,
         }
         products = {"picture": np.arange(6, dtype=np.uint16).reshape(2, 3), "title": "a", "nested": [{"x": np.eye(2)}]}
-        kept = {"thing": object()} if parameters.products == "bad" else products
-        return CaseResult("VALID" if answered else "SILENT", answered, row, kept)
+        if parameters.products == "bad":
+            products = {"thing": object()}
+        return CaseResult("VALID" if answered else "SILENT", answered, row, products)
 
 
 class SelectingScenario(FakeScenario):
-    """A scenario that states which shared input a case uses: the one of its terrain's number."""
+    """A scenario in which each case uses the shared input with the number of its terrain."""
 
     def prepare(self, parameters: FakeParameters, shared_input: int) -> None:
         super().prepare(parameters, shared_input)

@@ -1,4 +1,4 @@
-"""A scenario with velocity estimators and without a world: the suite's descent, another inertial error in each case."""
+"""A scenario for velocity estimators without rendering: one fixed descent, with a different inertial error per case."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from pydantic import BaseModel
 
 from marsyard.algorithms.answers import check_velocity
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.algorithm_run import case_result, run_algorithm
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
+from marsyard.scenarios.algorithm_run import AlgorithmSelection, case_result, run_algorithm
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.estimators import VELOCITY, Task
 from marsyard.scenarios.interface import CaseResult
@@ -34,25 +33,25 @@ class FakeVelocityScenario:
         return ()
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
-        """Nothing: there are no shared inputs."""
+        """There are no shared inputs."""
 
     def run(self, parameters: FakeVelocityParameters, streams: Streams) -> CaseResult:
-        p, common = parameters, streams.generator("inertial").normal(size=3)
-        given = inputs.descent()
-        measurements = replace(given, interval_velocities_m_s=given.interval_velocities_m_s + common)
+        p, inertial_error_m_s = parameters, streams.generator("inertial").normal(size=3)
+        exact = inputs.descent()
+        measurements = replace(exact, interval_velocities_m_s=exact.interval_velocities_m_s + inertial_error_m_s)
 
-        def judge(algorithm: str) -> CaseResult:
-            attempt = run_algorithm(
+        def evaluate(algorithm: str) -> CaseResult:
+            run_result = run_algorithm(
                 lambda: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case).estimate(measurements),
                 check_velocity,
             )
-            velocity = None if attempt.answer is None else attempt.answer.velocity_m_s
+            velocity = None if run_result.answer is None else run_result.answer.velocity_m_s
             return CaseResult(
-                outcome=attempt.outcome(lambda answer: answer.outcome.name),
+                outcome=run_result.outcome(lambda answer: answer.outcome.name),
                 answered=velocity is not None,
-                row={**velocity_row("velocity", velocity, inputs.DESCENT_VELOCITY_M_S[:2]), **attempt.row},
-                failure=attempt.failure,
+                row={**velocity_row("velocity", velocity, inputs.DESCENT_VELOCITY_M_S[:2]), **run_result.row},
+                failure=run_result.failure,
             )
 
-        hashed = f"{measurements.interval_velocities_m_s.tolist()}"
-        return case_result(p.algorithms, judge, {"image_hash": hashed})
+        input_text = f"{measurements.interval_velocities_m_s.tolist()}"
+        return case_result(p.algorithms, evaluate, {"image_hash": input_text})

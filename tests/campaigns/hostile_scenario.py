@@ -1,4 +1,4 @@
-"""A scenario whose cases each do something to their worker or their row that they must not."""
+"""A scenario whose cases damage their worker process or return invalid rows."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pydantic import BaseModel, ConfigDict
 from marsyard.scenarios.interface import CaseResult, record_conditions
 from marsyard.sim.streams import Streams
 
-#: What each case does, by its number.
-DEEDS = (
+#: Faults, in the order of the case numbers.
+FAULTS = (
     "nothing",
     "text in a metric",
     "text in a population",
@@ -44,34 +44,34 @@ class HostileScenario:
         return ()
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
-        """Nothing."""
+        """There are no shared inputs."""
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        deed = DEEDS[streams.case % len(DEEDS)]
-        conditions = {"near": streams.case < 2 * len(DEEDS), "height_m": 10.0 + streams.case}
+        fault = FAULTS[streams.case % len(FAULTS)]
+        conditions = {"near": streams.case < 2 * len(FAULTS), "height_m": 10.0 + streams.case}
         record_conditions(conditions)
         row: dict[str, Any] = {"velocity_error_m_s": 1.0, "met": True, "number": 1, "text": "a", **conditions}
         outcome = "VALID"
-        if deed == "text in a metric":
+        if fault == "text in a metric":
             row["velocity_error_m_s"] = "small"
-        elif deed == "text in a population":
+        elif fault == "text in a population":
             row["near"] = "yes"
-        elif deed == "int of 400 digits":
+        elif fault == "int of 400 digits":
             row["number"] = 10**400
-        elif deed == "int of 5000 digits":
+        elif fault == "int of 5000 digits":
             row["velocity_error_m_s"] = 10**5000
-        elif deed == "closes files":
+        elif fault == "closes files":
             os.closerange(3, 256)
-        elif deed == "closes output":
+        elif fault == "closes output":
             os.close(1)
-        elif deed == "error without a message":
+        elif fault == "error without a message":
             raise SilentError
-        elif deed == "surrogates":
+        elif fault == "surrogates":
             outcome, row["text \udc80"] = "VALID \udc80", "\udc80"
-        elif deed == "raises":
+        elif fault == "raises":
             raise ValueError("the algorithm raised")
-        elif deed == "exits":
+        elif fault == "exits":
             os._exit(3)
-        elif deed == "list in a column":
+        elif fault == "list in a column":
             row["text"] = ["a"]
         return CaseResult(outcome, True, row)

@@ -1,4 +1,4 @@
-"""Attributes that share a description are rendered each by its own name."""
+"""Tests of documented attributes: names that share a description are rendered separately."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ class Mean:
 '''
 
 
-def test_several_attributes_in_one_line_are_rendered_apart(tmp_path: Path) -> None:
+def test_attributes_in_one_line_are_rendered_separately(tmp_path: Path) -> None:
     source = tmp_path / "docs"
     source.mkdir()
     (tmp_path / "described.py").write_text(MODULE.replace("\\\n        ", "\n        "))
     conf = (CONF / "conf.py").read_text()
-    # the site's own settings, without its pages and figures
+    # settings of the site without its pages and figures
     for call in ("    write_pages()\n", '    draw_figures(Path(__file__).parent / "generated")\n'):
         assert call in conf
         conf = conf.replace(call, "")
     (source / "conf.py").write_text(conf.replace("Path(__file__).parent))", f"Path({str(CONF)!r})))"))
     (source / "index.md").write_text("# Index\n\n```{eval-rst}\n.. automodule:: described\n```\n")
-    # in a process of its own: Sphinx warns of its own parts
+    # in a separate process because Sphinx itself gives warnings
     command = [sys.executable, "-m", "sphinx", "-q", "-b", "text", str(source), str(tmp_path / "out")]
     subprocess.run(command, check=True, env={**os.environ, "PYTHONPATH": str(tmp_path)}, timeout=120)
     text = (tmp_path / "out" / "index.txt").read_text()

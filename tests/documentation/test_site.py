@@ -1,4 +1,4 @@
-"""The documentation's site builds without a warning, and every link in it leads somewhere."""
+"""Tests of the documentation site: it builds without warnings and has no broken links."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MIN_PAGES = 40
 
 
 class Page(HTMLParser):
-    """What a page links to, what it loads, and the anchors that it has."""
+    """Parser that collects links, loaded files and anchors of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -26,55 +26,58 @@ class Page(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = {name: value or "" for name, value in attrs}
-        self.anchors.update(given[name] for name in ("id", "name") if name in given)
-        if tag == "a" and "href" in given:
-            self.links.append(given["href"])
-        elif tag in ("script", "img") and "src" in given:
-            self.loads.append(given["src"])
-        elif tag == "link" and given.get("rel") == "stylesheet":
-            self.loads.append(given["href"])
+        attributes = {name: value or "" for name, value in attrs}
+        self.anchors.update(attributes[name] for name in ("id", "name") if name in attributes)
+        if tag == "a" and "href" in attributes:
+            self.links.append(attributes["href"])
+        elif tag in ("script", "img") and "src" in attributes:
+            self.loads.append(attributes["src"])
+        elif tag == "link" and attributes.get("rel") == "stylesheet":
+            self.loads.append(attributes["href"])
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, Page]:
     out = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-E", "-b", "html", "-d", str(out / "trees")]
-    done = subprocess.run([*command, str(DOCS), str(out / "html")], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    result = subprocess.run([*command, str(DOCS), str(out / "html")], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
     pages = {path: Page(path.read_text(encoding="utf-8")) for path in (out / "html").rglob("*.html")}
     assert len(pages) >= MIN_PAGES
     return pages
 
 
-def _local(targets: list[str]) -> Iterator[tuple[str, str]]:
-    """Path and fragment of each target that is no address elsewhere."""
+def _select_local(targets: list[str]) -> Iterator[tuple[str, str]]:
+    """Yield path and fragment of each target within the site."""
     for target in targets:
         parts = urlsplit(target)
         if not parts.scheme and not parts.netloc:
             yield unquote(parts.path), unquote(parts.fragment)
 
 
-def test_every_link_leads_somewhere(site: dict[Path, Page]) -> None:
+def test_links_have_targets(site: dict[Path, Page]) -> None:
     broken = []
     for path, page in site.items():
-        for target, fragment in _local(page.links):
+        for target, fragment in _select_local(page.links):
             file = (path.parent / target).resolve() if target else path
             if not file.exists() or (fragment and file in site and fragment not in site[file].anchors):
                 broken.append(f"{path.name} -> {target}#{fragment}")
     assert not broken
 
 
-def test_pages_load_nothing_from_elsewhere(site: dict[Path, Page]) -> None:
-    loaded = [one for page in site.values() for one in page.loads]
-    assert [one for one in loaded if urlsplit(one).netloc] == []
+def test_pages_load_only_files_of_the_site(site: dict[Path, Page]) -> None:
+    loaded = [target for page in site.values() for target in page.loads]
+    assert [target for target in loaded if urlsplit(target).netloc] == []
     missing = [
-        one for path, page in site.items() for one, _ in _local(page.loads) if one and not (path.parent / one).exists()
+        target
+        for path, page in site.items()
+        for target, _ in _select_local(page.loads)
+        if target and not (path.parent / target).exists()
     ]
     assert not missing
 
 
-def test_every_scenario_has_a_page_of_its_keys(site: dict[Path, Page]) -> None:
+def test_every_scenario_has_a_parameter_page(site: dict[Path, Page]) -> None:
     from marsyard.scenarios.systems import scenario_names
 
     names = {path.stem for path in site}

@@ -30,9 +30,7 @@ NAME_WORDS = {
     "crew": "executor",
 }
 #: Names that are kept, with the reason.
-ALLOWED_NAMES = {
-    r"least_(squares|median|absolute|sum)": "terms of estimation",
-}
+ALLOWED_NAMES = {r"least_(squares|median|absolute|sum)": "terms of estimation"}
 #: Patterns of text that have a plain form.
 PHRASES = {
     r"\banew\b": "again",

@@ -1,4 +1,4 @@
-"""Files that cannot be meant: the command names file and fault, and ends with status 2, whatever the file is."""
+"""Tests of invalid input files: the command reports file and fault and exits with status 2."""
 
 from __future__ import annotations
 
@@ -19,44 +19,44 @@ from tests.scenarios.measured.folders import read_rows, velocity_folder, write_t
 
 MARS = CRS.from_string("+proj=eqc +lat_ts=0 +lon_0=0 +R=3396190 +units=m +no_defs")
 DEGREES = CRS.from_string("+proj=longlat +R=3396190 +no_defs")
-HOLE = -32767.0
+NO_DATA = -32767.0
 
-#: Writes a file into a folder.
+#: Function that writes a file to a path.
 Write = Callable[[Path], object]
 
 
-def dtm(path: Path, *, crs: CRS = MARS, unit: str = "m", nodata: float | None = HOLE, side: int = 40) -> None:
+def write_dtm(path: Path, *, crs: CRS = MARS, unit: str = "m", nodata: float | None = NO_DATA, side: int = 40) -> None:
     heights = np.full((40, 40), -4450.0, dtype=np.float32)
-    heights[7, 7] = HOLE
+    heights[7, 7] = NO_DATA
     profile = {"driver": "GTiff", "count": 1, "dtype": "float32", "nodata": nodata, "SPARSE_OK": "TRUE"}
-    place = {"crs": crs, "transform": Affine(1.0, 0.0, 8e6, 0.0, -1.0, -3e5), "height": side, "width": side}
-    with warnings.catch_warnings(), rasterio.open(path, "w", **profile, **place) as file:
+    georeference = {"crs": crs, "transform": Affine(1.0, 0.0, 8e6, 0.0, -1.0, -3e5), "height": side, "width": side}
+    with warnings.catch_warnings(), rasterio.open(path, "w", **profile, **georeference) as file:
         warnings.simplefilter("ignore")
         if side == 40:
             file.write(heights, 1)
         file.units = (unit,)
 
 
-def flight(path: Path, place: int, column: int, value: float) -> None:
-    """A fall with one number of one pose changed; of a quaternion's x, all poses are turned upside down."""
+def write_flight(path: Path, row: int, column: int, value: float) -> None:
+    """Write a vertical descent with one changed value; column 4 (qx) turns all poses upside down."""
     times = np.arange(-6.0, 22.0, 0.5)
     poses = np.zeros((times.size, 8))
     poses[:, 0], poses[:, 3], poses[:, 7] = times, 1900.0 - 75.0 * times, 1.0
-    poses[place, column] = value
+    poses[row, column] = value
     if column == 4:
         poses[:, 4:] = [1.0, 0.0, 0.0, 0.0]
     head = "time_s,x_m,y_m,z_m,qx,qy,qz,qw"
     np.savetxt(path, poses, delimiter=",", header=head, comments="")
 
 
-def gigabyte(path: Path, head: bytes = b"") -> None:
-    """A file of 1 GiB, of which nothing but its head takes room on the disk."""
+def write_gigabyte(path: Path, head: bytes = b"") -> None:
+    """Write a sparse file of 1 GiB that starts with `head`."""
     with path.open("wb") as file:
         file.write(head)
         file.truncate(1 << 30)
 
 
-def empty(path: Path) -> None:
+def write_empty(path: Path) -> None:
     path.write_bytes(b"")
 
 
@@ -70,47 +70,67 @@ DETECTOR = '[parameters.detector]\nfile = "{}"'
 @pytest.mark.parametrize(
     ("table", "name", "write", "message"),
     [
-        (TERRAIN, "projection.tif", lambda path: dtm(path, crs=DEGREES), "is in degrees; project it to metres"),
-        (TERRAIN, "nodata.tif", lambda path: dtm(path, nodata=None), "states no nodata value"),
-        (TERRAIN, "units.tif", lambda path: dtm(path, unit="ft"), "its heights are in 'ft'; metres are needed"),
-        (TERRAIN, "huge.tif", lambda path: dtm(path, side=16384), "has 16384 x 16384 values; at most 5461"),
-        (TERRAIN, "empty.tif", empty, "is empty (0 bytes)"),
-        (FLIGHT, "nan.csv", lambda path: flight(path, 9, 2, np.nan), "pose 10: y_m is not finite"),
-        (FLIGHT, "back.csv", lambda path: flight(path, 9, 0, -9.0), "pose 10: time goes from -2.000000 to -9.000000"),
-        (FLIGHT, "length.csv", lambda path: flight(path, 9, 7, 2.0), "pose 10: the quaternion's length is 2; allowed"),
-        (FLIGHT, "up.csv", lambda path: flight(path, 9, 4, 1.0), "at picture 1 the camera looks up, 90.0 deg"),
-        (FLIGHT, "huge.csv", gigabyte, "larger than 512 MiB"),
-        (FLIGHT, "empty.csv", empty, "has 0 poses; allowed: at least 4"),
-        (CAMERA, "empty.yaml", empty, "is empty (0 bytes)"),
-        (CAMERA, "huge.yaml", lambda path: gigabyte(path, b"image_width: 640\n"), "is larger than 8 MiB"),
-        (CAMERA, "huge.IMG", lambda path: gigabyte(path, b"PDS_VERSION_ID = PDS3\r\n"), "END: missing in the first"),
-        (MESH, "empty.stl", empty, "holds no triangle"),
-        (MESH, "huge.stl", gigabyte, "is larger than 256 MiB"),
-        (DETECTOR, "empty_sheet.toml", empty, "pixel_pitch_um: Field required"),
-        (DETECTOR, "huge_sheet.toml", gigabyte, "larger than 1 MiB"),
+        (TERRAIN, "projection.tif", lambda path: write_dtm(path, crs=DEGREES), "is in degrees; project it to metres"),
+        (TERRAIN, "nodata.tif", lambda path: write_dtm(path, nodata=None), "states no nodata value"),
+        (TERRAIN, "units.tif", lambda path: write_dtm(path, unit="ft"), "its heights are in 'ft'; metres are needed"),
+        (TERRAIN, "huge.tif", lambda path: write_dtm(path, side=16384), "has 16384 x 16384 values; at most 5461"),
+        (TERRAIN, "empty.tif", write_empty, "is empty (0 bytes)"),
+        (FLIGHT, "nan.csv", lambda path: write_flight(path, 9, 2, np.nan), "pose 10: y_m is not finite"),
+        (
+            FLIGHT,
+            "back.csv",
+            lambda path: write_flight(path, 9, 0, -9.0),
+            "pose 10: time goes from -2.000000 to -9.000000",
+        ),
+        (
+            FLIGHT,
+            "length.csv",
+            lambda path: write_flight(path, 9, 7, 2.0),
+            "pose 10: the quaternion's length is 2; allowed",
+        ),
+        (FLIGHT, "up.csv", lambda path: write_flight(path, 9, 4, 1.0), "at picture 1 the camera looks up, 90.0 deg"),
+        (FLIGHT, "huge.csv", write_gigabyte, "larger than 512 MiB"),
+        (FLIGHT, "empty.csv", write_empty, "has 0 poses; allowed: at least 4"),
+        (CAMERA, "empty.yaml", write_empty, "is empty (0 bytes)"),
+        (CAMERA, "huge.yaml", lambda path: write_gigabyte(path, b"image_width: 640\n"), "is larger than 8 MiB"),
+        (
+            CAMERA,
+            "huge.IMG",
+            lambda path: write_gigabyte(path, b"PDS_VERSION_ID = PDS3\r\n"),
+            "END: missing in the first",
+        ),
+        (MESH, "empty.stl", write_empty, "holds no triangle"),
+        (MESH, "huge.stl", write_gigabyte, "is larger than 256 MiB"),
+        (DETECTOR, "empty_sheet.toml", write_empty, "pixel_pitch_um: Field required"),
+        (DETECTOR, "huge_sheet.toml", write_gigabyte, "larger than 1 MiB"),
     ],
     ids=lambda value: value if isinstance(value, str) and "." in value and "\n" not in value else "",
 )
-def test_a_campaign_that_names_it_is_refused(tmp_path: Path, table: str, name: str, write: Write, message: str) -> None:
+def test_campaign_with_invalid_file_is_rejected(
+    tmp_path: Path, table: str, name: str, write: Write, message: str
+) -> None:
     write(tmp_path / name)
     campaign = tmp_path / "campaign.toml"
     campaign.write_text(f'name = "bad"\nscenario = "descent"\ncases = 1\n{table.format(tmp_path / name)}\n')
-    refused(["run", str(campaign), "--out", str(tmp_path / "run")], tmp_path / name, message)
+    run_and_expect_error(["run", str(campaign), "--out", str(tmp_path / "run")], tmp_path / name, message)
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (lambda path: gigabyte(path, b"P5 32768 32768 255\n"), "has 32768 x 32768 pixels; its camera has 1024 x 256"),
-        (lambda path: gigabyte(path, b"PDS_VERSION_ID = PDS3\r\n"), "END: missing in the first"),
-        (empty, "is empty (0 bytes)"),
+        (
+            lambda path: write_gigabyte(path, b"P5 32768 32768 255\n"),
+            "has 32768 x 32768 pixels; its camera has 1024 x 256",
+        ),
+        (lambda path: write_gigabyte(path, b"PDS_VERSION_ID = PDS3\r\n"), "END: missing in the first"),
+        (write_empty, "is empty (0 bytes)"),
     ],
 )
-def test_a_picture_is_refused(tmp_path: Path, write: Write, message: str) -> None:
+def test_invalid_image_is_rejected(tmp_path: Path, write: Write, message: str) -> None:
     folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write(folder / "drop-1.png")
-    refused(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "drop-1.png", message)
+    run_and_expect_error(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "drop-1.png", message)
     assert not (tmp_path / "out").exists()
 
 
@@ -123,16 +143,16 @@ def test_a_picture_is_refused(tmp_path: Path, write: Write, message: str) -> Non
         ({"qx": "1", "qy": "0", "qz": "0", "qw": "0"}, "line 3: the camera looks up, 90.0 deg"),
     ],
 )
-def test_a_table_is_refused(tmp_path: Path, cells: dict[str, str], message: str) -> None:
+def test_invalid_table_is_rejected(tmp_path: Path, cells: dict[str, str], message: str) -> None:
     folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
-    write_texts(folder, [row | cells if place == 1 else row for place, row in enumerate(read_rows(folder))])
-    refused(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "pictures.csv", message)
+    write_texts(folder, [row | cells if index == 1 else row for index, row in enumerate(read_rows(folder))])
+    run_and_expect_error(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "pictures.csv", message)
 
 
-def refused(words: list[str], path: Path, message: str) -> None:
-    ended = CliRunner().invoke(app, words)
-    assert (ended.exit_code, type(ended.exception)) == (2, SystemExit)
-    output = ended.output
+def run_and_expect_error(words: list[str], path: Path, message: str) -> None:
+    result = CliRunner().invoke(app, words)
+    assert (result.exit_code, type(result.exception)) == (2, SystemExit)
+    output = result.output
     assert output.startswith("error: ")
     assert str(path) in output
     assert message in output

@@ -1,4 +1,4 @@
-"""The command line as a user runs it: what it prints, where, and how it ends."""
+"""Tests of the command line: output, error messages, exit status and run folders."""
 
 from __future__ import annotations
 
@@ -22,49 +22,49 @@ from tests.campaigns.fake_campaign import HEAD, REQUIREMENT, write_campaign
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    # Figures are the reports' own business.
+    # warnings of Matplotlib in the figures of reports
     pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
 ]
 
 
 @dataclass(frozen=True)
-class Ended:
+class CommandResult:
     status: int
     out: str
     err: str
 
 
-Command = Callable[..., Ended]
+Command = Callable[..., CommandResult]
 
 
 @pytest.fixture
 def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Runs a command in this process."""
+    """Return a function that runs a command in this process."""
 
-    def command(*arguments: object) -> Ended:
+    def run_command(*arguments: object) -> CommandResult:
         monkeypatch.setattr(sys, "argv", ["marsyard", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as raised:
             cli.main()
         captured = capfd.readouterr()
-        return Ended(int(ended.value.code or 0), captured.out, captured.err)
+        return CommandResult(int(raised.value.code or 0), captured.out, captured.err)
 
-    return command
+    return run_command
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small campaign, run by the real command."""
+    """Run a small campaign with the installed command."""
     folder = tmp_path_factory.mktemp("campaign")
     path = write_campaign(folder, "silent_cases = [2]", requirement=REQUIREMENT.replace("0.99", "0.9"))
     command = [str(Path(sys.executable).with_name("marsyard")), "run", str(path), "--jobs", "2", "-n", "6"]
-    ended = subprocess.run([*command, "--out", str(folder / "run")], capture_output=True, text=True, timeout=120)
-    assert ended.returncode == 3, ended.stderr
-    (folder / "stdout.txt").write_text(ended.stdout)
-    (folder / "stderr.txt").write_text(ended.stderr)
+    result = subprocess.run([*command, "--out", str(folder / "run")], capture_output=True, text=True, timeout=120)
+    assert result.returncode == 3, result.stderr
+    (folder / "stdout.txt").write_text(result.stdout)
+    (folder / "stderr.txt").write_text(result.stderr)
     return folder / "run"
 
 
-def test_a_run_ends_with_table_verdict_and_report(finished: Path) -> None:
+def test_run_prints_table_verdict_and_report(finished: Path) -> None:
     out = (finished.parent / "stdout.txt").read_text()
     assert "velocity" in out
     assert "1 of 6" in out
@@ -78,35 +78,35 @@ def test_a_run_ends_with_table_verdict_and_report(finished: Path) -> None:
     assert "\x1b" not in out + progress
 
 
-def test_report_judges_what_is_stored(finished: Path, marsyard: Command) -> None:
+def test_report_evaluates_stored_rows(finished: Path, marsyard: Command) -> None:
     (finished / "report.html").unlink()
-    ended = marsyard("report", finished)
-    assert (ended.status, ended.err) == (3, "")
-    assert "verdict: INSUFFICIENT" in ended.out
+    result = marsyard("report", finished)
+    assert (result.status, result.err) == (3, "")
+    assert "verdict: INSUFFICIENT" in result.out
     assert (finished / "report.html").exists()
 
 
-def test_replay_compares_with_what_is_stored(finished: Path, marsyard: Command, tmp_path: Path) -> None:
-    ended = marsyard("replay", finished, 2, "--out", tmp_path / "products")
-    assert (ended.status, ended.err) == (0, "")
-    assert "case 2: SILENT" in ended.out
-    assert "the row equals the stored one" in ended.out
+def test_replay_compares_with_the_stored_row(finished: Path, marsyard: Command, tmp_path: Path) -> None:
+    result = marsyard("replay", finished, 2, "--out", tmp_path / "products")
+    assert (result.status, result.err) == (0, "")
+    assert "case 2: SILENT" in result.out
+    assert "the row equals the stored one" in result.out
     assert (tmp_path / "products" / "products.npz").exists()
 
 
-def test_replay_fails_where_rows_differ(finished: Path, marsyard: Command, tmp_path: Path) -> None:
+def test_replay_fails_if_the_row_differs(finished: Path, marsyard: Command, tmp_path: Path) -> None:
     (tmp_path / "campaign.json").write_bytes((finished / "campaign.json").read_bytes())
     frame = pd.read_parquet(finished / "cases.parquet")
     frame["altitude_m"] += 1.0 * (frame.index == 1)
     frame.to_parquet(tmp_path / "cases.parquet")
-    ended = marsyard("replay", tmp_path, 1)
-    assert ended.status == 1
-    assert "the row differs from the stored one in: altitude_m" in ended.out
+    result = marsyard("replay", tmp_path, 1)
+    assert result.status == 1
+    assert "the row differs from the stored one in: altitude_m" in result.out
 
 
-def test_stages_are_written_one_by_one(finished: Path, marsyard: Command, tmp_path: Path) -> None:
-    ended = marsyard("replay", finished, 0, "--save-stages", "--out", tmp_path / "case")
-    assert (ended.status, ended.err) == (0, "")
+def test_stages_are_saved_as_separate_files(finished: Path, marsyard: Command, tmp_path: Path) -> None:
+    result = marsyard("replay", finished, 0, "--save-stages", "--out", tmp_path / "case")
+    assert (result.status, result.err) == (0, "")
     stages = tmp_path / "case" / "stages"
     files = sorted(str(path.relative_to(stages)) for path in stages.rglob("*.*"))
     assert files == ["01-picture.png", "02-title.json", "03-nested/01-0/01-x.npy"]
@@ -114,11 +114,11 @@ def test_stages_are_written_one_by_one(finished: Path, marsyard: Command, tmp_pa
     assert picture is not None
     assert picture.dtype == np.uint16
     assert picture.tolist() == [[0, 1, 2], [3, 4, 5]]
-    assert f"stages: 3 files in {stages}" in ended.out
+    assert f"stages: 3 files in {stages}" in result.out
 
 
-def _kill_when_rows_are_there(path: Path, directory: Path, cases: int) -> None:
-    """Runs a campaign and kills it with its rows half done."""
+def _kill_after_first_rows(path: Path, directory: Path, cases: int) -> None:
+    """Run a campaign and kill it when the first rows are stored."""
     command = [
         sys.executable,
         "-m",
@@ -134,16 +134,16 @@ def _kill_when_rows_are_there(path: Path, directory: Path, cases: int) -> None:
     ]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     log = directory / "cases.sqlite-wal"
-    # the header and a page for what each of the first batches wrote
+    # more than the header and the pages of the empty table
     while not (log.exists() and log.stat().st_size > 4 * 4200) and process.poll() is None:
         time.sleep(0.05)
     process.kill()
     process.wait()
 
 
-def test_a_killed_campaign_is_reported_and_resumed(tmp_path: Path, marsyard: Command) -> None:
+def test_killed_campaign_is_reported_and_resumed(tmp_path: Path, marsyard: Command) -> None:
     path = write_campaign(tmp_path, "sleep_s = 0.1", dispersions="", requirement=REQUIREMENT)
-    _kill_when_rows_are_there(path, tmp_path / "run", 40)
+    _kill_after_first_rows(path, tmp_path / "run", 40)
     before = (tmp_path / "run" / "campaign.json").read_bytes()
     reported = marsyard("report", tmp_path / "run")
     assert (reported.status, reported.err) == (3, "")
@@ -154,62 +154,60 @@ def test_a_killed_campaign_is_reported_and_resumed(tmp_path: Path, marsyard: Com
     assert message[2] == str(tmp_path / "run")
     assert 0 < int(message[1]) == len(pd.read_parquet(tmp_path / "run" / "cases.parquet")) < 40
     assert (tmp_path / "run" / "campaign.json").read_bytes() == before
-    refused = marsyard("append", tmp_path / "run", 2)
-    assert (refused.status, "is not finished (running): marsyard resume" in refused.err) == (2, True)
+    rejected = marsyard("append", tmp_path / "run", 2)
+    assert (rejected.status, "is not finished (running): marsyard resume" in rejected.err) == (2, True)
     resumed = marsyard("resume", tmp_path / "run", "--jobs", 1, "--allow-changed")
     assert (resumed.status, "INCOMPLETE" in resumed.out) == (3, False)
     assert list(pd.read_parquet(tmp_path / "run" / "cases.parquet")["case"]) == list(range(40))
-    # With more cases the same requirement is decided.
     appended = marsyard("append", tmp_path / "run", 20, "--jobs", 1, "--allow-changed")
     assert appended.status == 3
     assert "of 60" in appended.out
     assert "takes at least 230 cases without a failure, and 60 are asked for" in appended.out
 
 
-def test_a_dry_run_only_estimates(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dry_run_only_estimates(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    ended = marsyard("run", write_campaign(tmp_path, "sleep_s = 0.05"), "--dry-run", "-n", 100_000, "--jobs", 2)
-    assert (ended.status, ended.err) == (0, "")
-    assert re.search(r"^100,000 cases on 2 workers: about [\d.]+ (min|h)$", ended.out, re.MULTILINE)
-    assert re.search(r"^  0\.\d+ s a case \(0\.\d+ to \d[\d.]* s in 9 trial cases\)$", ended.out, re.MULTILINE)
-    assert re.search(r"^disk: [\d.]+ MB of rows, up to [\d.]+ bytes of products$", ended.out, re.MULTILINE)
+    result = marsyard("run", write_campaign(tmp_path, "sleep_s = 0.05"), "--dry-run", "-n", 100_000, "--jobs", 2)
+    assert (result.status, result.err) == (0, "")
+    assert re.search(r"^100,000 cases on 2 workers: about [\d.]+ (min|h)$", result.out, re.MULTILINE)
+    assert re.search(r"^  0\.\d+ s a case \(0\.\d+ to \d[\d.]* s in 9 trial cases\)$", result.out, re.MULTILINE)
+    assert re.search(r"^disk: [\d.]+ MB of rows, up to [\d.]+ bytes of products$", result.out, re.MULTILINE)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fake.toml"]
 
 
-def _crash(case: int) -> str:
+def _crash_case(case: int) -> str:
     return f"raising_cases = [{case}]"
 
 
 @pytest.mark.parametrize(
-    ("parameters", "requirement", "status", "word"),
+    ("parameters", "requirement", "status", "verdict"),
     [
         ("", "", 0, "NO REQUIREMENT"),
-        (_crash(1), "", 1, "NO REQUIREMENT"),
-        # Three cases on one terrain are worth one: at 90 % it shows a rate of 10 %.
+        (_crash_case(1), "", 1, "NO REQUIREMENT"),
+        # three cases on one terrain count as one: at 90 % confidence it shows a rate of 10 %
         ("", REQUIREMENT.replace("0.99", "0.09"), 0, "PASS"),
         ("error_scale = 1e3", REQUIREMENT, 1, "FAIL"),
         ("", REQUIREMENT, 3, "INSUFFICIENT"),
-        # One failure of three leaves open whether nine of ten would succeed, but a crash is a crash.
-        (_crash(1), REQUIREMENT.replace("0.99", "0.9"), 1, "INSUFFICIENT"),
+        # the requirement is undecided, but a crash gives status 1
+        (_crash_case(1), REQUIREMENT.replace("0.99", "0.9"), 1, "INSUFFICIENT"),
     ],
 )
-def test_exit_status(
-    tmp_path: Path, marsyard: Command, parameters: str, requirement: str, status: int, word: str
+def test_exit_status_follows_verdict_and_crashes(
+    tmp_path: Path, marsyard: Command, parameters: str, requirement: str, status: int, verdict: str
 ) -> None:
     path = write_campaign(tmp_path, parameters, dispersions="", requirement=requirement)
-    ended = marsyard("run", path, "-n", 3, "--jobs", 1, "--out", tmp_path / "run")
-    assert (ended.status, f"verdict: {word}" in ended.out) == (status, True), ended.out + ended.err
-    # From the files alone it is the same.
-    again = marsyard("report", tmp_path / "run")
-    assert (again.status, f"verdict: {word}" in again.out) == (status, True)
+    result = marsyard("run", path, "-n", 3, "--jobs", 1, "--out", tmp_path / "run")
+    assert (result.status, f"verdict: {verdict}" in result.out) == (status, True), result.out + result.err
+    reported = marsyard("report", tmp_path / "run")
+    assert (reported.status, f"verdict: {verdict}" in reported.out) == (status, True)
 
 
-def test_what_is_wrong_goes_before_what_failed(tmp_path: Path, marsyard: Command) -> None:
+def test_configuration_error_precedes_failed_cases(tmp_path: Path, marsyard: Command) -> None:
     wrong = REQUIREMENT.replace("velocity_error_m_s", "velocity_error_m")
-    path = write_campaign(tmp_path, _crash(0), dispersions="", requirement=wrong)
-    ended = marsyard("run", path, "-n", 3, "--jobs", 1, "--out", tmp_path / "run")
-    assert ended.status == 2
-    assert "unknown column of numbers 'velocity_error_m' (did you mean 'velocity_error_m_s'?)" in ended.err
+    path = write_campaign(tmp_path, _crash_case(0), dispersions="", requirement=wrong)
+    result = marsyard("run", path, "-n", 3, "--jobs", 1, "--out", tmp_path / "run")
+    assert result.status == 2
+    assert "unknown column of numbers 'velocity_error_m' (did you mean 'velocity_error_m_s'?)" in result.err
 
 
 @pytest.mark.parametrize(
@@ -250,30 +248,32 @@ def test_what_is_wrong_goes_before_what_failed(tmp_path: Path, marsyard: Command
         (["replay", "{run}", "0", "--out", "{file}/x"], "cannot be written"),
     ],
 )
-def test_bad_input(finished: Path, tmp_path: Path, marsyard: Command, arguments: list[str], message: str) -> None:
+def test_invalid_arguments_are_rejected(
+    finished: Path, tmp_path: Path, marsyard: Command, arguments: list[str], message: str
+) -> None:
     file = write_campaign(tmp_path)
-    ended = marsyard(*(part.format(file=file, run=finished, folder=tmp_path) for part in arguments))
-    # The usage errors of the command line's own library are set in a box: what is said may be broken into lines.
-    text = re.sub(r"[\s│]+", " ", ended.err)
-    assert ended.status == 2
+    result = marsyard(*(part.format(file=file, run=finished, folder=tmp_path) for part in arguments))
+    # Typer prints usage errors in a box with line breaks
+    text = re.sub(r"[\s│]+", " ", result.err)
+    assert result.status == 2
     assert re.sub(r"\s+", " ", message) in text
-    assert "Traceback" not in ended.err
-    assert ended.out == ""
+    assert "Traceback" not in result.err
+    assert result.out == ""
     assert not (tmp_path / "runs").exists()
 
 
-def test_negative_case_numbers_are_refused(finished: Path, marsyard: Command) -> None:
+def test_negative_case_numbers_are_rejected(finished: Path, marsyard: Command) -> None:
     assert marsyard("replay", finished, "--", "-1").status == 2
 
 
-def test_a_defect_of_ours_is_no_verdict(marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("marsyard.campaigns.definition.catalogue.catalogue", lambda: 1 / 0)
-    ended = marsyard("list")
-    assert ended.status == 2
-    assert "ZeroDivisionError" in ended.err
+def test_internal_error_has_status_2(marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("marsyard.campaigns.definition.loading.catalogue", lambda: 1 / 0)
+    result = marsyard("list")
+    assert result.status == 2
+    assert "ZeroDivisionError" in result.err
 
 
-def test_without_out_a_run_goes_to_runs(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_default_output_folder_is_runs(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     path = write_campaign(tmp_path, dispersions="", requirement="")
     for _ in range(2):
@@ -283,56 +283,56 @@ def test_without_out_a_run_goes_to_runs(tmp_path: Path, marsyard: Command, monke
     assert all(re.fullmatch(r"fake-\d{8}T\d{6}Z(-2)?", name) for name in folders)
 
 
-def test_list_and_show(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "120")  # narrower ones fold what is looked for
+def test_list_and_show_print_campaigns(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "120")  # wide enough for unbroken texts
     listed = marsyard("list")
     assert (listed.status, listed.err) == (0, "")
     assert "dimes-smoke" in listed.out
-    shown = marsyard("show", write_campaign(tmp_path), "--set", "terrain=2")
-    assert (shown.status, shown.err) == (0, "")
+    details = marsyard("show", write_campaign(tmp_path), "--set", "terrain=2")
+    assert (details.status, details.err) == (0, "")
     for text in ("uniform(low=-30.0, high=30.0)", "test", "lowest_altitude_m", "velocity", "12 cases, seed 5"):
-        assert text in shown.out
+        assert text in details.out
 
 
 def test_names_in_brackets_are_not_markup(tmp_path: Path, marsyard: Command) -> None:
     head = HEAD.replace("a campaign without a world", "[red]bold[/red] [oops")
-    shown = marsyard("show", write_campaign(tmp_path, head=head))
-    assert "[red]bold[/red] [oops" in shown.out
+    result = marsyard("show", write_campaign(tmp_path, head=head))
+    assert "[red]bold[/red] [oops" in result.out
 
 
-def test_version_and_doctor(marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_version_and_doctor_print_their_output(marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     assert re.fullmatch(r"marsyard \d+\.\d+\.\d+\n", marsyard("--version").out)
     monkeypatch.setattr("marsyard.doctor.run", lambda console, as_json: console.print("looked") or 1)
-    ended = marsyard("doctor")
-    assert (ended.status, ended.out) == (1, "looked\n")
+    result = marsyard("doctor")
+    assert (result.status, result.out) == (1, "looked\n")
 
 
-def test_help_answers_at_once() -> None:
-    began = time.perf_counter()
-    ended = subprocess.run(
+def test_help_is_fast() -> None:
+    start_s = time.perf_counter()
+    result = subprocess.run(
         [sys.executable, "-X", "importtime", "-m", "marsyard", "--help"], capture_output=True, text=True
     )
-    elapsed = time.perf_counter() - began
-    assert ended.returncode == 0
-    assert "Exit status: 0 every requirement met" in re.sub(r"[\s│]+", " ", ended.stdout)
-    # The time is stated loosely for a busy machine; what makes it short is that none of these is imported.
+    elapsed = time.perf_counter() - start_s
+    assert result.returncode == 0
+    assert "Exit status: 0 every requirement met" in re.sub(r"[\s│]+", " ", result.stdout)
+    # loose limit for a busy machine; no heavy package may be imported
     assert elapsed < 3.0
-    for heavy in ("numpy", "pandas", "scipy", "joblib", "pydantic", "matplotlib"):
-        assert f" {heavy}\n" not in ended.stderr
+    for package in ("numpy", "pandas", "scipy", "joblib", "pydantic", "matplotlib"):
+        assert f" {package}\n" not in result.stderr
 
 
-def test_a_bad_campaign_is_refused_before_what_is_slow_is_imported(tmp_path: Path) -> None:
+def test_invalid_campaign_is_rejected_before_slow_imports(tmp_path: Path) -> None:
     path = tmp_path / "bad.toml"
     path.write_text('name = "bad"\nscenario = "descent"\ncases = 1\n[parameters.camera]\nfocal_length_mmm = 1\n')
     command = [sys.executable, "-X", "importtime", "-m", "marsyard", "run", str(path)]
-    ended = subprocess.run(command, capture_output=True, text=True)
-    assert ended.returncode == 2
-    assert "did you mean 'focal_length_mm'?" in ended.stderr
-    for heavy in ("pandas", "matplotlib", "pyarrow", "joblib", "trimesh", "networkx", "rasterio", "pyrender"):
-        assert f" {heavy}\n" not in ended.stderr
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 2
+    assert "did you mean 'focal_length_mm'?" in result.stderr
+    for package in ("pandas", "matplotlib", "pyarrow", "joblib", "trimesh", "networkx", "rasterio", "pyrender"):
+        assert f" {package}\n" not in result.stderr
 
 
-def test_a_terminal_gets_a_bar(tmp_path: Path) -> None:
+def test_terminal_shows_a_progress_bar(tmp_path: Path) -> None:
     path = write_campaign(tmp_path, dispersions="", requirement="")
     command = [
         sys.executable,
@@ -348,8 +348,8 @@ def test_a_terminal_gets_a_bar(tmp_path: Path) -> None:
         str(tmp_path / "run"),
     ]
     environment = {**os.environ, "FORCE_COLOR": "1", "TERM": "xterm", "COLUMNS": "100"}
-    ended = subprocess.run(command, capture_output=True, text=True, env=environment)
-    assert ended.returncode == 0, ended.stderr
-    assert "2/2" in ended.stderr
-    assert "in all" in ended.stderr
-    assert "━" in ended.stderr
+    result = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert result.returncode == 0, result.stderr
+    assert "2/2" in result.stderr
+    assert "in all" in result.stderr
+    assert "━" in result.stderr

@@ -1,4 +1,4 @@
-"""The shell completes commands and their options, as `marsyard --install-completion` sets it up."""
+"""Tests of shell completion and of `marsyard --install-completion`."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from marsyard.cli.app import app
 
 
 @pytest.mark.parametrize(
-    ("words", "place", "completed"),
+    ("words", "index", "completions"),
     [("marsyard con", 1, {"conformance"}), ("marsyard clean --y", 2, {"--yes"}), ("marsyard terrain l", 2, {"list"})],
 )
-def test_words_are_completed(words: str, place: int, completed: set[str]) -> None:
-    environment = {"_MARSYARD_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(place)}
-    ended = CliRunner().invoke(app, [], prog_name="marsyard", env=environment)
-    assert set(ended.output.split()) == completed
+def test_words_are_completed(words: str, index: int, completions: set[str]) -> None:
+    environment = {"_MARSYARD_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(index)}
+    result = CliRunner().invoke(app, [], prog_name="marsyard", env=environment)
+    assert set(result.output.split()) == completions
 
 
-def test_it_is_set_up_as_the_readme_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_installation_writes_the_shell_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("typer._completion_shared._get_shell_name", lambda: "bash")
     monkeypatch.setenv("HOME", str(tmp_path))
-    ended = CliRunner().invoke(app, ["--install-completion"], prog_name="marsyard")
-    assert ended.exit_code == 0, ended.output
+    result = CliRunner().invoke(app, ["--install-completion"], prog_name="marsyard")
+    assert result.exit_code == 0, result.output
     assert "marsyard" in (tmp_path / ".bashrc").read_text()
     assert "marsyard --install-completion" in (Path(__file__).parents[2] / "docs" / "commands.md").read_text()

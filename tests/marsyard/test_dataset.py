@@ -1,4 +1,4 @@
-"""Data sets for learning: whole shards, the truth of each pixel, the same bytes again."""
+"""Tests of data sets for machine learning: shards, truth of each pixel and reproducible files."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ diameter_m = 1.0
 """
 
 
-def made(folder: Path, *words: str) -> tuple[int, str]:
+def run_dataset(folder: Path, *words: str) -> tuple[int, str]:
     (folder / "samples.toml").write_text(CAMPAIGN)
     result = CliRunner().invoke(
         app, ["dataset", str(folder / "samples.toml"), "--out", str(folder / "set"), "--shard", "1", *words]
@@ -52,40 +52,40 @@ def made(folder: Path, *words: str) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
-def contents(path: Path) -> dict[str, bytes]:
+def read_shard(path: Path) -> dict[str, bytes]:
     with tarfile.open(path) as shard:
-        return {one.name: shard.extractfile(one).read() for one in shard.getmembers()}  # type: ignore[union-attr]
+        return {member.name: shard.extractfile(member).read() for member in shard.getmembers()}  # type: ignore[union-attr]
 
 
 def test_only_terrains_of_the_cases_are_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path / "cache"))
     path = tmp_path / "samples.toml"
-    drawn = '"location.terrain" = { distribution = "integer", low = 0, high = 19, source = "any" }'
-    path.write_text(CAMPAIGN.replace("bank = 1", "bank = 20").replace("samples = 512", "samples = 256") + drawn)
+    dispersion = '"location.terrain" = { distribution = "integer", low = 0, high = 19, source = "any" }'
+    path.write_text(CAMPAIGN.replace("bank = 1", "bank = 20").replace("samples = 512", "samples = 256") + dispersion)
     campaign = load_campaign(str(path))
     _prepare_inputs(campaign, range(2))
     used = {campaign.parameters(case).model_dump()["location"]["terrain"] for case in range(2)}
     assert len(list((tmp_path / "cache" / "terrain").iterdir())) == len(used)
 
 
-def points_of(reported: dict[str, Any], camera_file: Path, distance: np.ndarray) -> np.ndarray:
-    """World points of a sample's pixels, from its pose, camera and ranges."""
+def compute_points(sample: dict[str, Any], camera_file: Path, distance: np.ndarray) -> np.ndarray:
+    """World points of a sample's pixels, computed from pose, camera and ranges."""
     camera = read_cahvor(camera_file)
     origins, directions = camera.rays(camera.pixel_grid())
-    turn = Rotation.from_quat(reported["world_from_body_xyzw"])
-    seen = (origins + distance[..., None] * directions).reshape(-1, 3)
-    return (np.array(reported["position_m"]) + turn.apply(seen)).reshape(*distance.shape, 3)
+    world_from_body = Rotation.from_quat(sample["world_from_body_xyzw"])
+    body_points = (origins + distance[..., None] * directions).reshape(-1, 3)
+    return (np.array(sample["position_m"]) + world_from_body.apply(body_points)).reshape(*distance.shape, 3)
 
 
-def test_samples_hold_the_truth_of_their_pixels_and_are_gone_on_with(tmp_path: Path) -> None:
-    status, output = made(tmp_path)
+def test_samples_contain_pixel_truth_and_are_reproducible(tmp_path: Path) -> None:
+    status, output = run_dataset(tmp_path)
     assert status == 0, output
     shards = sorted((tmp_path / "set").glob("*.tar"))
     assert [path.name for path in shards] == ["shard-000000.tar", "shard-000001.tar"]
-    files = contents(shards[1])
+    files = read_shard(shards[1])
     assert {name.partition(".")[0] for name in files} == {"0000001-0", "0000001-1"}
 
-    reported = json.loads(files["0000001-0.json"])
+    sample = json.loads(files["0000001-0.json"])
     image, rocks, hazard = (
         np.asarray(cv2.imdecode(np.frombuffer(files[f"0000001-0.{name}.png"], np.uint8), cv2.IMREAD_UNCHANGED))
         for name in ("image", "rocks", "hazard")
@@ -98,35 +98,35 @@ def test_samples_hold_the_truth_of_their_pixels_and_are_gone_on_with(tmp_path: P
     assert set(np.unique(hazard)) <= {0, 1, 255}
     assert 0 in hazard
 
-    # pose, camera and range give world points; of flat parts the height changes as the normals say
+    # normals from the world points of neighbouring pixels, compared with the stored normals
     path = tmp_path / "camera.cahvor"
     path.write_bytes(files["0000001-0.cahvor"])
-    points = points_of(reported, path, distance)
-    bare = rocks[:-1, :-1] + rocks[1:, :-1] + rocks[:-1, 1:] == 0
-    across, along = points[:-1, 1:] - points[:-1, :-1], points[1:, :-1] - points[:-1, :-1]
-    fitted = np.cross(along, across)
-    fitted /= np.linalg.norm(fitted, axis=2, keepdims=True)
-    cosine = np.sum(fitted * normal[:-1, :-1], axis=2)[bare]
+    points = compute_points(sample, path, distance)
+    without_rocks = rocks[:-1, :-1] + rocks[1:, :-1] + rocks[:-1, 1:] == 0
+    x_step, y_step = points[:-1, 1:] - points[:-1, :-1], points[1:, :-1] - points[:-1, :-1]
+    computed_normal = np.cross(y_step, x_step)
+    computed_normal /= np.linalg.norm(computed_normal, axis=2, keepdims=True)
+    cosine = np.sum(computed_normal * normal[:-1, :-1], axis=2)[without_rocks]
     assert np.median(cosine) > 0.99
 
-    # the drawn values are the campaign's, and an interrupted set is gone on with, byte for byte
-    assert 0.0 <= reported["drawn"]["location.east_m"] <= 20.0
+    # an interrupted data set is completed with identical files
+    assert 0.0 <= sample["drawn"]["location.east_m"] <= 20.0
     before = [path.read_bytes() for path in shards]
     shards[0].unlink()
-    assert made(tmp_path)[0] == 0
+    assert run_dataset(tmp_path)[0] == 0
     assert [path.read_bytes() for path in shards] == before
-    status, output = made(tmp_path, "--seed", "4")
+    status, output = run_dataset(tmp_path, "--seed", "4")
     assert status == 2
     assert "holds another data set (configuration_sha256 differs)" in output
 
 
-def test_descents_give_their_three_pictures(tmp_path: Path) -> None:
+def test_descent_sample_has_three_images(tmp_path: Path) -> None:
     settings = ["terrain.samples=512", "location.bank=8"]
     words = [part for setting in settings for part in ("--set", setting)]
     out = tmp_path / "set"
     result = CliRunner().invoke(app, ["dataset", "dimes-smoke", "-n", "1", "--jobs", "1", "--out", str(out), *words])
     assert result.exit_code == 0, result.output
-    files = contents(out / "shard-000000.tar")
+    files = read_shard(out / "shard-000000.tar")
     kinds = {name.partition(".")[2] for name in files}
     assert kinds == {"image.png", "range.npy", "normal.npy", "rocks.png", "cahvor", "json"}
     assert {name.partition(".")[0] for name in files} == {f"0000000-{number}" for number in range(3)}
@@ -137,24 +137,24 @@ def test_descents_give_their_three_pictures(tmp_path: Path) -> None:
     surface = World.of(parameters).surface
     path = tmp_path / "camera.cahvor"
     for number in range(3):
-        reported = json.loads(files[f"0000000-{number}.json"])
+        sample = json.loads(files[f"0000000-{number}.json"])
         path.write_bytes(files[f"0000000-{number}.cahvor"])
         distance = np.load(io.BytesIO(files[f"0000000-{number}.range.npy"]))
-        points = points_of(reported, path, distance)
-        seen = np.isfinite(distance)
-        assert seen.mean() > 0.9
-        x, y, z = points[seen].T
-        # within what a pixel's level of detail smooths of the ground: its own size, some 2 m at 2000 m
+        points = compute_points(sample, path, distance)
+        is_visible = np.isfinite(distance)
+        assert is_visible.mean() > 0.9
+        x, y, z = points[is_visible].T
+        # the level of detail smooths the terrain over one pixel, about 2 m at 2000 m range
         assert np.median(abs(z - surface.height(x, y))) < 0.2
-        assert reported["velocity_m_s"][2] < -60.0
+        assert sample["velocity_m_s"][2] < -60.0
 
 
-def test_scenarios_without_samples_are_refused(tmp_path: Path) -> None:
+def test_scenarios_without_samples_are_rejected(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["dataset", "vtt-montecarlo", "--out", str(tmp_path / "set")])
     assert result.exit_code == 2
     assert "gives no samples to learn from; allowed: descent, landing" in result.output
 
 
 @pytest.mark.parametrize("words", [("--shard", "0"), ("--jobs", "0")])
-def test_wrong_numbers(tmp_path: Path, words: tuple[str, str]) -> None:
-    assert made(tmp_path, *words)[0] == 2
+def test_invalid_numbers_are_rejected(tmp_path: Path, words: tuple[str, str]) -> None:
+    assert run_dataset(tmp_path, *words)[0] == 2

@@ -11,16 +11,16 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from marsyard.campaigns.definition.identity import identity_of
+from marsyard.campaigns.definition.identity import create_identity
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.store import record
 from marsyard.cli.app import main
 from marsyard.reports.stored import read_run
 from marsyard.scenarios.systems import row_columns, scenario, scenario_names
-from marsyard.sim import renamed
-from marsyard.sim.renamed import RenamedWarning
+from marsyard.sim import parameters
+from marsyard.sim.parameters import RenamedWarning
 
-TABLE = tomllib.loads(Path(renamed.__file__).with_suffix(".toml").read_text())
+TABLE = tomllib.loads(Path(parameters.__file__).with_suffix(".toml").read_text())
 CAMPAIGN = """
 name = "former"
 scenario = "descent"
@@ -85,7 +85,7 @@ def test_draws_are_those_of_the_former_names(files: tuple[Path, Path]) -> None:
 
 def test_a_stored_campaign_is_read_by_the_current_names(files: tuple[Path, Path], tmp_path: Path) -> None:
     expected = load_campaign(str(files[1])).configuration
-    record.begin(tmp_path, expected, identity_of(expected), "test")
+    record.begin(tmp_path, expected, create_identity(expected), "test")
     text = (tmp_path / "campaign.json").read_text()
     for former, now in (*NAMES, ("most_cases", "max_cases")):
         text = text.replace(f'"{now}', f'"{former}').replace(f".{now}", f".{former}").replace(f" {now}", f" {former}")

@@ -1,4 +1,4 @@
-"""`marsyard gallery`: its plates are possible, its page stands alone, its contact sheet is small."""
+"""Tests of `marsyard gallery`: figures, page and contact sheet."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from marsyard.cli import app as cli
 from marsyard.cli import gallery as gallery_command
-from marsyard.cli.gallery import PAGE, PLATES, SHEET, SHEET_BYTES, SvgFigure, contact_sheet, displayed, write_gallery
+from marsyard.cli.gallery import PAGE, PLATES, SHEET, SHEET_BYTES, SvgFigure, contact_sheet, map_to_grey, write_gallery
 from marsyard.cli.pictures import Shot
 from marsyard.sim.sensor import PRESETS
 from marsyard.sim.terrain import sites
@@ -22,17 +22,17 @@ from marsyard.sim.terrain import sites
 class _Links(HTMLParser):
     def __init__(self) -> None:
         super().__init__()
-        self.found: list[str] = []
+        self.targets: list[str] = []
         self.texts: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.found += [value for name, value in attrs if name in ("href", "src") and value]
+        self.targets += [value for name, value in attrs if name in ("href", "src") and value]
         self.texts += [value or "" for name, value in attrs if tag == "img" and name == "alt"]
 
 
 @pytest.fixture(scope="module")
-def plates() -> list[SvgFigure]:
-    """Plates of noise, as hard to compress as pictures can be."""
+def figures() -> list[SvgFigure]:
+    """Figures of white noise, the worst case for compression."""
     rng = np.random.default_rng(1)
     return [
         SvgFigure(
@@ -44,37 +44,41 @@ def plates() -> list[SvgFigure]:
     ]
 
 
-def test_every_site_and_every_kind_of_camera_is_shown(plates: list[SvgFigure]) -> None:
-    assert {plate.shot.site for plate in plates} == set(sites())
-    assert {plate.shot.camera for plate in plates} == set(PRESETS)
-    for plate in plates:
-        site = sites()[plate.shot.site]
-        assert site.descent is None or any(p.shot.scale == "descent" for p in plates if p.shot.site == site.name)
+def test_every_site_and_camera_is_shown(figures: list[SvgFigure]) -> None:
+    assert {figure.shot.site for figure in figures} == set(sites())
+    assert {figure.shot.camera for figure in figures} == set(PRESETS)
+    for figure in figures:
+        site = sites()[figure.shot.site]
+        assert site.descent is None or any(
+            other.shot.scale == "descent" for other in figures if other.shot.site == site.name
+        )
 
 
-def test_page_needs_only_the_pictures_next_to_it(plates: list[SvgFigure], tmp_path: Path) -> None:
-    page = write_gallery(plates, tmp_path / "new" / "gallery")
+def test_page_links_only_to_its_images(figures: list[SvgFigure], tmp_path: Path) -> None:
+    page = write_gallery(figures, tmp_path / "new" / "gallery")
     links = _Links()
     text = page.read_text()
     links.feed(text)
     assert page.name == PAGE
-    for link in links.found:
+    for link in links.targets:
         if link.startswith("#"):
             assert f'id="{link[1:]}"' in text
         elif not link.startswith("data:image/jpeg;base64,"):
             assert (page.parent / link).is_file()
-    assert len(links.texts) == len(plates)
-    assert all(plate.caption in links_text for plate, links_text in zip(plates, links.texts, strict=True))
+    assert len(links.texts) == len(figures)
+    assert all(figure.caption in alternative for figure, alternative in zip(figures, links.texts, strict=True))
     for command in re.findall(r"<code>(marsyard render [^<]*)</code>", text):
         assert "--camera" in command
 
 
-def test_contact_sheet_is_small(plates: list[SvgFigure]) -> None:
+def test_contact_sheet_is_small(figures: list[SvgFigure]) -> None:
     smooth = np.linspace(0.0, 255.0, 640 * 480).reshape(480, 640)
     rng = np.random.default_rng(2)
     pictures = [
-        SvgFigure(one.shot, np.clip(smooth + rng.normal(0.0, 6.0, smooth.shape), 0, 255).astype(np.uint8), one.file)
-        for one in plates
+        SvgFigure(
+            figure.shot, np.clip(smooth + rng.normal(0.0, 6.0, smooth.shape), 0, 255).astype(np.uint8), figure.file
+        )
+        for figure in figures
     ]
     sheet = contact_sheet(pictures)
     assert len(sheet) <= SHEET_BYTES
@@ -83,34 +87,34 @@ def test_contact_sheet_is_small(plates: list[SvgFigure]) -> None:
     assert len(np.unique(decoded)) > 8
 
 
-def test_display_uses_the_greys_and_keeps_their_order() -> None:
+def test_display_keeps_the_order_of_grey_values() -> None:
     rng = np.random.default_rng(3)
     ground = np.ones((120, 160), dtype=bool)
     ground[:20] = False
     signal = np.where(ground, rng.normal(800.0, 100.0, ground.shape), 3000.0)
-    grey = displayed(signal, ground)
+    grey = map_to_grey(signal, ground)
     assert (grey[~ground] > 250).all()
     assert np.ptp(np.percentile(grey[ground], [1.0, 99.0])) > 60
     order = np.argsort(signal, axis=None)
     assert (np.diff(grey.ravel()[order].astype(int)) >= 0).all()
-    # without sky the brightest ground is white
-    assert np.percentile(displayed(signal[20:], ground[20:]), 99.8) > 250
+    # without sky, the brightest terrain is white
+    assert np.percentile(map_to_grey(signal[20:], ground[20:]), 99.8) > 250
 
 
-@pytest.mark.parametrize("dark", [np.zeros((8, 8)), np.full((8, 8), 7.0)])
-def test_even_pictures_can_be_displayed(dark: np.ndarray) -> None:
-    assert len(np.unique(displayed(dark, np.zeros((8, 8), dtype=bool)))) == 1
+@pytest.mark.parametrize("image", [np.zeros((8, 8)), np.full((8, 8), 7.0)])
+def test_uniform_images_can_be_displayed(image: np.ndarray) -> None:
+    assert len(np.unique(map_to_grey(image, np.zeros((8, 8), dtype=bool)))) == 1
 
 
 @pytest.mark.parametrize("name", [PAGE, SHEET])
-def test_gallery_that_is_there_stays(
+def test_existing_gallery_is_kept(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / name).write_text("mine")
     monkeypatch.setattr(gallery_command, "PLATES", ())
     monkeypatch.setattr(sys, "argv", ["marsyard", "gallery", "--out", str(tmp_path)])
-    with pytest.raises(SystemExit) as ended:
+    with pytest.raises(SystemExit) as raised:
         cli.main()
-    assert ended.value.code == 2
+    assert raised.value.code == 2
     assert f"{tmp_path / name}: there already" in capfd.readouterr().err
     assert (tmp_path / name).read_text() == "mine"

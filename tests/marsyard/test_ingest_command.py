@@ -1,4 +1,4 @@
-"""`marsyard ingest` makes a campaign that runs and is reported, or says what is wrong and leaves nothing behind."""
+"""Tests of `marsyard ingest`: campaigns from recorded images; invalid input leaves no files."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def run_command(*words: str) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
-def test_real_pictures_are_run_and_reported(tmp_path: Path) -> None:
+def test_ingested_images_are_run_and_reported(tmp_path: Path) -> None:
     folder, cases, run = (
         landing_folder(tmp_path / "in", inputs.landing(), "matching"),
         tmp_path / "out",
@@ -45,24 +45,26 @@ def test_real_pictures_are_run_and_reported(tmp_path: Path) -> None:
     assert (tmp_path / "again" / "matches-1.png").stat().st_size > 10_000
 
 
-def test_a_campaign_with_truth_asks_for_errors_by_the_estimate(tmp_path: Path) -> None:
-    given = inputs.descent()
-    folder = velocity_folder(tmp_path / "in", {"one": given, "two": given}, {"two": inputs.DESCENT_VELOCITY_M_S[:2]})
+def test_campaign_with_truth_gets_an_error_requirement(tmp_path: Path) -> None:
+    descent = inputs.descent()
+    folder = velocity_folder(
+        tmp_path / "in", {"one": descent, "two": descent}, {"two": inputs.DESCENT_VELOCITY_M_S[:2]}
+    )
     assert run_command("ingest", str(folder), "--out", str(tmp_path / "out"))[0] == 0
     path = tmp_path / "out" / "campaign.toml"
-    written = tomllib.loads(path.read_text())
-    (asked,) = written["requirements"]
-    # pictures of 1024 x 256 pixels, four rows summed: binned as the descent camera's own are
-    assert written["parameters"]["dimes"]["binned_size"] == [256, 256]
-    assert (asked["decide_by"], asked["population"]) == ("estimate", "valid and truth_known")
+    tables = tomllib.loads(path.read_text())
+    (requirement,) = tables["requirements"]
+    # images of 1024 x 256 pixels with four summed rows are binned to square pixels
+    assert tables["parameters"]["dimes"]["binned_size"] == [256, 256]
+    assert (requirement["decide_by"], requirement["population"]) == ("estimate", "valid and truth_known")
     campaign = load_campaign(str(path))
     assert campaign.configuration.total_cases == 2
     assert [campaign.parameters(case).case.name for case in range(2)] == ["one", "two"]  # type: ignore[attr-defined]
-    # the hash of all pictures is in what the campaign is known by
+    # the identity of the campaign includes the hash of all images
     assert len(campaign.configuration.parameters["cases"]["sha256"]) == 64
 
 
-def test_what_is_wrong_ends_with_2_and_leaves_nothing(tmp_path: Path) -> None:
+def test_invalid_input_has_status_2_and_leaves_no_files(tmp_path: Path) -> None:
     folder = landing_folder(tmp_path / "in", inputs.landing(), "matching")
     rows = read_rows(folder)
     rows[1]["file"] = "lost.png"
@@ -81,21 +83,23 @@ def test_what_is_wrong_ends_with_2_and_leaves_nothing(tmp_path: Path) -> None:
     assert (status, "unknown system 'vtt'; allowed: measured" in output) == (2, True)
 
 
-def test_summed_rows_are_taken_from_the_camera(tmp_path: Path) -> None:
-    # the suite's camera sums rows: its pixels are longer than wide
-    given = inputs.descent()
-    summed = given.images[0].calibration.rows_summed
-    assert summed > 1
-    folder = velocity_folder(tmp_path / "in", {"one": given}, {})
-    stated = (folder / "ingest.toml").read_text()
-    assert f"rows_summed = {summed}\n" in stated
+def test_summed_rows_are_inferred_from_the_camera(tmp_path: Path) -> None:
+    # the camera sums rows, so its pixels are not square
+    descent = inputs.descent()
+    rows_summed = descent.images[0].calibration.rows_summed
+    assert rows_summed > 1
+    folder = velocity_folder(tmp_path / "in", {"one": descent}, {})
+    text = (folder / "ingest.toml").read_text()
+    assert f"rows_summed = {rows_summed}\n" in text
     status, output = run_command("ingest", str(folder), "--out", str(tmp_path / "stated"))
     assert (status, "rows_summed" in output) == (0, False)
-    (folder / "ingest.toml").write_text(stated.replace(f"rows_summed = {summed}\n", ""))
+    (folder / "ingest.toml").write_text(text.replace(f"rows_summed = {rows_summed}\n", ""))
     status, output = run_command("ingest", str(folder), "--out", str(tmp_path / "inferred"))
     assert status == 0
-    assert f"rows_summed = {summed}: taken from the camera" in output
-    detectors = [json.loads((tmp_path / one / "cases.json").read_text())["detector"] for one in ("stated", "inferred")]
+    assert f"rows_summed = {rows_summed}: taken from the camera" in output
+    detectors = [
+        json.loads((tmp_path / name / "cases.json").read_text())["detector"] for name in ("stated", "inferred")
+    ]
     assert detectors[0] == detectors[1]
-    campaigns = [tomllib.loads((tmp_path / one / "campaign.toml").read_text()) for one in ("stated", "inferred")]
+    campaigns = [tomllib.loads((tmp_path / name / "campaign.toml").read_text()) for name in ("stated", "inferred")]
     assert campaigns[0]["parameters"]["dimes"] == campaigns[1]["parameters"]["dimes"]

@@ -1,4 +1,4 @@
-"""Progress of a running campaign: rates, times left, and what is reported while kernels are compiled."""
+"""Tests of progress output: rates, remaining time and notes about compilation."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from marsyard.campaigns.running import preparation
 from marsyard.campaigns.running.preparation import report_compilation
 from marsyard.cli.progress import BarProgress, LineProgress
 from marsyard.sim.kernel_cache import mark_ready
-from tests.campaigns.fake_campaign import Silence
+from tests.campaigns.fake_campaign import RecordingWatch
 
 
 class Clock:
-    """A clock that is set by the test."""
+    """A clock whose time the test sets."""
 
     def __init__(self) -> None:
         self.now_s = 100.0
@@ -28,8 +28,8 @@ class Clock:
         return self.now_s
 
 
-def _shown(bars: BarProgress, clock: Clock) -> list[str]:
-    """The lines of the bars as they would be drawn now."""
+def _render_bars(bars: BarProgress, clock: Clock) -> list[str]:
+    """Return the lines of the progress bars at the current time."""
     console = Console(width=120, file=io.StringIO(), get_time=clock, force_terminal=False)
     console.print(bars.bars.get_renderable())
     file = console.file
@@ -37,7 +37,7 @@ def _shown(bars: BarProgress, clock: Clock) -> list[str]:
     return file.getvalue().splitlines()
 
 
-def test_finished_stages_stop_counting_and_time_left_follows_the_rate() -> None:
+def test_time_left_follows_the_rate_of_the_stage() -> None:
     clock = Clock()
     bars = BarProgress(Console(file=io.StringIO(), force_terminal=True, get_time=clock))
     bars.bars.live.auto_refresh = False
@@ -46,22 +46,22 @@ def test_finished_stages_stop_counting_and_time_left_follows_the_rate() -> None:
         clock.now_s += 5.0
         bars.step()
     bars.begin("cases", 10)
-    # slow at first, as the first cases load what the others find
+    # the first case is slow because it fills the caches
     for seconds in (90.0, 5.0, 5.0):
         clock.now_s += seconds
         bars.step()
-    first, second = (line for line in _shown(bars, clock) if line.strip())
+    first, second = (line for line in _render_bars(bars, clock) if line.strip())
     assert "5.0 s each" in first
     assert "0:00:10 in all" in first
-    # 7 cases are left, at 33.3 s each as is printed next to it
+    # 7 remaining cases at 33.3 s each
     assert "33.3 s each" in second
     assert "0:03:53 left" in second
     clock.now_s += 1000.0
-    assert "0:00:10 in all" in _shown(bars, clock)[0]
-    assert "5.0 s each" in _shown(bars, clock)[0]
+    assert "0:00:10 in all" in _render_bars(bars, clock)[0]
+    assert "5.0 s each" in _render_bars(bars, clock)[0]
 
 
-def test_a_stage_that_is_left_before_its_end_stops_counting() -> None:
+def test_unfinished_stage_stops_its_clock() -> None:
     clock = Clock()
     bars = BarProgress(Console(file=io.StringIO(), force_terminal=True, get_time=clock))
     bars.begin("cases", 10)
@@ -69,10 +69,10 @@ def test_a_stage_that_is_left_before_its_end_stops_counting() -> None:
     bars.step()
     bars.begin("showcase", 1)
     clock.now_s += 60.0
-    assert "4.0 s each" in _shown(bars, clock)[0]
+    assert "4.0 s each" in _render_bars(bars, clock)[0]
 
 
-def test_lines_give_the_time_left_at_the_printed_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_print_time_left_at_the_printed_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
     monkeypatch.setattr("marsyard.cli.progress.time.monotonic", clock)
     console = Console(file=io.StringIO(), force_terminal=False)
@@ -85,12 +85,10 @@ def test_lines_give_the_time_left_at_the_printed_rate(monkeypatch: pytest.Monkey
     assert file.getvalue().splitlines()[-1] == "cases: 1/8, 12.5 s each, 88 s left"
 
 
-def test_compilation_is_reported_until_the_first_case_has_ended(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_compilation_is_reported_until_first_case_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(preparation, "REPORT_INTERVAL_S", 0.01)
-    watch = Silence()
+    watch = RecordingWatch()
     with report_compilation("descent", watch.note) as first_case_ended:
         assert watch.notes[0].startswith("compiling numeric kernels once on this machine, about two minutes")
         assert "marsyard compile" in watch.notes[0]
@@ -102,9 +100,9 @@ def test_compilation_is_reported_until_the_first_case_has_ended(
         first_case_ended()
     assert any("3 functions so far" in note for note in watch.notes)
     assert re.fullmatch(r"numeric kernels are compiled, \d+ s", next(itertools.islice(reversed(watch.notes), 1)))
-    # the next run finds them
+    # compiled kernels give no notes
     mark_ready("descent")
-    again = Silence()
-    with report_compilation("descent", again.note) as first_case_ended:
+    second_watch = RecordingWatch()
+    with report_compilation("descent", second_watch.note) as first_case_ended:
         first_case_ended()
-    assert again.notes == []
+    assert second_watch.notes == []

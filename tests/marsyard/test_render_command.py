@@ -1,4 +1,4 @@
-"""`marsyard render`: what it writes fits together, and what cannot be is named."""
+"""Tests of `marsyard render`: consistent image, camera and truth files; invalid options."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ Command = Callable[..., tuple[int, str]]
 
 @pytest.fixture
 def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Runs a command in this process; its status and what it says of errors."""
+    """Return a function that runs a command in this process and returns exit status and error output."""
 
-    def command(*arguments: object) -> tuple[int, str]:
+    def run_command(*arguments: object) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["marsyard", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as raised:
             cli.main()
-        return int(ended.value.code or 0), capfd.readouterr().err
+        return int(raised.value.code or 0), capfd.readouterr().err
 
-    return command
+    return run_command
 
 
 def _check_picture(prefix: Path, size: tuple[int, int], multiple: int) -> None:
-    """The files of one picture agree with each other."""
+    """Check that image, camera model, metadata and truth of one picture agree."""
     columns, rows = size
     picture = cv2.imread(f"{prefix}.png", cv2.IMREAD_UNCHANGED)
     assert picture is not None
@@ -41,39 +41,39 @@ def _check_picture(prefix: Path, size: tuple[int, int], multiple: int) -> None:
     assert picture.shape == (rows, columns)
     assert (picture % multiple == 0).all()
     assert picture.std() > 0.0
-    message = json.loads(Path(f"{prefix}.json").read_text())
+    metadata = json.loads(Path(f"{prefix}.json").read_text())
     assert "# Frame: body" in Path(f"{prefix}.cahvor").read_text()
-    camera = read_cahvor(f"{prefix}.cahvor").moved(RigidTransform.from_matrix(message["world_from_body"]))
+    camera = read_cahvor(f"{prefix}.cahvor").transform(RigidTransform.from_matrix(metadata["world_from_body"]))
     assert camera.size == size
     with np.load(f"{prefix}.npz") as truth:
-        seen = np.isfinite(truth["range_m"])
-        points = truth["point_m"][seen]
-        # rays are kept in float32: 6e-8 of a focal length of about 1000 pixels, and of a range
-        np.testing.assert_allclose(camera.project(points)[0], camera.pixel_grid()[seen], atol=2e-3)
-        np.testing.assert_allclose(np.linalg.norm(points - camera.c, axis=1), truth["range_m"][seen], rtol=1e-6)
-        np.testing.assert_allclose(np.linalg.norm(truth["normal"][seen], axis=1), 1.0, atol=1e-4)
-        to_sun = np.array(message["sun_direction"])
-        to_eye = (camera.c - points) / truth["range_m"][seen][:, None]
-        np.testing.assert_allclose(np.cos(np.radians(truth["phase_deg"][seen])), to_eye @ to_sun, atol=1e-5)
-        assert ((truth["object"] == -2) == ~seen).all()
+        is_surface = np.isfinite(truth["range_m"])
+        points = truth["point_m"][is_surface]
+        # float32 rays: relative error 6e-8 at a focal length of about 1000 pixels
+        np.testing.assert_allclose(camera.project(points)[0], camera.pixel_grid()[is_surface], atol=2e-3)
+        np.testing.assert_allclose(np.linalg.norm(points - camera.c, axis=1), truth["range_m"][is_surface], rtol=1e-6)
+        np.testing.assert_allclose(np.linalg.norm(truth["normal"][is_surface], axis=1), 1.0, atol=1e-4)
+        to_sun = np.array(metadata["sun_direction"])
+        to_eye = (camera.c - points) / truth["range_m"][is_surface][:, None]
+        np.testing.assert_allclose(np.cos(np.radians(truth["phase_deg"][is_surface])), to_eye @ to_sun, atol=1e-5)
+        assert ((truth["object"] == -2) == ~is_surface).all()
         assert (truth["object"] >= 0).any()
-        assert 0.0 < truth["shadow"][seen].mean() < 0.5
-        # faces turned away from the sun have no direct light
-        assert truth["shadow"][seen][truth["normal"][seen] @ to_sun < -1e-3].all()
-        np.testing.assert_allclose(truth["world_from_body"], message["world_from_body"])
+        assert 0.0 < truth["shadow"][is_surface].mean() < 0.5
+        # surfaces that face away from the sun are in shadow
+        assert truth["shadow"][is_surface][truth["normal"][is_surface] @ to_sun < -1e-3].all()
+        np.testing.assert_allclose(truth["world_from_body"], metadata["world_from_body"])
 
 
-def test_detector_picture_from_above(marsyard: Command, tmp_path: Path) -> None:
+def test_detector_image_from_above_is_consistent(marsyard: Command, tmp_path: Path) -> None:
     prefix = tmp_path / "hover"
     status, message = marsyard("render", "heli-hazardous", "--camera", "xc-55", "--out", prefix, "--azimuth", 30)
     assert status == 0, message
     _check_picture(prefix, (640, 480), multiple=256)  # 8 bits in 16
-    made_from = json.loads(Path(f"{prefix}.json").read_text())
-    assert made_from["shot"]["altitude_m"] == 10.0
-    assert made_from["detector"]["exposure_s"] == made_from["png"]["exposure_s"]
+    metadata = json.loads(Path(f"{prefix}.json").read_text())
+    assert metadata["shot"]["altitude_m"] == 10.0
+    assert metadata["detector"]["exposure_s"] == metadata["png"]["exposure_s"]
 
 
-def test_stereo_pair_as_radiance(marsyard: Command, tmp_path: Path) -> None:
+def test_stereo_pair_of_radiance_is_consistent(marsyard: Command, tmp_path: Path) -> None:
     prefix = tmp_path / "pair"
     options = ("--radiance", "--sun-elevation", 25, "--east", 12, "--north", -7)
     status, message = marsyard("render", "heli-hazardous", "--camera", "research-navcam", "--out", prefix, *options)
@@ -105,7 +105,7 @@ def test_stereo_pair_as_radiance(marsyard: Command, tmp_path: Path) -> None:
         ("gusev", "mer-navcam", ("--east", "inf"), "--east inf is not a finite number"),
     ],
 )
-def test_what_cannot_be_is_named(
+def test_invalid_options_are_rejected(
     marsyard: Command, tmp_path: Path, site: str, camera: str, options: tuple[str, ...], message: str
 ) -> None:
     status, error = marsyard("render", site, "--camera", camera, "--out", tmp_path / "x", *options)
@@ -116,24 +116,24 @@ def test_what_cannot_be_is_named(
     assert not list(tmp_path.iterdir())
 
 
-def test_folder_that_is_not_there_is_named(marsyard: Command, tmp_path: Path) -> None:
+def test_missing_folder_is_reported(marsyard: Command, tmp_path: Path) -> None:
     status, error = marsyard("render", "gusev", "--camera", "xc-55", "--out", tmp_path / "no" / "x")
     assert status == 2
     assert "there is no folder" in error
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_files_that_are_there_stay(marsyard: Command, tmp_path: Path, ending: str) -> None:
-    kept = tmp_path / f"x{ending}"
-    kept.write_text("mine")
+def test_existing_files_are_kept(marsyard: Command, tmp_path: Path, ending: str) -> None:
+    existing = tmp_path / f"x{ending}"
+    existing.write_text("mine")
     status, error = marsyard("render", "gusev", "--camera", "xc-55", "--out", tmp_path / "x")
     assert status == 2
-    assert f"{kept}: there already" in error
-    assert kept.read_text() == "mine"
+    assert f"{existing}: there already" in error
+    assert existing.read_text() == "mine"
 
 
-def test_a_terrain_model_is_rendered_with_its_holes_marked(marsyard: Command, tmp_path: Path) -> None:
-    """Seen from straight above the middle of its file, whose eastern quarter has no height."""
+def test_filled_holes_of_a_dtm_are_marked(marsyard: Command, tmp_path: Path) -> None:
+    """The camera looks down at the centre of a DTM whose eastern quarter has no heights."""
     heights = 3.0 * np.add.outer(np.sin(np.arange(120) / 7.0), np.cos(np.arange(120) / 9.0))
     heights[:, 90:] = np.nan
     dtm, prefix = tmp_path / "site.npz", tmp_path / "view"
@@ -149,10 +149,10 @@ def test_a_terrain_model_is_rendered_with_its_holes_marked(marsyard: Command, tm
         filled, points = truth["filled"], truth["point_m"]
         assert filled.any()
         assert not filled.all()
-        # 256 samples, the file's 119 m from 68 m (rounded) eastwards: no height from its post 90 on
+        # the DTM of 119 m is centred in 256 m; posts from column 90 have no height
         west = round(0.5 * (256 - 119))
         assert points[filled][:, 0].min() > west + 89.0
         np.testing.assert_allclose(np.nanmean(points[..., :2], axis=(0, 1)), 128.0, atol=3.0)
-    made_from = json.loads(Path(f"{prefix}.json").read_text())
-    assert made_from["filled_fraction"] == pytest.approx(float(filled.mean()))
-    assert made_from["cahvor"]["frame"].startswith("body")
+    metadata = json.loads(Path(f"{prefix}.json").read_text())
+    assert metadata["filled_fraction"] == pytest.approx(float(filled.mean()))
+    assert metadata["cahvor"]["frame"].startswith("body")

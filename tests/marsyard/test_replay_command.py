@@ -1,4 +1,4 @@
-"""`marsyard replay` changes a campaign's folder only where it has something better to put there."""
+"""Tests of `marsyard replay`: stored products are replaced only by complete new ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products, pack_products, save_packed
 from marsyard.cli.app import app
-from tests.campaigns.fake_campaign import Silence, run, write_campaign
+from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
 
 SCENARIO = """
 from tests.campaigns.fake_scenario import FakeScenario
@@ -29,7 +29,7 @@ class Mine(FakeScenario):
 
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished campaign of a scenario that is found from its own folder only, with the products of case 0."""
+    """Run a campaign whose scenario can be imported only from its own folder; keep all products."""
     folder = tmp_path_factory.mktemp("mine")
     (folder / "my_scenario.py").write_text(SCENARIO)
     path = write_campaign(folder)
@@ -37,42 +37,42 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     before = Path.cwd()
     os.chdir(folder)
     try:
-        run(path, folder / "run", Silence(), "cases=2", "retain.products=all", jobs=1)
+        run(path, folder / "run", RecordingWatch(), "cases=2", "retain.products=all", jobs=1)
     finally:
         os.chdir(before)
     assert (folder / "run" / "cases" / "0" / "products.json").exists()
     return folder / "run"
 
 
-def reported(*words: object) -> tuple[int, str]:
+def run_command(*words: object) -> tuple[int, str]:
     result = CliRunner().invoke(app, list(map(str, words)))
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result.exit_code, result.output
 
 
-def _content(folder: Path) -> dict[str, bytes]:
+def _read_files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_scenario_that_is_not_found_is_one_message_and_changes_nothing(
+def test_missing_scenario_is_reported_and_changes_nothing(
     stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [entry for entry in sys.path if entry != str(stored.parent)])
     monkeypatch.delitem(sys.modules, "my_scenario", raising=False)
-    before = _content(stored)
+    before = _read_files(stored)
     for command in (("replay", stored, 0), ("resume", stored, "--allow-changed")):
-        status, output = reported(*command)
+        status, output = run_command(*command)
         assert status == 2
         assert "no scenario at 'my_scenario:Mine': No module named 'my_scenario'" in output
         assert "Traceback" not in output
-    assert {name: text for name, text in _content(stored).items() if name != "campaign.lock"} == {
+    assert {name: text for name, text in _read_files(stored).items() if name != "campaign.lock"} == {
         name: text for name, text in before.items() if name != "campaign.lock"
     }
 
 
-def test_an_algorithm_that_is_not_found_is_one_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from marsyard.campaigns.definition.identity import identity_of
+def test_missing_algorithm_is_reported_and_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from marsyard.campaigns.definition.identity import create_identity
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.store import record
     from marsyard.campaigns.store.rows import ROWS_FILE, create_store
@@ -82,81 +82,81 @@ def test_an_algorithm_that_is_not_found_is_one_message(tmp_path: Path, monkeypat
     configuration = load_campaign("dimes-smoke", [], 1).configuration
     parameters = {**configuration.parameters, "algorithm": "my_absent_module:Estimator"}
     create_store(folder / ROWS_FILE, {"identity": "x"})
-    identity = identity_of(configuration)
+    identity = create_identity(configuration)
     record.begin(folder, configuration.model_copy(update={"parameters": parameters}), identity, "nobody")
-    before = _content(folder)
-    status, output = reported("replay", folder, 0)
+    before = _read_files(folder)
+    status, output = run_command("replay", folder, 0)
     assert status == 2
     assert "no algorithm at 'my_absent_module:Estimator'" in output
-    assert _content(folder) == before
+    assert _read_files(folder) == before
 
 
-def test_products_are_kept_where_the_case_fails_this_time(
+def test_products_are_kept_if_the_replayed_case_fails(
     stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     copy = shutil.copytree(stored, tmp_path / "run")
     monkeypatch.chdir(stored.parent)
-    before = _content(copy / "cases")
+    before = _read_files(copy / "cases")
     text = (copy / "campaign.json").read_text()
     changed = json.loads(text)
     changed["configuration"]["parameters"]["raising_cases"] = [0]
     (copy / "campaign.json").write_text(json.dumps(changed))
-    status, output = reported("replay", copy, 0)
+    status, output = run_command("replay", copy, 0)
     assert status == 1
     assert "case 0: CRASHED" in output
     assert "keeps the products that it had" in output
-    assert _content(copy / "cases") == before
+    assert _read_files(copy / "cases") == before
     (copy / "campaign.json").write_text(text)
-    assert reported("replay", copy, 0)[0] == 0
+    assert run_command("replay", copy, 0)[0] == 0
 
 
-def test_a_folder_that_cannot_be_written_to_is_replayed_into_another(
+def test_read_only_folder_is_replayed_into_another(
     stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Rows are read from a copy: SQLite would put files next to its log. (Tests may run as root, who may write.)"""
+    """Rows are read from a copy because SQLite writes files. `os.access` is patched because tests may run as root."""
     copy = shutil.copytree(stored, tmp_path / "run")
     monkeypatch.chdir(stored.parent)
     access = os.access
 
-    def refused(path: Path, mode: int, **options: bool) -> bool:
-        hidden = mode == os.W_OK and Path(path).is_relative_to(copy)
-        return not hidden and access(path, mode, **options)
+    def deny_write_access(path: Path, mode: int, **options: bool) -> bool:
+        is_denied = mode == os.W_OK and Path(path).is_relative_to(copy)
+        return not is_denied and access(path, mode, **options)
 
-    opened: list[str] = []
+    opened_files: list[str] = []
     connect = "marsyard.campaigns.store.rows.sqlite3.connect"
     original = sqlite3.connect
-    monkeypatch.setattr("os.access", refused)
+    monkeypatch.setattr("os.access", deny_write_access)
 
     def record_open(name: str, **options: Any) -> sqlite3.Connection:
-        opened.append(str(name))
+        opened_files.append(str(name))
         connection: sqlite3.Connection = original(name, **options)
         return connection
 
     monkeypatch.setattr(connect, record_open)
-    status, output = reported("replay", copy, 1, "--out", tmp_path / "out")
+    status, output = run_command("replay", copy, 1, "--out", tmp_path / "out")
     assert (status, "the row equals the stored one" in output) == (0, True), output
-    assert opened
-    assert not any(str(copy) in name for name in opened)
+    assert opened_files
+    assert not any(str(copy) in name for name in opened_files)
     assert (tmp_path / "out" / "products.json").exists()
 
 
-def test_products_are_replaced_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_products_are_replaced_completely_or_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "case"
     save_packed(folder, pack_products({"x": np.arange(3)}), {"case": 0})
     (folder / "note.txt").write_text("the user's own")
-    before = _content(folder)
+    before = _read_files(folder)
     write = Path.write_bytes
 
-    def full(path: Path, data: bytes) -> int:
+    def raise_disk_full(path: Path, data: bytes) -> int:
         if path.name == "products.json":
             raise OSError(28, "No space left on device")
         return write(path, data)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Path, "write_bytes", full)
+        patched.setattr(Path, "write_bytes", raise_disk_full)
         with pytest.raises(StoreError, match="No space left on device"):
             save_packed(folder, pack_products({"x": np.arange(4)}), {"case": 1})
-    assert _content(folder) == before
+    assert _read_files(folder) == before
     save_packed(folder, pack_products({"x": np.arange(4)}), {"case": 1})
     assert load_products(folder)["x"].size == 4
-    assert set(_content(folder)) == set(before)
+    assert set(_read_files(folder)) == set(before)

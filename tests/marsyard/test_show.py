@@ -1,4 +1,4 @@
-"""`marsyard show`: every dispersion with its distribution, bounds, unit and source; draws as table, figure and JSON."""
+"""Tests of `marsyard show`: dispersions, draws as table, figure and JSON, and invalid campaign files."""
 
 from __future__ import annotations
 
@@ -64,23 +64,23 @@ showcase = "worst"
 
 
 @dataclass(frozen=True)
-class Ended:
+class CommandResult:
     status: int
     out: str
     err: str
 
 
-def marsyard(*arguments: object) -> Ended:
-    """Runs a command in this process."""
-    out, err, stated = io.StringIO(), io.StringIO(), sys.argv
+def marsyard(*arguments: object) -> CommandResult:
+    """Run a command in this process."""
+    out, err, argv = io.StringIO(), io.StringIO(), sys.argv
     sys.argv = ["marsyard", *map(str, arguments)]
     try:
         with redirect_stdout(out), redirect_stderr(err):
             cli.main()
-    except SystemExit as ended:
-        return Ended(int(ended.code or 0), out.getvalue(), err.getvalue())
+    except SystemExit as error:
+        return CommandResult(int(error.code or 0), out.getvalue(), err.getvalue())
     finally:
-        sys.argv = stated
+        sys.argv = argv
     raise AssertionError("the command did not exit")
 
 
@@ -93,8 +93,8 @@ def campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_every_dispersion_is_reported(campaign: Path) -> None:
-    shown = marsyard("show", campaign)
-    assert (shown.status, shown.err) == (0, "")
+    result = marsyard("show", campaign)
+    assert (result.status, result.err) == (0, "")
     for text in (
         "sampling: Latin hypercube at each point of a grid over error_scale; case 0 is the nominal one",
         "normal(mean=5.0, sd=3.0)",
@@ -107,33 +107,33 @@ def test_every_dispersion_is_reported(campaign: Path) -> None:
         "covariance",
         "dispersed; nominal 2000.0",
     ):
-        assert text in re.sub(r"\s+", " ", shown.out.replace("│", " ")) or text in shown.out, text
+        assert text in re.sub(r"\s+", " ", result.out.replace("│", " ")) or text in result.out, text
 
 
 def test_units_and_descriptions_come_from_the_scenario() -> None:
     reported = json.loads(marsyard("show", "dimes-gusev", "--json").out)
-    of_each = {one["parameter"]: one for one in reported["dispersions"]}
-    sun = of_each["sun.elevation_deg"]
+    dispersions = {dispersion["parameter"]: dispersion for dispersion in reported["dispersions"]}
+    sun = dispersions["sun.elevation_deg"]
     assert (sun["unit"], sun["description"], sun["bounds"]) == ("deg", "above the horizon", [30.0, 60.0])
-    assert all(one["source"] for one in reported["dispersions"])
-    assert all(one["description"] for one in reported["dispersions"])
+    assert all(dispersion["source"] for dispersion in reported["dispersions"])
+    assert all(dispersion["description"] for dispersion in reported["dispersions"])
 
 
-def test_draws_as_table_json_and_figure(campaign: Path, tmp_path: Path) -> None:
+def test_draws_are_shown_as_table_json_and_figure(campaign: Path, tmp_path: Path) -> None:
     figure = tmp_path / "draws.svg"
-    shown = marsyard("show", campaign, "--draw", 25, "--figure", figure)
-    assert (shown.status, shown.err) == (0, "")
-    assert "Draws of 24 cases" in shown.out
-    assert "nominal" in shown.out
-    assert f"figure: {figure}" in shown.out
+    result = marsyard("show", campaign, "--draw", 25, "--figure", figure)
+    assert (result.status, result.err) == (0, "")
+    assert "Draws of 24 cases" in result.out
+    assert "nominal" in result.out
+    assert f"figure: {figure}" in result.out
     assert "<svg" in figure.read_text()
     reported = json.loads(marsyard("show", campaign, "--draw", 25, "--json").out)
-    assert [one["case"] for one in reported["draws"]] == list(range(25))
+    assert [draw["case"] for draw in reported["draws"]] == list(range(25))
     assert reported["draws"][0]["values"]["wind.east_m_s"] == 1.0
-    values = [one["values"] for one in reported["draws"]]
-    assert all(one["lowest_altitude_m"] == pytest.approx(one["altitude_m"] - 100.0) for one in values)
-    assert [one["error_scale"] for one in values[1:4]] == [0.5, 1.0, 1.5]
-    assert f"{min(one['altitude_m'] for one in values[1:]):.5g}" in shown.out
+    values = [draw["values"] for draw in reported["draws"]]
+    assert all(draw["lowest_altitude_m"] == pytest.approx(draw["altitude_m"] - 100.0) for draw in values)
+    assert [draw["error_scale"] for draw in values[1:4]] == [0.5, 1.0, 1.5]
+    assert f"{min(draw['altitude_m'] for draw in values[1:]):.5g}" in result.out
     assert not (tmp_path / "runs").exists()
 
 
@@ -149,22 +149,22 @@ def test_draws_as_table_json_and_figure(campaign: Path, tmp_path: Path) -> None:
         (["--set", "cases=26"], "--set cases=26: cases: 25 cases behind the nominal one cannot be laid out: the grid"),
     ],
 )
-def test_what_cannot_be_shown(campaign: Path, arguments: list[str], message: str) -> None:
-    shown = marsyard("show", campaign, *arguments)
-    assert (shown.status, shown.out) == (2, "")
-    assert "Traceback" not in shown.err
-    assert message in shown.err
+def test_invalid_options_are_rejected(campaign: Path, arguments: list[str], message: str) -> None:
+    result = marsyard("show", campaign, *arguments)
+    assert (result.status, result.out) == (2, "")
+    assert "Traceback" not in result.err
+    assert message in result.err
 
 
-def _paths(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+def _walk_paths(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
     inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, one in inner:
+    for key, inner_value in inner:
         yield (*path, key)
-        yield from _paths(one, (*path, key))
+        yield from _walk_paths(inner_value, (*path, key))
 
 
 _DOCUMENT = tomllib.loads(CAMPAIGN)
-_PATHS = list(_paths(_DOCUMENT))
+_PATHS = list(_walk_paths(_DOCUMENT))
 _MISSING = object()
 _junk = st.recursive(
     st.one_of(
@@ -183,7 +183,7 @@ _junk = st.recursive(
 
 def _toml(value: Any) -> str:
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{_toml(str(key))} = {_toml(one)}" for key, one in value.items()) + "}"
+        return "{" + ", ".join(f"{_toml(str(key))} = {_toml(inner_value)}" for key, inner_value in value.items()) + "}"
     if isinstance(value, list):
         return "[" + ", ".join(map(_toml, value)) + "]"
     if isinstance(value, str):
@@ -191,7 +191,7 @@ def _toml(value: Any) -> str:
     return str(value).lower()
 
 
-def _changed(path: tuple[str | int, ...], value: Any) -> dict[str, Any]:
+def _change_document(path: tuple[str | int, ...], value: Any) -> dict[str, Any]:
     document = copy.deepcopy(_DOCUMENT)
     table: Any = document
     for part in path[:-1]:
@@ -203,8 +203,8 @@ def _changed(path: tuple[str | int, ...], value: Any) -> dict[str, Any]:
     return document
 
 
-#: Keys at which a change of another shows: what is dispersed is held against the parameters, sizes against the design.
-_SHOWS_AT = {
+#: Keys that may report an error of another key: parameters limit dispersions, the design limits sizes.
+_REPORTING_KEYS = {
     "correlations": ("correlations", "dispersions"),
     "design": ("design", "cases"),
     "dispersions": ("dispersions", "correlations", "cases"),
@@ -214,33 +214,31 @@ _SHOWS_AT = {
 
 @given(path=st.sampled_from(_PATHS), value=_junk)
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_every_wrong_file_ends_with_2_and_names_the_key(
-    campaign: Path, path: tuple[str | int, ...], value: Any
-) -> None:
-    """A good file with one value put wrong, or taken out: it is shown, or the message is about that key."""
-    document = _changed(path, value)
-    campaign.write_text("\n".join(f"{key} = {_toml(one)}" for key, one in document.items()))
-    shown = marsyard("show", campaign, "--draw", 2, "--json")
-    assert "Traceback" not in shown.err, shown.err
-    assert shown.status in (0, 2)
-    if shown.status == 2:
-        assert shown.out == ""
-        assert str(campaign) in shown.err
-        for line in shown.err.splitlines():  # one problem, one line, whatever the file holds
+def test_random_changes_are_shown_or_reported_by_key(campaign: Path, path: tuple[str | int, ...], value: Any) -> None:
+    """One value of a valid file is replaced or removed: the file is shown or the error names that key."""
+    document = _change_document(path, value)
+    campaign.write_text("\n".join(f"{key} = {_toml(entry)}" for key, entry in document.items()))
+    result = marsyard("show", campaign, "--draw", 2, "--json")
+    assert "Traceback" not in result.err, result.err
+    assert result.status in (0, 2)
+    if result.status == 2:
+        assert result.out == ""
+        assert str(campaign) in result.err
+        for line in result.err.splitlines():  # one line per problem
             key = line.removeprefix("error: ").removeprefix(f"{campaign}: ")
-            assert key.startswith(_SHOWS_AT.get(str(path[0]), (str(path[0]),))), (path, value, shown.err)
+            assert key.startswith(_REPORTING_KEYS.get(str(path[0]), (str(path[0]),))), (path, value, result.err)
     else:
-        json.loads(shown.out)
+        json.loads(result.out)
 
 
 @given(text=st.binary(max_size=60) | st.text("[]{}=\"'.,abc123\n#\\", max_size=60).map(str.encode))
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_no_bytes_end_in_a_traceback(campaign: Path, text: bytes) -> None:
+def test_random_bytes_are_rejected_without_traceback(campaign: Path, text: bytes) -> None:
     campaign.write_bytes(text)
-    shown = marsyard("show", campaign)
-    assert (shown.status, shown.out) == (2, "")
-    assert str(campaign) in shown.err
-    assert "Traceback" not in shown.err
+    result = marsyard("show", campaign)
+    assert (result.status, result.out) == (2, "")
+    assert str(campaign) in result.err
+    assert "Traceback" not in result.err
 
 
 @pytest.mark.parametrize(
@@ -262,12 +260,12 @@ def test_no_bytes_end_in_a_traceback(campaign: Path, text: bytes) -> None:
         "dispersions.altitude_m = {distribution = 'erlang', a = 1e300, scale = 1e300}",
     ],
 )
-def test_odd_values_are_refused(campaign: Path, line: str) -> None:
+def test_extreme_values_are_rejected(campaign: Path, line: str) -> None:
     head = "name = 'fake'\nscenario = 'tests.campaigns.fake_scenario:FakeScenario'\ncases = 3\n"
     campaign.write_text(head + line)
-    shown = marsyard("show", campaign)
-    assert (shown.status, shown.out) == (2, "")
-    assert "Traceback" not in shown.err
-    assert "\x1b" not in shown.err
+    result = marsyard("show", campaign)
+    assert (result.status, result.out) == (2, "")
+    assert "Traceback" not in result.err
+    assert "\x1b" not in result.err
     key = re.split(r"[ =\"]", line)[0]
-    assert key.rpartition(".")[2] in shown.err or "not valid TOML" in shown.err
+    assert key.rpartition(".")[2] in result.err or "not valid TOML" in result.err

@@ -1,4 +1,4 @@
-"""The dashboard's server refuses what no browser of its user asks for."""
+"""Tests of the dashboard server: invalid paths and requests for other hosts are rejected."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.cli.site_server import server
+from marsyard.cli.outcome import server
 
 
 @pytest.fixture
 def port(tmp_path: Path) -> Iterator[int]:
     (tmp_path / "index.html").write_text("the site")
-    with server(tmp_path, "127.0.0.1", 0) as serving:
-        threading.Thread(target=serving.serve_forever, daemon=True).start()
-        yield serving.server_port
-        serving.shutdown()
+    with server(tmp_path, "127.0.0.1", 0) as http_server:
+        threading.Thread(target=http_server.serve_forever, daemon=True).start()
+        yield http_server.server_port
+        http_server.shutdown()
 
 
-def _status(port: int, path: str, host: str | None) -> int:
+def _request_status(port: int, path: str, host: str | None) -> int:
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
     try:
         connection.putrequest("GET", path, skip_host=True)
@@ -34,16 +34,16 @@ def _status(port: int, path: str, host: str | None) -> int:
 
 
 @pytest.mark.parametrize("path", ["/%00", "/a%00b/index.html", "/" + 5000 * "a", "/%2e%2e/%00"])
-def test_paths_that_no_file_can_have_are_not_found(port: int, path: str, capfd: pytest.CaptureFixture[str]) -> None:
-    assert _status(port, path, f"127.0.0.1:{port}") == 404
+def test_invalid_paths_are_not_found(port: int, path: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert _request_status(port, path, f"127.0.0.1:{port}") == 404
     assert "Traceback" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", "", None])
-def test_requests_for_another_host_are_refused(port: int, host: str | None) -> None:
-    assert _status(port, "/", host) == 403
+def test_requests_for_another_host_are_rejected(port: int, host: str | None) -> None:
+    assert _request_status(port, "/", host) == 403
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "LOCALHOST:1234", "[::1]:80"])
 def test_requests_for_this_host_are_answered(port: int, host: str) -> None:
-    assert _status(port, "/", host) == 200
+    assert _request_status(port, "/", host) == 200

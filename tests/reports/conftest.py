@@ -1,4 +1,4 @@
-"""Synthetic run folders: rows with known statistics, as a campaign would store them."""
+"""Synthetic run folders with rows of known statistics."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MakeRun = Callable[..., Path]
 def synthetic_frame(
     cases: int, *, answered: float = 0.9, crashed: int = 0, spread: float = 1.0, terrains: int = 4, seed: int = 1
 ) -> pd.DataFrame:
-    """Rows of a made-up descent campaign."""
+    """Rows of a synthetic descent campaign."""
     rng = np.random.default_rng(seed)
     valid = rng.random(cases) < answered
     outcome = np.where(valid, "VALID", rng.choice(["NO_TEMPLATE_AREA", "NO_VALID_TRACK", "IMU_MISMATCH"], cases))
@@ -58,11 +58,11 @@ def synthetic_frame(
             "traceback": "",
         }
     )
-    return _crash(frame, crashed)
+    return _mark_crashed(frame, crashed)
 
 
-def _crash(frame: pd.DataFrame, crashed: int) -> pd.DataFrame:
-    """The last rows as a case that raised leaves them: nothing but its message."""
+def _mark_crashed(frame: pd.DataFrame, crashed: int) -> pd.DataFrame:
+    """Turn the last rows into crashed cases, which have only an error message."""
     if not crashed:
         return frame
     rows = frame.index[-crashed:]
@@ -78,7 +78,7 @@ def _crash(frame: pd.DataFrame, crashed: int) -> pd.DataFrame:
 
 
 def synthetic_products(seed: int = 1) -> dict[str, Any]:
-    """Products of a made-up DIMES case: textured pictures, two tracks a pair, one of them not valid."""
+    """Products of a synthetic DIMES case: textured images, two tracks per pair, one of them invalid."""
     rng = np.random.default_rng(seed)
     v, u = np.mgrid[0:256, 0:1024]
     products: dict[str, Any] = {}
@@ -98,20 +98,17 @@ def synthetic_products(seed: int = 1) -> dict[str, Any]:
             products[f"window_{pair}_{k}"] = rng.normal(1500, 300, (61, 61)).astype(np.float32)
             products[f"template_{pair}_{k}"] = rng.normal(1500, 300, (17, 17)).astype(np.float32)
             products[f"match_{pair}_{k}"] = np.array([33.4, 39.2])
-        # A camera that looks straight down, 5 m a pixel, and a virtual one that takes in half as much again.
+        # nadir camera with 5 m per pixel; the rectified camera has a field 1.5 times as wide
         lattice = np.stack(np.meshgrid(*(np.linspace(-64.0, 319.0, 17),) * 2), axis=-1)
         products |= {f"rectified_{pair}_{side}": lattice for side in (0, 1)}
         products[f"rectified_frame_{pair}"] = np.array([-64.0 - 128.0, 128.0 + 64.0, 383.0 / 16.0]) * 5.0
         products[f"gsd_{pair}"] = np.array([5.0])
     products |= {"tracks": np.array(rows), "tracks_columns": columns}
-    return products | {
-        "velocity_estimated_m_s": np.array([14.1, -8.9]),
-        "velocity_true_m_s": np.array([14.6, -9.2]),
-    }
+    return products | {"velocity_estimated_m_s": np.array([14.1, -8.9]), "velocity_true_m_s": np.array([14.6, -9.2])}
 
 
 def synthetic_record(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """`campaign.json` as the engine writes it."""
+    """Content of `campaign.json` as the engine writes it."""
     configuration = {
         "name": "dimes-synthetic",
         "scenario": "descent",
@@ -152,7 +149,7 @@ def write_run(
     products: Mapping[str, Any] | None = None,
     **changes: Any,
 ) -> Path:
-    """Writes a run folder; `changes` go into the record."""
+    """Write a run folder; `changes` replace entries of the record."""
     directory.mkdir(parents=True, exist_ok=True)
     frame.to_parquet(directory / "cases.parquet")
     record = {**synthetic_record(frame, requirements), **changes}
@@ -164,27 +161,27 @@ def write_run(
 
 @pytest.fixture
 def make_run(tmp_path: Path) -> MakeRun:
-    """Writes a run folder into the test's own folder; see `write_run`."""
+    """Return a function that writes a run folder into the test's folder; see `write_run`."""
 
-    def make(frame: pd.DataFrame, *args: Any, name: str = "run", **kwargs: Any) -> Path:
+    def write_named_run(frame: pd.DataFrame, *args: Any, name: str = "run", **kwargs: Any) -> Path:
         return write_run(tmp_path / name, frame, *args, **kwargs)
 
-    return make
+    return write_named_run
 
 
 @pytest.fixture
 def make_rows() -> Callable[..., pd.DataFrame]:
-    """Makes up rows; see `synthetic_frame`."""
+    """Return the function that makes rows; see `synthetic_frame`."""
     return synthetic_frame
 
 
 @pytest.fixture
 def dimes_products() -> dict[str, Any]:
-    """Products of a made-up DIMES case; see `synthetic_products`."""
+    """Products of a synthetic DIMES case; see `synthetic_products`."""
     return synthetic_products()
 
 
 @pytest.fixture
 def velocity() -> dict[str, Any]:
-    """The requirement on velocity, on valid answers."""
+    """The requirement on the velocity of valid answers."""
     return dict(VELOCITY)

@@ -1,4 +1,4 @@
-"""Layout of `report.json` as models, which generate and check `reports/report.schema.json`."""
+"""Models of `report.json`; they generate and check `reports/report.schema.json`."""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""Tests of the report page: valid markup, content, escaping of texts and damaged runs."""
+
 from __future__ import annotations
 
 import json
@@ -17,14 +19,14 @@ from marsyard.reports.sections import script_hash
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
-VOID = {"meta", "link", "br", "img", "input", "hr", "path", "use", "circle", "line", "rect"}
-#: Columns enough for most of a report; fewer figures are drawn of them.
-BARE = ["case", "outcome", "answered", "velocity_error_m_s"]
+VOID_ELEMENTS = {"meta", "link", "br", "img", "input", "hr", "path", "use", "circle", "line", "rect"}
+#: Minimum columns of a report with few figures.
+MIN_COLUMNS = ["case", "outcome", "answered", "velocity_error_m_s"]
 HOSTILE = "<script>alert('x')</script><img src=x onerror=alert(1)>\"'&{{ 7*7 }}"
 
 
 class Page(HTMLParser):
-    """What a browser would make of a page: its elements, identifiers and references."""
+    """Parser that collects a page's elements, identifiers, references and event handlers."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -37,7 +39,7 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append(tag)
-        if tag not in VOID:
+        if tag not in VOID_ELEMENTS:
             self.open.append(tag)
         self._note(attrs)
 
@@ -46,7 +48,7 @@ class Page(HTMLParser):
         self._note(attrs)
 
     def handle_endtag(self, tag: str) -> None:
-        if tag not in VOID:
+        if tag not in VOID_ELEMENTS:
             assert self.open, f"</{tag}> closes nothing"
             assert self.open.pop() == tag
 
@@ -60,23 +62,23 @@ class Page(HTMLParser):
                 self.handlers.append(name)
 
 
-def _read(directory: Path) -> tuple[str, Page, dict[str, Any]]:
+def _write_and_read(directory: Path) -> tuple[str, Page, dict[str, Any]]:
     path = write_report(directory)
     assert path == directory / "report.html"
     text = path.read_text(encoding="utf-8")
     return text, Page(text), json.loads((directory / "report.json").read_text(encoding="utf-8"))
 
 
-def _check(text: str, page: Page) -> None:
-    """What holds for every page: well-formed, on its own, nothing that runs but ours, every link leads somewhere."""
+def _check_page(text: str, page: Page) -> None:
+    """Check that a page is well formed, self-contained, free of foreign scripts, and that its links have targets."""
     assert page.open == []
     assert len(page.ids) == len(set(page.ids))
-    # Data, and the one script that the page's policy names by its hash.
-    running = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
-    assert page.tags.count("script") == 2 * len(running) <= 2
-    for script in running:
+    # one data element per script; the content security policy names the script by its hash
+    scripts = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
+    assert page.tags.count("script") == 2 * len(scripts) <= 2
+    for script in scripts:
         assert f"script-src '{script_hash(script)}'" in text
-    assert ("script-src" in text) == bool(running)
+    assert ("script-src" in text) == bool(scripts)
     assert "link" not in page.tags
     assert "iframe" not in page.tags
     assert page.handlers == []
@@ -89,40 +91,48 @@ def _check(text: str, page: Page) -> None:
     assert "default-src 'none'" in text
 
 
-#: Columns of a whole report, with one driver only.
-CORE = [*BARE, "velocity_error_x_m_s", "velocity_error_y_m_s", "terrain", "off_nadir_max_deg", "error", "traceback"]
+#: Columns of a full report with one driver.
+FULL_COLUMNS = [
+    *MIN_COLUMNS,
+    "velocity_error_x_m_s",
+    "velocity_error_y_m_s",
+    "terrain",
+    "off_nadir_max_deg",
+    "error",
+    "traceback",
+]
 RUNS: dict[str, Callable[[Rows], pd.DataFrame]] = {
-    "small": lambda rows: rows(24)[CORE],
-    "large": lambda rows: rows(2000, spread=1.5, terrains=60)[CORE],
-    "crashed": lambda rows: rows(24, crashed=3)[CORE],
-    "only crashed": lambda rows: rows(4, crashed=4)[CORE],
-    "no answer": lambda rows: rows(24, answered=0.0)[CORE],
-    "one case": lambda rows: rows(1, answered=1.0)[CORE],
+    "small": lambda rows: rows(24)[FULL_COLUMNS],
+    "large": lambda rows: rows(2000, spread=1.5, terrains=60)[FULL_COLUMNS],
+    "crashed": lambda rows: rows(24, crashed=3)[FULL_COLUMNS],
+    "only crashed": lambda rows: rows(4, crashed=4)[FULL_COLUMNS],
+    "no answer": lambda rows: rows(24, answered=0.0)[FULL_COLUMNS],
+    "one case": lambda rows: rows(1, answered=1.0)[FULL_COLUMNS],
     "no rows": lambda rows: rows(24).head(0),
-    "exact": lambda rows: rows(24, answered=1.0, spread=0.0)[CORE],
+    "exact": lambda rows: rows(24, answered=1.0, spread=0.0)[FULL_COLUMNS],
     "few columns": lambda rows: rows(24)[["case", "outcome"]],
     "only cases": lambda rows: rows(24)[["case"]],
-    "wild": lambda rows: rows(24)[CORE].assign(velocity_error_m_s=np.geomspace(1e-9, 1e9, 24)),
-    "infinite": lambda rows: rows(24)[CORE].assign(velocity_error_x_m_s=np.inf),
+    "wild": lambda rows: rows(24)[FULL_COLUMNS].assign(velocity_error_m_s=np.geomspace(1e-9, 1e9, 24)),
+    "infinite": lambda rows: rows(24)[FULL_COLUMNS].assign(velocity_error_x_m_s=np.inf),
 }
 
 
 @pytest.mark.parametrize("kind", RUNS)
-def test_report_of_any_run(make_rows: Rows, make_run: MakeRun, kind: str) -> None:
-    text, page, twin = _read(make_run(RUNS[kind](make_rows)))
-    _check(text, page)
+def test_report_is_valid_for_any_run(make_rows: Rows, make_run: MakeRun, kind: str) -> None:
+    text, page, twin = _write_and_read(make_run(RUNS[kind](make_rows)))
+    _check_page(text, page)
     assert twin["schema"] == 4
     assert twin["verdict"] in text
     assert len(text) < 1_000_000
 
 
-def test_small_report_says_what_a_board_asks(
+def test_small_report_contains_the_main_results(
     make_rows: Rows, make_run: MakeRun, dimes_products: dict[str, Any]
 ) -> None:
     directory = make_run(make_rows(24, crashed=1), products=dimes_products)
-    text, page, twin = _read(directory)
-    _check(text, page)
-    plain = " ".join(re.sub(r"<[^>]+>", " ", text).split())
+    text, page, twin = _write_and_read(directory)
+    _check_page(text, page)
+    visible_text = " ".join(re.sub(r"<[^>]+>", " ", text).split())
     for message in (
         "INSUFFICIENT",
         "DIMES-VEL",
@@ -136,7 +146,7 @@ def test_small_report_says_what_a_board_asks(
         "landing season",
         "+14.10 m/s east",
     ):
-        assert message in plain, message
+        assert message in visible_text, message
     assert "case-3" in page.ids
     assert page.tags.count("svg") > 8
     assert twin["exit_code"] == 1
@@ -144,20 +154,20 @@ def test_small_report_says_what_a_board_asks(
     assert len(text) < 2_000_000
 
 
-def test_report_without_requirements(make_rows: Rows, make_run: MakeRun) -> None:
-    text, page, twin = _read(make_run(make_rows(24)[CORE], []))
-    _check(text, page)
+def test_report_without_requirements_has_exit_code_0(make_rows: Rows, make_run: MakeRun) -> None:
+    text, page, twin = _write_and_read(make_run(make_rows(24)[FULL_COLUMNS], []))
+    _check_page(text, page)
     assert "asks for no requirement" in text
     assert (twin["exit_code"], twin["verdicts"]) == (0, [])
     assert "velocity error (m/s)" in text
 
 
-def test_a_rate_that_is_met_has_its_own_word_colour_and_sign(
+def test_requirement_met_by_rate_has_its_own_symbol(
     make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]
 ) -> None:
     rate = {**velocity, "probability": 0.9, "confidence": 0.999, "decide_by": "estimate"}
-    directory = make_run(make_rows(24)[BARE], [rate])
-    text, _, twin = _read(directory)
+    directory = make_run(make_rows(24)[MIN_COLUMNS], [rate])
+    text, _, twin = _write_and_read(directory)
     assert '<div class="headline status-met-by-rate">' in text
     assert ".status-met-by-rate { --status: var(--rate)" in text
     assert "(decided by rate)." in text
@@ -166,16 +176,16 @@ def test_a_rate_that_is_met_has_its_own_word_colour_and_sign(
     assert (twin["verdict"], twin["exit_code"]) == ("MET BY RATE", 3)
 
 
-def test_four_terrains_show_little_however_many_cases_they_bear(make_rows: Rows, make_run: MakeRun) -> None:
-    text, _, twin = _read(make_run(make_rows(400, answered=1.0, spread=0.1)[[*BARE, "terrain"]]))
+def test_few_terrains_give_an_insufficient_verdict(make_rows: Rows, make_run: MakeRun) -> None:
+    text, _, twin = _write_and_read(make_run(make_rows(400, answered=1.0, spread=0.1)[[*MIN_COLUMNS, "terrain"]]))
     assert (twin["verdict"], twin["verdicts"][0]["plain_status"]) == ("INSUFFICIENT", "PASS")
     assert "400 cases share 4 terrains and so are not independent" in text
 
 
-def test_everything_from_files_is_shown_as_text(
+def test_texts_from_files_are_escaped(
     make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any], dimes_products: dict[str, Any]
 ) -> None:
-    frame = make_rows(24, crashed=2)[CORE]
+    frame = make_rows(24, crashed=2)[FULL_COLUMNS]
     frame["outcome"] = frame["outcome"].replace("VALID", HOSTILE)
     frame = frame.assign(error=HOSTILE, traceback=HOSTILE, site=[HOSTILE, "b"] * 12, gl_version=HOSTILE)
     frame[f"{HOSTILE}_deg"] = np.arange(24.0)
@@ -194,8 +204,8 @@ def test_everything_from_files_is_shown_as_text(
         state=HOSTILE,
         showcase_differs=[HOSTILE],
     )
-    text, page, _ = _read(directory)
-    _check(text, page)
+    text, page, _ = _write_and_read(directory)
+    _check_page(text, page)
     assert "img" not in page.tags
     assert "&lt;script&gt;" in text
     assert "49" not in re.findall(r"alert\(1\)&gt;&#34;&#39;&amp;(\S+)", text)
@@ -213,29 +223,29 @@ def test_everything_from_files_is_shown_as_text(
         '{"name": "\\ud800", "seed": [1], "description": {"a": "b"}}',
     ],
 )
-def test_damaged_record(make_rows: Rows, make_run: MakeRun, record: str) -> None:
-    directory = make_run(make_rows(6)[BARE])
+def test_damaged_record_gives_a_valid_page(make_rows: Rows, make_run: MakeRun, record: str) -> None:
+    directory = make_run(make_rows(6)[MIN_COLUMNS])
     (directory / "campaign.json").write_text(record, encoding="utf-8")
-    text, page, _ = _read(directory)
-    _check(text, page)
+    text, page, _ = _write_and_read(directory)
+    _check_page(text, page)
 
 
-def test_missing_record_and_damaged_products(make_rows: Rows, make_run: MakeRun) -> None:
-    directory = make_run(make_rows(6)[BARE], products={"image_1": np.zeros((4, 4))})
+def test_missing_record_and_damaged_products_give_a_valid_page(make_rows: Rows, make_run: MakeRun) -> None:
+    directory = make_run(make_rows(6)[MIN_COLUMNS], products={"image_1": np.zeros((4, 4))})
     (directory / "campaign.json").unlink()
     (directory / "cases" / "3" / "products.npz").write_bytes(b"not an archive")
     (directory / "cases" / "not-a-number").mkdir()
-    text, page, _ = _read(directory)
-    _check(text, page)
+    text, page, _ = _write_and_read(directory)
+    _check_page(text, page)
 
 
-def test_interrupted_campaign_says_so(make_rows: Rows, make_run: MakeRun) -> None:
-    text, _, twin = _read(make_run(make_rows(6)[BARE], state="interrupted", cases=24))
+def test_interrupted_campaign_is_marked(make_rows: Rows, make_run: MakeRun) -> None:
+    text, _, twin = _write_and_read(make_run(make_rows(6)[MIN_COLUMNS], state="interrupted", cases=24))
     assert "Not finished." in text
     assert twin["state"] == "interrupted"
 
 
-def test_folder_without_rows_is_refused(tmp_path: Path) -> None:
+def test_folder_without_rows_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"cases\.parquet"):
         write_report(tmp_path)
     (tmp_path / "cases.parquet").write_bytes(b"not a table")
@@ -243,7 +253,7 @@ def test_folder_without_rows_is_refused(tmp_path: Path) -> None:
         write_report(tmp_path)
 
 
-def test_same_files_same_page(make_rows: Rows, make_run: MakeRun) -> None:
-    directory = make_run(make_rows(24)[[*BARE, "off_nadir_max_deg", "terrain"]])
+def test_report_is_reproducible(make_rows: Rows, make_run: MakeRun) -> None:
+    directory = make_run(make_rows(24)[[*MIN_COLUMNS, "off_nadir_max_deg", "terrain"]])
     first = write_report(directory).read_bytes()
     assert write_report(directory).read_bytes() == first

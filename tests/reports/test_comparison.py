@@ -1,4 +1,4 @@
-"""Algorithms in pairs, and covariances against errors: closed forms, and rates over many repetitions."""
+"""Tests of paired comparisons of algorithms and of the consistency of covariances."""
 
 from typing import Any
 
@@ -11,57 +11,56 @@ from marsyard.reports.common_sections import consistencies, consistency
 from marsyard.reports.comparison import comparison, select_algorithm
 
 
-def rows(mine: list[float], its: list[float]) -> pd.DataFrame:
-    frame: dict[str, Any] = {"case": range(len(mine)), "algorithm": "dimes", "velocity_error_m_s": mine}
-    for prefix, errors in (("", mine), ("other.", its)):
-        known = np.isfinite(errors)
-        frame[f"{prefix}outcome"] = np.where(known, "VALID", "CRASHED")
-        frame[f"{prefix}answered"] = known
-    return pd.DataFrame({**frame, "other.velocity_error_m_s": its, "altitude_m": 1.0})
+def make_paired_rows(first_errors: list[float], other_errors: list[float]) -> pd.DataFrame:
+    frame: dict[str, Any] = {"case": range(len(first_errors)), "algorithm": "dimes", "velocity_error_m_s": first_errors}
+    for prefix, errors in (("", first_errors), ("other.", other_errors)):
+        is_answered = np.isfinite(errors)
+        frame[f"{prefix}outcome"] = np.where(is_answered, "VALID", "CRASHED")
+        frame[f"{prefix}answered"] = is_answered
+    return pd.DataFrame({**frame, "other.velocity_error_m_s": other_errors, "altitude_m": 1.0})
 
 
-def test_algorithms_side_by_side() -> None:
+def test_paired_comparison_counts_and_mean_difference() -> None:
     nan = float("nan")
-    contenders, (difference,) = comparison(rows([1, 2, 3, 9], [2, 3, nan, 4]), "velocity_error_m_s", 5.0)
-    assert [(one.name, one.answered, one.failed, one.succeeded) for one in contenders] == [
-        ("dimes", 4, 0, 3),
-        ("other", 3, 1, 3),
-    ]
+    contenders, (difference,) = comparison(make_paired_rows([1, 2, 3, 9], [2, 3, nan, 4]), "velocity_error_m_s", 5.0)
+    assert [
+        (contender.name, contender.answered, contender.failed, contender.succeeded) for contender in contenders
+    ] == [("dimes", 4, 0, 3), ("other", 3, 1, 3)]
     assert (difference.only_first, difference.only_other, difference.pairs) == (1, 1, 3)
     assert difference.mean == pytest.approx((1 + 1 - 5) / 3)
 
 
-def test_probabilities_are_corrected_for_the_number_of_algorithms() -> None:
-    frame = rows([1.0] * 12, [2.0] * 12)
-    again = frame.filter(like="other.").rename(columns=lambda name: name.replace("other.", "third."))
-    (alone,) = comparison(frame, "velocity_error_m_s", 1.5)[1]
-    both = comparison(pd.concat([frame, again], axis=1), "velocity_error_m_s", 1.5)[1]
-    assert [one.success_p for one in both] == pytest.approx([2.0 * alone.success_p] * 2)
-    assert [one.error_p for one in both] == pytest.approx([2.0 * alone.error_p] * 2)
+def test_p_values_are_corrected_for_the_number_of_algorithms() -> None:
+    frame = make_paired_rows([1.0] * 12, [2.0] * 12)
+    third = frame.filter(like="other.").rename(columns=lambda name: name.replace("other.", "third."))
+    (single,) = comparison(frame, "velocity_error_m_s", 1.5)[1]
+    both = comparison(pd.concat([frame, third], axis=1), "velocity_error_m_s", 1.5)[1]
+    assert [difference.success_p for difference in both] == pytest.approx([2.0 * single.success_p] * 2)
+    assert [difference.error_p for difference in both] == pytest.approx([2.0 * single.error_p] * 2)
 
 
-def test_one_algorithm_alone_is_no_comparison() -> None:
-    frame = rows([1, 2], [1, 2])[["case", "algorithm", "outcome", "answered", "velocity_error_m_s"]]
+def test_single_algorithm_gives_no_comparison() -> None:
+    frame = make_paired_rows([1, 2], [1, 2])[["case", "algorithm", "outcome", "answered", "velocity_error_m_s"]]
     assert comparison(frame, "velocity_error_m_s", 5.0) == ([], [])
 
 
-def test_a_frame_as_if_the_other_had_been_judged() -> None:
-    own = select_algorithm(rows([1, 2], [3, 4]), "other")
-    assert own["velocity_error_m_s"].tolist() == [3, 4]
-    assert own["altitude_m"].tolist() == [1.0, 1.0]
-    assert not any("." in str(name) for name in own.columns)
+def test_columns_of_a_compared_algorithm_are_selected() -> None:
+    selected = select_algorithm(make_paired_rows([1, 2], [3, 4]), "other")
+    assert selected["velocity_error_m_s"].tolist() == [3, 4]
+    assert selected["altitude_m"].tolist() == [1.0, 1.0]
+    assert not any("." in str(name) for name in selected.columns)
 
 
-def test_right_covariances_are_consistent_19_times_in_20() -> None:
+def test_correct_covariances_are_consistent_at_95_percent() -> None:
     rng = np.random.default_rng(7)
     words = [consistency(stats.chi2.rvs(2, size=50, random_state=rng))["word"] for _ in range(400)]
-    assert 0.91 <= words.count("consistent") / 400 <= 0.985  # 0.95 with 4 standard deviations below, 3 above
-    found = consistency(stats.chi2.rvs(2, size=50, random_state=rng) * 4.0)
-    assert found["word"] == "too sure"
+    assert 0.91 <= words.count("consistent") / 400 <= 0.985  # 0.95, minus 4 and plus 3 standard deviations
+    overconfident = consistency(stats.chi2.rvs(2, size=50, random_state=rng) * 4.0)
+    assert overconfident["word"] == "too sure"
     assert consistency(stats.chi2.rvs(2, size=50, random_state=rng) / 4.0)["word"] == "too cautious"
 
 
-def test_consistency_of_every_algorithm_that_states_covariances() -> None:
-    frame = rows([1, 2], [3, 4]).assign(**{"other.velocity_nees": [2.0, 2.0]})
-    ((name, only),) = consistencies(frame).items()
-    assert (name, only["n"], only["mean"], only["word"]) == ("other", 2, 2.0, "consistent")
+def test_consistency_covers_all_algorithms_with_covariances() -> None:
+    frame = make_paired_rows([1, 2], [3, 4]).assign(**{"other.velocity_nees": [2.0, 2.0]})
+    ((name, values),) = consistencies(frame).items()
+    assert (name, values["n"], values["mean"], values["word"]) == ("other", 2, 2.0, "consistent")

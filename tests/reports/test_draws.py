@@ -1,4 +1,4 @@
-"""The figure of sampled inputs shows every parameter, every pair, and correlations that chance would hardly make."""
+"""Tests of the figure of sampled inputs: marginals, pairs and significant correlations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from matplotlib.patches import Rectangle
 from marsyard.reports.draws import Drawn, draws_figure, save_figure
 
 
-def _drawn() -> list[Drawn]:
+def _make_draws() -> list[Drawn]:
     rng = np.random.default_rng(1)
     x = rng.normal(size=300)
     return [
@@ -23,22 +23,22 @@ def _drawn() -> list[Drawn]:
     ]
 
 
-def test_marginals_and_pairs() -> None:
-    figure = draws_figure("a campaign", _drawn())
+def test_figure_shows_marginals_and_pairs() -> None:
+    figure = draws_figure("a campaign", _make_draws())
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     assert titles[:5] == ["wind.east (m/s)", "wind.north (m/s)", "heights_m.1", "kind", "sleep (s)"]
     bars = [[patch for patch in axes.patches if isinstance(patch, Rectangle)] for axes in figure.axes[:5]]
-    assert [sum(bar.get_height() for bar in of_one) for of_one in bars] == [300.0] * 5
+    assert [sum(bar.get_height() for bar in group) for group in bars] == [300.0] * 5
     pairs = figure.axes[5]
     texts = {text.get_text(): text.get_fontweight() for text in pairs.texts}
     assert {"east", "north", "heights\nm\n1", "kind"} <= set(texts)
     assert [text for text, weight in texts.items() if weight == "bold"] == ["+0.99"]
-    points = next(one for one in pairs.collections if isinstance(one, PathCollection))
+    points = next(collection for collection in pairs.collections if isinstance(collection, PathCollection))
     assert np.shape(points.get_offsets())[0] == 6 * 300
 
 
 def test_one_parameter_has_no_pairs(tmp_path: Path) -> None:
-    figure = draws_figure("[a] $x$", _drawn()[:1])
+    figure = draws_figure("[a] $x$", _make_draws()[:1])
     assert len(figure.axes) == 1
     for name in ("one.svg", "one.png"):
         save_figure(figure, tmp_path / name)

@@ -1,3 +1,5 @@
+"""Tests of the data explorer and of the cases selected for the gallery."""
+
 from __future__ import annotations
 
 import json
@@ -8,30 +10,30 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from marsyard.reports.cases import gallery_cases, notable_cases
-from marsyard.reports.sections import MAX_POINTS, choose_points, embedded, explorer_data
+from marsyard.reports.presentation import gallery_cases, notable_cases
+from marsyard.reports.sections import MAX_POINTS, choose_points, embed_json, explorer_data
 from marsyard.reports.stored import read_run
 
 Rows = Callable[..., pd.DataFrame]
 METRIC = "velocity_error_m_s"
 
 
-def test_points_hold_the_worst_the_silent_and_the_crashed(make_rows: Rows) -> None:
+def test_points_include_worst_silent_and_crashed_cases(make_rows: Rows) -> None:
     frame = make_rows(12_000, crashed=3)
-    chosen = choose_points(frame, METRIC)
-    assert chosen.size == MAX_POINTS
-    assert np.all(np.diff(chosen) > 0)
-    assert int(np.nanargmax(frame[METRIC])) in chosen
-    assert {11_997, 11_998, 11_999} <= set(chosen.tolist())
-    assert frame.iloc[chosen]["outcome"].nunique() == frame["outcome"].nunique()
+    selected = choose_points(frame, METRIC)
+    assert selected.size == MAX_POINTS
+    assert np.all(np.diff(selected) > 0)
+    assert int(np.nanargmax(frame[METRIC])) in selected
+    assert {11_997, 11_998, 11_999} <= set(selected.tolist())
+    assert frame.iloc[selected]["outcome"].nunique() == frame["outcome"].nunique()
     assert choose_points(frame.head(50), METRIC).tolist() == list(range(50))
 
 
-def test_data_of_the_points(make_rows: Rows, make_run: Callable[..., Path]) -> None:
+def test_explorer_data_have_labels_outcomes_and_values(make_rows: Rows, make_run: Callable[..., Path]) -> None:
     frame = make_rows(30, crashed=1)
     run = read_run(make_run(frame))
     data = explorer_data(run, METRIC, 5.0, ["3"])
-    assert [data["labels"][place] for place in data["axes"]] == ["velocity error x (m/s)", "velocity error y (m/s)"]
+    assert [data["labels"][index] for index in data["axes"]] == ["velocity error x (m/s)", "velocity error y (m/s)"]
     assert (data["cases"], data["pictured"], data["shown"], data["all"]) == (list(range(30)), [3], 30, 30)
     assert data["outcomes"][data["outcome"][29]] == "CRASHED"
     assert data["columns"][data["metric"]][29] is None
@@ -39,33 +41,33 @@ def test_data_of_the_points(make_rows: Rows, make_run: Callable[..., Path]) -> N
     assert data["columns"][data["metric"]][0] == (None if np.isnan(first) else float(f"{first:.4g}"))
 
 
-def test_embedded_data_cannot_end_its_element() -> None:
+def test_embedded_data_are_escaped() -> None:
     hostile = {"</script><script>alert(1)//": "<!--\u2028&"}
-    text = str(embedded(hostile))
+    text = str(embed_json(hostile))
     assert not set("<>&\u2028") & set(text)
     assert json.loads(text) == hostile
 
 
-def test_notable_cases_are_the_worst_the_silent_and_others(make_rows: Rows, make_run: Callable[..., Path]) -> None:
+def test_notable_cases_are_worst_silent_and_others(make_rows: Rows, make_run: Callable[..., Path]) -> None:
     frame = make_rows(60, crashed=2)
-    found = notable_cases(read_run(make_run(frame)))
+    selected = notable_cases(read_run(make_run(frame)))
     sizes = frame["velocity_error_m_s"]
-    assert found[:2] == sizes.nlargest(2).index.tolist()
+    assert selected[:2] == sizes.nlargest(2).index.tolist()
     silent = frame.index[sizes.isna() & ~frame["outcome"].eq("CRASHED")].tolist()
-    assert found[2:4] == silent[:2]
-    assert len(found) == len(set(found)) == 6
-    assert not set(found) & set(frame.index[frame["outcome"].eq("CRASHED")])
+    assert selected[2:4] == silent[:2]
+    assert len(selected) == len(set(selected)) == 6
+    assert not set(selected) & set(frame.index[frame["outcome"].eq("CRASHED")])
     assert notable_cases(read_run(make_run(frame.head(0), name="none"))) == []
 
 
-def test_the_gallery_holds_the_worst_the_silent_and_others(make_rows: Rows, make_run: Callable[..., Path]) -> None:
+def test_gallery_has_worst_silent_and_other_cases(make_rows: Rows, make_run: Callable[..., Path]) -> None:
     frame = make_rows(40)
     run = replace(read_run(make_run(frame)), showcases=(7, *(case for case in range(40) if case != 7)))
-    chosen = gallery_cases(run)
-    assert chosen[0] == 7
-    assert len(chosen) == len(set(chosen)) == 7
+    selected = gallery_cases(run)
+    assert selected[0] == 7
+    assert len(selected) == len(set(selected)) == 7
     worst = frame[METRIC].drop(7).sort_values(ascending=False).index[:2]
-    assert chosen[1:3] == worst.tolist()
-    assert frame[METRIC].iloc[chosen[3:5]].isna().all()
+    assert selected[1:3] == worst.tolist()
+    assert frame[METRIC].iloc[selected[3:5]].isna().all()
     assert gallery_cases(replace(run, showcases=(7,))) == [7]
     assert gallery_cases(replace(run, showcases=())) == []

@@ -1,3 +1,5 @@
+"""Tests of the SVG figures of errors and outcomes."""
+
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
@@ -17,13 +19,13 @@ from marsyard.reports.figures import (
     error_scatter_against,
     outcome_bars,
 )
-from marsyard.reports.svg import svg_markup
+from marsyard.reports.section import svg_markup
 
 Rows = Callable[..., pd.DataFrame]
 METRIC = "velocity_error_m_s"
 
 
-def _all_figures(frame: pd.DataFrame, bound: float | None) -> list[Figure | None]:
+def _draw_all_figures(frame: pd.DataFrame, bound: float | None) -> list[Figure | None]:
     return [
         error_scatter(frame, METRIC, bound),
         error_scatter(frame, METRIC, bound, close=True),
@@ -36,14 +38,14 @@ def _all_figures(frame: pd.DataFrame, bound: float | None) -> list[Figure | None
 
 @pytest.mark.parametrize(("cases", "bound"), [(1, 5.0), (24, None), (24, 0.0), (1500, 5.0)])
 def test_figures_are_well_formed(make_rows: Rows, cases: int, bound: float | None) -> None:
-    for place, figure in enumerate(_all_figures(make_rows(cases, answered=1.0), bound)):
+    for index, figure in enumerate(_draw_all_figures(make_rows(cases, answered=1.0), bound)):
         assert figure is not None
-        root = ET.fromstring(svg_markup(figure, f"f{place}", 'errors & "more" <of them>'))  # noqa: S314  (our own)
+        root = ET.fromstring(svg_markup(figure, f"f{index}", 'errors & "more" <of them>'))  # noqa: S314
         assert root.get("aria-label") == 'errors & "more" <of them>'
         assert root.get("viewBox")
 
 
-def test_figures_of_what_is_not_there(make_rows: Rows) -> None:
+def test_missing_data_give_no_figure(make_rows: Rows) -> None:
     silent = make_rows(5, answered=0.0)
     assert error_scatter(silent, METRIC, 5.0) is None
     assert error_histogram(silent, METRIC, 5.0) is None
@@ -55,7 +57,7 @@ def test_figures_of_what_is_not_there(make_rows: Rows) -> None:
     assert error_histogram(bare, METRIC, 5.0) is not None
 
 
-def test_identifiers_of_figures_are_apart(make_rows: Rows) -> None:
+def test_figures_have_distinct_identifiers(make_rows: Rows) -> None:
     figure = error_histogram(make_rows(24), METRIC, 5.0)
     assert figure is not None
     names = [
@@ -66,13 +68,13 @@ def test_identifiers_of_figures_are_apart(make_rows: Rows) -> None:
     assert not names[0] & names[1]
 
 
-def test_same_rows_same_bytes(make_rows: Rows) -> None:
+def test_figures_are_reproducible(make_rows: Rows) -> None:
     frame = make_rows(24)
     first, second = (svg_markup(error_scatter(frame, METRIC, 5.0) or Figure(), "s", "") for _ in range(2))
     assert first == second
 
 
-def test_scatter_shows_the_requirement_to_scale(make_rows: Rows) -> None:
+def test_scatter_shows_the_bound_as_a_circle(make_rows: Rows) -> None:
     figure = error_scatter(make_rows(24), METRIC, 5.0)
     assert figure is not None
     circles = [patch for patch in figure.axes[0].patches if isinstance(patch, Circle)]
@@ -80,7 +82,7 @@ def test_scatter_shows_the_requirement_to_scale(make_rows: Rows) -> None:
     assert figure.axes[0].get_aspect() == 1.0
 
 
-def test_hostile_texts_are_drawn_as_text(make_rows: Rows) -> None:
+def test_texts_in_figures_are_escaped(make_rows: Rows) -> None:
     frame = make_rows(6).assign(outcome="<script>alert(1)</script> $\\frac$ \N{PILE OF POO}")
     figure = outcome_bars(frame)
     assert figure is not None
@@ -90,60 +92,59 @@ def test_hostile_texts_are_drawn_as_text(make_rows: Rows) -> None:
     assert "$\\frac$" in markup
 
 
-def _with_gross_errors(frame: pd.DataFrame, gross: slice) -> pd.DataFrame:
-    """The rows with some errors a hundred times as large."""
+def _scale_errors(frame: pd.DataFrame, rows: slice) -> pd.DataFrame:
+    """Multiply the errors of some rows by 100."""
     parts = [METRIC, "velocity_error_x_m_s", "velocity_error_y_m_s"]
-    frame.loc[frame.index[gross], parts] *= 100.0
+    frame.loc[frame.index[rows], parts] *= 100.0
     return frame
 
 
-def test_a_histogram_counts_errors_beyond_its_axis_in_a_bar_of_their_own(make_rows: Rows) -> None:
-    frame = _with_gross_errors(make_rows(60, answered=1.0), slice(0, 60, 12))
+def test_histogram_has_an_overflow_bar(make_rows: Rows) -> None:
+    frame = _scale_errors(make_rows(60, answered=1.0), slice(0, 60, 12))
     figure = error_histogram(frame, METRIC, 5.0)
     assert figure is not None
     bars = [patch for patch in figure.axes[0].patches if isinstance(patch, Rectangle)]
     (overflow,) = [bar for bar in bars if bar.get_hatch()]
     assert overflow.get_height() == (frame[METRIC] > 15.0).sum() >= 4
-    # no other bar holds them: those end with the largest error on the axis
+    # the other bars end at the largest error on the axis
     assert sum(bar.get_height() for bar in bars) == 60
     largest = frame[METRIC][frame[METRIC] <= 15.0].max()
     assert max(bar.get_x() + bar.get_width() for bar in bars if bar is not overflow) == pytest.approx(largest)
     assert any("> 15" in text.get_text() for text in figure.axes[0].texts)
 
 
-def test_axes_follow_errors_that_are_mostly_gross(make_rows: Rows) -> None:
-    frame = _with_gross_errors(make_rows(60, answered=1.0), slice(None))
+def test_axis_includes_the_95_percent_quantile(make_rows: Rows) -> None:
+    frame = _scale_errors(make_rows(60, answered=1.0), slice(None))
     for draw in (error_histogram, error_distribution):
         figure = draw(frame, METRIC, 5.0)
         assert figure is not None
-        # at least the errors up to their 95 % quantile lie on the axis
         assert figure.axes[0].get_xlim()[1] >= frame[METRIC].quantile(0.95)
     distribution = error_distribution(frame, METRIC, 5.0)
     assert distribution is not None
     axes = distribution.axes[0]
-    x, share = (np.asarray(values) for values in axes.lines[0].get_data())
-    assert share[x <= axes.get_xlim()[1]].max() > 0.9
+    x, fraction = (np.asarray(values) for values in axes.lines[0].get_data())
+    assert fraction[x <= axes.get_xlim()[1]].max() > 0.9
     assert any("beyond" in text.get_text() for text in axes.texts)
 
 
-def _hollow_marks(figure: Figure) -> int:
+def _count_hollow_marks(figure: Figure) -> int:
     lines = [line for line in figure.axes[0].lines if line.get_markerfacecolor() == "none"]
     return sum(np.size(line.get_xdata()) for line in lines)
 
 
-def test_points_beyond_the_axes_are_hollow_and_counted(make_rows: Rows) -> None:
-    frame = _with_gross_errors(make_rows(60, answered=1.0), slice(0, 60, 12))
+def test_points_beyond_the_axes_are_marked_and_counted(make_rows: Rows) -> None:
+    frame = _scale_errors(make_rows(60, answered=1.0), slice(0, 60, 12))
     figure = error_scatter(frame, METRIC, 5.0)
     assert figure is not None
-    count = _hollow_marks(figure)
+    count = _count_hollow_marks(figure)
     assert count >= 4
     legend = figure.axes[0].get_legend()
     assert legend is not None
     assert f"{count} beyond the axes" in [text.get_text() for text in legend.texts]
-    driven = error_scatter_against(frame, METRIC, "off_nadir_max_deg", 5.0)
-    assert driven is not None
+    driver_figure = error_scatter_against(frame, METRIC, "off_nadir_max_deg", 5.0)
+    assert driver_figure is not None
     assert (
-        _hollow_marks(driven)
+        _count_hollow_marks(driver_figure)
         == count_beyond_axis(frame, METRIC, "off_nadir_max_deg", 5.0)
         == (frame[METRIC] > 15.0).sum()
     )

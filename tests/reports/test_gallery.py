@@ -1,4 +1,4 @@
-"""Captions and numbers claim no more than the cases show."""
+"""Tests of captions and numbers: intervals, minimum numbers of cases and rounding."""
 
 from __future__ import annotations
 
@@ -22,36 +22,38 @@ METRIC = "velocity_error_m_s"
 
 
 def test_rank_correlations_have_intervals_and_need_enough_cases(make_rows: Rows) -> None:
-    few = [one.caption for one in driver_plates(make_rows(12, answered=1.0), METRIC, 5.0)]
-    assert few
-    assert not [caption for caption in few if "correlation" in caption]
-    many = [one.caption for one in driver_plates(make_rows(60, answered=1.0), METRIC, 5.0)]
-    given = r"rank correlation −?\d\.\d{3} \(−?\d\.\d{3} to −?\d\.\d{3} at 90 % confidence\)"
-    assert all(re.search(given, caption) for caption in many)
+    few_captions = [figure.caption for figure in driver_plates(make_rows(12, answered=1.0), METRIC, 5.0)]
+    assert few_captions
+    assert not [caption for caption in few_captions if "correlation" in caption]
+    captions = [figure.caption for figure in driver_plates(make_rows(60, answered=1.0), METRIC, 5.0)]
+    pattern = r"rank correlation −?\d\.\d{3} \(−?\d\.\d{3} to −?\d\.\d{3} at 90 % confidence\)"
+    assert all(re.search(pattern, caption) for caption in captions)
 
 
-@pytest.mark.parametrize(("maps", "known"), [(10, False), (40, True)])
-def test_rank_correlations_of_maps_have_intervals(maps: int, known: bool) -> None:
+@pytest.mark.parametrize(("maps", "has_interval"), [(10, False), (40, True)])
+def test_rank_correlations_of_maps_have_intervals(maps: int, has_interval: bool) -> None:
     rng = np.random.default_rng(1)
     texture = rng.uniform(0.1, 1.0, maps)
     frame = pd.DataFrame({"texture": texture, "rms_share": rng.uniform(0.0, 0.1, maps) / texture})
-    effect = next(one for one in MAP_EFFECTS.effects(frame) if one.error.startswith("elevation error"))
-    assert (" to " in correlation_text(effect)) == known
-    assert known or correlation_text(effect) == NOTHING
+    effect = next(
+        candidate for candidate in MAP_EFFECTS.effects(frame) if candidate["error"].startswith("elevation error")
+    )
+    assert (" to " in correlation_text(effect)) == has_interval
+    assert has_interval or correlation_text(effect) == NOTHING
 
 
-def test_a_bound_that_cases_are_too_few_for_is_a_dash() -> None:
-    # the lower bound of the 5 % quantile at 90 % confidence takes 45 values
+def test_bound_without_enough_cases_is_a_dash() -> None:
+    # a lower bound of the 5 % quantile at 90 % confidence needs 45 values
     (row,) = distance_grid({"sites": np.array([1.0, 2.0, 3.0])}).rows
     assert row[-1] == NOTHING
 
 
-def test_rounding_errors_are_zero_and_small_numbers_are_not() -> None:
+def test_rounding_errors_are_printed_as_zero() -> None:
     assert number(9.09e-13) == number(-9.09e-13) == "0.000"
     assert number(2e-7) == "2.00e−07"
 
 
-def test_one_case_is_counted_in_the_singular(make_rows: Rows) -> None:
+def test_single_crashed_case_is_written_in_singular(make_rows: Rows) -> None:
     frame = make_rows(8, crashed=1)
     suite = Xml.fromstring(junit_xml("one", [], overall([], frame)))  # noqa: S314
-    assert [one.get("message") for one in suite.iter("failure")] == ["1 case crashed"]
+    assert [failure.get("message") for failure in suite.iter("failure")] == ["1 case crashed"]

@@ -1,4 +1,4 @@
-"""Sections declared as data, as a system of another package declares its own: against rows whose numbers are known."""
+"""Tests of declared report sections against rows with known statistics."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from marsyard.reports import presentation
 from marsyard.reports.campaign import section_makers, write_report
-from marsyard.reports.charts import cumulative_figure
+from marsyard.reports.figures import cumulative_figure
 from marsyard.reports.kinds import (
     Distribution,
     Quantity,
@@ -22,13 +22,13 @@ from marsyard.reports.kinds import (
     SectionDeclaration,
     Statistics,
     condition_bins,
-    flagged,
+    flag_rate,
 )
 from marsyard.reports.papers import PaperFacts
 from marsyard.reports.presentation import Presentation, presentations
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
-from marsyard.scenarios.system import System
+from marsyard.scenarios.systems import System
 
 ERROR = Quantity("altitude_error_m")
 ALTITUDE = SectionDeclaration(
@@ -39,49 +39,51 @@ ALTITUDE = SectionDeclaration(
     parts=(
         Statistics("altitude_error_m"),
         Distribution([ERROR], ("altitude error (m)", "share of cases"), "Share of cases up to each error.", bound=5.0),
-        RateTable([Rate("answered", "answered", flagged("answered"))]),
-        RateByCondition(Quantity("altitude_m"), [Rate("answered", "Answered", flagged("answered"))]),
+        RateTable([Rate("answered", "answered", flag_rate("answered"))]),
+        RateByCondition(Quantity("altitude_m"), [Rate("answered", "Answered", flag_rate("answered"))]),
         Scatter([Quantity("altitude_m")], [ERROR], "Every case, and medians of bins."),
     ),
     note="Made up.",
 )
 
 
-def subject(frame: pd.DataFrame, name: str = "altitude-flight-2") -> Subject:
+def make_subject(frame: pd.DataFrame, name: str = "altitude-flight-2") -> Subject:
     return Subject(StoredRun(Path("run"), frame, frame, {"name": name}, ()), "altitude_error_m", 5.0)
 
 
-def rows() -> pd.DataFrame:
-    """40 cases at two altitudes: all answered at the lower one, half at the higher one; errors grow with altitude."""
-    high = np.arange(40) >= 20
-    answered = ~high | (np.arange(40) % 2 == 0)
-    error = np.where(answered, 1.0 + high, np.nan)
-    return pd.DataFrame({"answered": answered, "altitude_m": np.where(high, 800.0, 400.0), "altitude_error_m": error})
+def make_rows_of_two_altitudes() -> pd.DataFrame:
+    """40 cases at two altitudes: all answered at 400 m with error 1 m, half answered at 800 m with error 2 m."""
+    is_high = np.arange(40) >= 20
+    answered = ~is_high | (np.arange(40) % 2 == 0)
+    error = np.where(answered, 1.0 + is_high, np.nan)
+    return pd.DataFrame(
+        {"answered": answered, "altitude_m": np.where(is_high, 800.0, 400.0), "altitude_error_m": error}
+    )
 
 
-def test_a_declared_section_shows_its_parts_in_order() -> None:
-    section = ALTITUDE(subject(rows()))
+def test_declared_section_shows_its_parts_in_order() -> None:
+    section = ALTITUDE(make_subject(make_rows_of_two_altitudes()))
     assert section is not None
     assert [len(block.plates) for block in section.blocks] == [0, 1, 0, 1, 0, 1, 0]
     assert section.blocks[-1].note == "Made up."
-    low, high = section.data["by_condition"]
+    low, is_high = section.data["by_condition"]
     assert (low["altitude_m"], low["answered"]["hits"], low["answered"]["n"]) == (400.0, 20, 20)
-    assert (high["altitude_m"], high["answered"]["hits"], high["answered"]["n"]) == (800.0, 10, 20)
+    assert (is_high["altitude_m"], is_high["answered"]["hits"], is_high["answered"]["n"]) == (800.0, 10, 20)
     assert section.data["rates"]["answered"]["share"] == pytest.approx(0.75)
-    # by hand: every error is 1 at the lower altitude and 2 at the higher one
+    # medians of the errors: 1 m at 400 m, 2 m at 800 m
     (effect,) = section.data["effects"]
     assert (effect["centres"], effect["medians"]) == ([400.0, 800.0], [1.0, 2.0])
     assert effect["rank_correlation"] == pytest.approx(1.0)
 
 
-def test_rows_without_the_columns_have_no_such_section() -> None:
-    assert ALTITUDE(subject(rows().drop(columns="altitude_error_m"))) is None
-    assert ALTITUDE(subject(rows().assign(altitude_error_m=np.nan))) is None
-    alone = SectionDeclaration("alone", "Alone", "Alone", [Distribution([Quantity("missing")], ("", ""), "")])
-    assert alone(subject(rows())) is None
+def test_missing_columns_give_no_section() -> None:
+    assert ALTITUDE(make_subject(make_rows_of_two_altitudes().drop(columns="altitude_error_m"))) is None
+    assert ALTITUDE(make_subject(make_rows_of_two_altitudes().assign(altitude_error_m=np.nan))) is None
+    declaration = SectionDeclaration("alone", "Alone", "Alone", [Distribution([Quantity("missing")], ("", ""), "")])
+    assert declaration(make_subject(make_rows_of_two_altitudes())) is None
 
 
-def test_a_cumulative_curve_counts_up_or_down() -> None:
+def test_cumulative_curve_rises_or_falls() -> None:
     values = {"ours": np.array([1.0, 2.0, 3.0, 4.0])}
     for falling, at_two in ((False, 0.5), (True, 0.5)):
         (line,) = cumulative_figure(values, ("", ""), falling=falling).axes[0].get_lines()
@@ -90,14 +92,14 @@ def test_a_cumulative_curve_counts_up_or_down() -> None:
         assert heights[4.0] == (0.0 if falling else 1.0)
 
 
-def test_bins_hold_every_case_with_a_value_once() -> None:
+def test_bins_contain_each_finite_value_once() -> None:
     values = np.append(np.arange(50.0), np.nan)
     bins = condition_bins(values)
-    assert [int(chosen.sum()) for chosen in bins] == [10] * 5
+    assert [int(is_in_bin.sum()) for is_in_bin in bins] == [10] * 5
     np.testing.assert_array_equal(np.sum(bins, axis=0), np.isfinite(values))
 
 
-def test_a_papers_numbers_stand_next_to_ours(tmp_path: Path) -> None:
+def test_values_of_the_paper_are_compared_with_results(tmp_path: Path) -> None:
     path = tmp_path / "paper.toml"
     path.write_text(
         """
@@ -111,19 +113,19 @@ def test_a_papers_numbers_stand_next_to_ours(tmp_path: Path) -> None:
         ]
         """
     )
-    section = PaperFacts(path)(subject(rows()))
+    section = PaperFacts(path)(make_subject(make_rows_of_two_altitudes()))
     assert section is not None
     assert section.data == {
         "altitude error (cm)": {"paper": "120", "ours": "100 (100 to 200)"},
         "answered": {"paper": "–", "ours": "30 of 40: 75.00 %"},
         "slope": {"paper": "3", "ours": "–"},
     }
-    assert PaperFacts(path)(subject(rows(), "another")) is None
+    assert PaperFacts(path)(make_subject(make_rows_of_two_altitudes(), "another")) is None
 
 
 @pytest.fixture
 def other_system(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Puts a system with this report into the registry."""
+    """Return a function that registers a system with the given report."""
 
     def install(report: str) -> None:
         system = System(name="altitude", title="Altitude", summary="", scenarios={}, report=report)
@@ -137,25 +139,29 @@ def other_system(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
 REPORT = Presentation(sections=(ALTITUDE,))
 
 
-def test_a_systems_sections_are_found_by_the_registry(
+def test_sections_of_a_registered_system_are_written(
     other_system: Callable[[str], None], make_run: Callable[..., Path]
 ) -> None:
     other_system(f"{__name__}:REPORT")
     try:
         assert ALTITUDE in section_makers()
-        page = write_report(make_run(rows().assign(case=np.arange(40), outcome="VALID"), requirements=[]))
+        page = write_report(
+            make_run(make_rows_of_two_altitudes().assign(case=np.arange(40), outcome="VALID"), requirements=[])
+        )
         assert '<section id="altitude"' in page.read_text(encoding="utf-8")
     finally:
         presentations.cache_clear()
 
 
 @pytest.mark.parametrize(
-    ("report", "wrong"), [("nowhere.at_all:REPORT", "nowhere"), (f"{__name__}:ERROR", "is a Quantity; allowed")]
+    ("report", "message"), [("nowhere.at_all:REPORT", "nowhere"), (f"{__name__}:ERROR", "is a Quantity; allowed")]
 )
-def test_a_report_that_is_none_is_named(other_system: Callable[[str], None], report: str, wrong: str) -> None:
+def test_invalid_report_of_a_system_gives_a_warning(
+    other_system: Callable[[str], None], report: str, message: str
+) -> None:
     other_system(report)
     try:
-        with pytest.warns(UserWarning, match=f"system 'altitude'.*{wrong}.*are left out"):
+        with pytest.warns(UserWarning, match=f"system 'altitude'.*{message}.*are left out"):
             assert presentations() == ()
     finally:
         presentations.cache_clear()

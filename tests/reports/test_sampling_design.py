@@ -1,4 +1,4 @@
-"""Only independent random draws carry a probability verdict; designs, grids and the nominal case say what they are."""
+"""Tests of verdicts for sampling designs: only independent random draws give probability statements."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rich.console import Console
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.evaluation import exit_code, overall
-from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, sampled
+from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design
 from marsyard.reports.tables import verdict_table
 from marsyard.reports.verdicts import Status, judge_campaign
 
@@ -24,7 +24,7 @@ Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
 
 GRID = {"a": {"distribution": "grid", "values": [1, 2]}, "b": {"distribution": "uniform", "low": 0, "high": 1}}
-DESIGNED = [
+DESIGNS = [
     ({"design": {"kind": "latin-hypercube"}}, "the design is Latin hypercube, and only independent random draws"),
     ({"design": {"kind": "sobol"}}, "the design is scrambled Sobol, and only"),
     ({"dispersions": GRID}, "the design is random draws at each point of a grid over a, and only"),
@@ -32,46 +32,48 @@ DESIGNED = [
 
 
 @pytest.mark.parametrize(
-    "odd", [{}, {"design": None}, {"design": 3}, {"design": {"kind": None, "nominal": "x"}}, {"dispersions": [1]}]
+    "settings", [{}, {"design": None}, {"design": 3}, {"design": {"kind": None, "nominal": "x"}}, {"dispersions": [1]}]
 )
-def test_what_states_no_design_is_drawn_independently(odd: dict[str, Any]) -> None:
-    assert sampled(odd) == INDEPENDENT
+def test_default_design_is_independent_draws(settings: dict[str, Any]) -> None:
+    assert read_sampling_design(settings) == INDEPENDENT
     assert INDEPENDENT.no_probability == ""
 
 
-@pytest.mark.parametrize(("configuration", "message"), DESIGNED)
-def test_designs_tell_rates_and_decide_nothing_at_a_confidence(
+@pytest.mark.parametrize(("configuration", "message"), DESIGNS)
+def test_designs_report_rates_without_confidence(
     make_rows: Rows, velocity: dict[str, Any], configuration: dict[str, Any], message: str
 ) -> None:
-    frame, how = make_rows(2000), sampled(configuration)
-    asked = [{**velocity, "probability": probability} for probability in (0.5, velocity["probability"])]
-    for verdict, plain in zip(judge_campaign(frame, asked, how), judge_campaign(frame, asked), strict=True):
+    frame, design = make_rows(2000), read_sampling_design(configuration)
+    requirements = [{**velocity, "probability": probability} for probability in (0.5, velocity["probability"])]
+    for verdict, reference in zip(
+        judge_campaign(frame, requirements, design), judge_campaign(frame, requirements), strict=True
+    ):
         assert verdict.status is Status.INSUFFICIENT
-        assert (verdict.n, verdict.failures, verdict.estimate) == (plain.n, plain.failures, plain.estimate)
+        assert (verdict.n, verdict.failures, verdict.estimate) == (reference.n, reference.failures, reference.estimate)
         assert math.isnan(verdict.lower)
         assert math.isnan(verdict.upper)
         assert verdict.further_cases is None
         assert message in verdict.note
-    verdicts = judge_campaign(frame, asked, how)
-    whole = overall(verdicts, frame, how)
-    assert (whole.word, message in whole.sentence) == ("INSUFFICIENT", True)
+    verdicts = judge_campaign(frame, requirements, design)
+    summary = overall(verdicts, frame, design)
+    assert (summary.word, message in summary.sentence) == ("INSUFFICIENT", True)
     assert exit_code(verdicts, crashed=False) == 3
     assert exit_code(verdicts, crashed=True) == 1
-    printed = io.StringIO()
-    Console(file=printed, width=200).print(verdict_table(verdicts))
-    assert printed.getvalue().count("No probability statement") == 1
-    assert "Clopper" not in printed.getvalue()
+    output = io.StringIO()
+    Console(file=output, width=200).print(verdict_table(verdicts))
+    assert output.getvalue().count("No probability statement") == 1
+    assert "Clopper" not in output.getvalue()
 
 
-@pytest.mark.parametrize(("configuration", "message"), DESIGNED)
-def test_the_rate_of_a_design_decides_where_the_estimate_is_to(
+@pytest.mark.parametrize(("configuration", "message"), DESIGNS)
+def test_rate_of_a_design_decides_by_estimate(
     make_rows: Rows, velocity: dict[str, Any], configuration: dict[str, Any], message: str
 ) -> None:
-    """Of 1,000 cases a rate of 0.98 meets 0.98 but not 0.99; no bounds are told, and the verdict says what it is."""
-    frame, how = make_rows(1000), sampled(configuration)
+    """A rate of 0.98 in 1000 cases meets 0.98 but not 0.99; the verdict has no bounds."""
+    frame, design = make_rows(1000), read_sampling_design(configuration)
     frame["answered"], frame["velocity_error_m_s"] = True, np.where(np.arange(1000) % 50, 0.1, 99.0)
-    asked = [{**velocity, "probability": least, "decide_by": "estimate"} for least in (0.98, 0.99)]
-    met, missed = judge_campaign(frame, asked, how)
+    requirements = [{**velocity, "probability": min_rate, "decide_by": "estimate"} for min_rate in (0.98, 0.99)]
+    met, missed = judge_campaign(frame, requirements, design)
     assert (met.status, missed.status) == (Status.MET_BY_RATE, Status.FAIL)
     assert (met.n, met.failures, met.estimate) == (1000, 20, 0.98)
     assert math.isnan(met.lower)
@@ -79,33 +81,33 @@ def test_the_rate_of_a_design_decides_where_the_estimate_is_to(
     assert message in met.note
     assert exit_code([met], crashed=False) == 3
     assert exit_code([met, missed], crashed=False) == 1
-    whole = overall([met, missed], frame, how)
-    assert whole.word == "FAIL"
-    assert whole.sentence.startswith("1 of 2 requirements met by the rate of these cases. No probability statement: ")
-    empty = judge_campaign(frame.assign(answered=False), [{**asked[0], "population": "valid"}], how)
+    summary = overall([met, missed], frame, design)
+    assert summary.word == "FAIL"
+    assert summary.sentence.startswith("1 of 2 requirements met by the rate of these cases. No probability statement: ")
+    empty = judge_campaign(frame.assign(answered=False), [{**requirements[0], "population": "valid"}], design)
     assert empty[0].status is Status.INSUFFICIENT
-    assert not overall(empty, frame, how).sentence.startswith("0 of")
+    assert not overall(empty, frame, design).sentence.startswith("0 of")
 
 
-def test_a_design_without_requirements_has_no_verdict(make_rows: Rows) -> None:
+def test_design_without_requirements_has_no_verdict(make_rows: Rows) -> None:
     frame = make_rows(5)
     assert overall([], frame, SamplingDesign("sobol")).status is None
     assert exit_code([], crashed=False) == 0
 
 
-def test_the_nominal_case_counts_in_no_verdict(make_rows: Rows, velocity: dict[str, Any]) -> None:
+def test_nominal_case_is_excluded_from_verdicts(make_rows: Rows, velocity: dict[str, Any]) -> None:
     frame = make_rows(231)
     frame["velocity_error_m_s"] = 1.0
     frame["answered"] = True
     frame["terrain"] = range(231)
     frame.loc[0, "velocity_error_m_s"] = 9.0
-    (without,) = judge_campaign(frame, [velocity], SamplingDesign(nominal=True))
-    assert (without.status, without.n, without.failures) == (Status.PASS, 230, 0)
-    (among,) = judge_campaign(frame, [velocity])
-    assert (among.n, among.failures) == (231, 1)
+    (without_nominal,) = judge_campaign(frame, [velocity], SamplingDesign(nominal=True))
+    assert (without_nominal.status, without_nominal.n, without_nominal.failures) == (Status.PASS, 230, 0)
+    (with_nominal,) = judge_campaign(frame, [velocity])
+    assert (with_nominal.n, with_nominal.failures) == (231, 1)
 
 
-def test_the_page_and_its_twin_say_how_cases_were_drawn(make_rows: Rows, make_run: MakeRun) -> None:
+def test_page_and_json_describe_the_design(make_rows: Rows, make_run: MakeRun) -> None:
     frame = make_rows(60)
     frame.loc[0, "velocity_error_m_s"] = 77.0
     run = make_run(frame)

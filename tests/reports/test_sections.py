@@ -1,4 +1,4 @@
-"""Sections that a report has where the rows hold their columns: numbers against truth that is known."""
+"""Tests of optional report sections against rows with known statistics."""
 
 from __future__ import annotations
 
@@ -23,85 +23,87 @@ MakeRun = Callable[..., Path]
 METRIC = "velocity_error_m_s"
 
 
-def subject(frame: pd.DataFrame, bound: float | None = 5.0) -> Subject:
+def make_subject(frame: pd.DataFrame, bound: float | None = 5.0) -> Subject:
     return Subject(StoredRun(Path("run"), frame, frame, {}, ()), METRIC, bound)
 
 
-def cells(section: Section | None, row: str) -> list[str]:
-    """The cells of the row of that name in the section's tables."""
+def find_cells(section: Section | None, row: str) -> list[str]:
+    """Cells of the row with this name in the section's tables."""
     assert section is not None
     grids = [block.grid for block in section.blocks if block.grid is not None]
-    (found,) = [list(cells) for grid in grids for cells in grid.rows if cells[0] == row]
-    return found
+    (cells,) = [list(cells) for grid in grids for cells in grid.rows if cells[0] == row]
+    return cells
 
 
-def errors(frame: pd.DataFrame, parts: np.ndarray) -> pd.DataFrame:
+def assign_errors(frame: pd.DataFrame, components: np.ndarray) -> pd.DataFrame:
     return frame.assign(
-        velocity_error_x_m_s=parts[:, 0], velocity_error_y_m_s=parts[:, 1], velocity_error_m_s=np.hypot(*parts.T)
+        velocity_error_x_m_s=components[:, 0],
+        velocity_error_y_m_s=components[:, 1],
+        velocity_error_m_s=np.hypot(*components.T),
     )
 
 
-def test_answers_are_reported_by_their_share_and_harm() -> None:
+def test_answer_rates_have_clopper_pearson_intervals() -> None:
     n = 200
-    answered, room = np.arange(n) >= 30, np.arange(n) >= 20
+    answered, has_overlap = np.arange(n) >= 30, np.arange(n) >= 20
     magnitude = np.where(np.arange(n) == 100, 7.0, 1.0)
     magnitude[~answered] = np.nan
     frame = pd.DataFrame(
-        {"answered": answered, "feasible_overlap": room, METRIC: magnitude, "terrain": np.arange(n) // 2}
+        {"answered": answered, "feasible_overlap": has_overlap, METRIC: magnitude, "terrain": np.arange(n) // 2}
     )
-    shares = list(answer_shares(subject(frame)).values())
-    assert [(one.hits, one.n) for one in shares] == [(170, 200), (170, 180), (20, 200), (1, 170)]
-    # One of 170: Clopper-Pearson at 90 %, both sides: BetaInv(0.05; 1, 170) and BetaInv(0.95; 2, 169).
-    assert (shares[3].lower, shares[3].upper) == pytest.approx((0.000302, 0.027594), abs=2e-5)
-    # Two cases a terrain fail together: the interval that allows for it must be wider.
-    assert shares[0].shared_lower is not None
-    assert shares[0].shared_lower < shares[0].lower
-    assert answer_shares(subject(frame.drop(columns="answered"))) == {}
+    rates = list(answer_shares(make_subject(frame)).values())
+    assert [(rate.hits, rate.n) for rate in rates] == [(170, 200), (170, 180), (20, 200), (1, 170)]
+    # 1 of 170, two-sided Clopper-Pearson at 90 %: BetaInv(0.05; 1, 170) and BetaInv(0.95; 2, 169)
+    assert (rates[3].lower, rates[3].upper) == pytest.approx((0.000302, 0.027594), abs=2e-5)
+    # the two cases of a terrain fail together, so the interval for shared terrains is wider
+    assert rates[0].shared_lower is not None
+    assert rates[0].shared_lower < rates[0].lower
+    assert answer_shares(make_subject(frame.drop(columns="answered"))) == {}
 
 
-def test_crashed_cases_of_unknown_room_count_as_failures_with_room(make_rows: Rows) -> None:
+def test_crashed_cases_of_unknown_overlap_count_as_failures(make_rows: Rows) -> None:
     frame = make_rows(50, answered=1.0, crashed=5)
-    room: list[bool | None] = [True] * 45 + [None] * 5
-    shares = answer_shares(subject(frame.assign(feasible_overlap=pd.Series(room, dtype=object))))
-    assert [(one.hits, one.n) for one in shares.values()] == [(45, 50), (45, 50), (0, 45), (0, 45)]
+    has_overlap: list[bool | None] = [True] * 45 + [None] * 5
+    rates = answer_shares(make_subject(frame.assign(feasible_overlap=pd.Series(has_overlap, dtype=object))))
+    assert [(rate.hits, rate.n) for rate in rates.values()] == [(45, 50), (45, 50), (0, 45), (0, 45)]
 
 
-def test_bins_hold_all_cases_once_and_know_their_errors() -> None:
+def test_condition_bins_have_correct_error_statistics() -> None:
     rng = np.random.default_rng(1)
     n = 1000
     rate = rng.uniform(0.0, 60.0, n)
     frame = pd.DataFrame({"answered": rng.random(n) < 0.9, "attitude_rate_max_deg_s": rate, "site": ["a", "b"] * 500})
-    # East: a bias that grows with the rate, without noise; north: noise of deviation 2.
-    frame = errors(frame, np.column_stack([0.1 * rate, rng.normal(0.0, 2.0, n)]))
+    # x: a bias proportional to the rate; y: noise with standard deviation 2
+    frame = assign_errors(frame, np.column_stack([0.1 * rate, rng.normal(0.0, 2.0, n)]))
     by_column = dict(cuts(frame))
     assert list(by_column) == ["attitude_rate_max_deg_s", "site"]
     for bins in by_column.values():
-        np.testing.assert_array_equal(np.sum([chosen for _, chosen in bins], axis=0), 1)
-    section = conditions_section(subject(frame))
+        np.testing.assert_array_equal(np.sum([is_in_bin for _, is_in_bin in bins], axis=0), 1)
+    section = conditions_section(make_subject(frame))
     assert section is not None
     bins = section.data["attitude_rate_max_deg_s"]
-    assert [one["answered"]["n"] for one in bins] == [200] * 5
-    assert [one["means"][0] for one in bins] == pytest.approx([0.6, 1.8, 3.0, 4.2, 5.4], abs=0.15)
-    assert [one["sds"][1] for one in bins] == pytest.approx([2.0] * 5, rel=0.2)
-    # Of 450 answers, the 450 of one site: a bound of the 99 % quantile; of 180 none.
+    assert [entry["answered"]["n"] for entry in bins] == [200] * 5
+    assert [entry["means"][0] for entry in bins] == pytest.approx([0.6, 1.8, 3.0, 4.2, 5.4], abs=0.15)
+    assert [entry["sds"][1] for entry in bins] == pytest.approx([2.0] * 5, rel=0.2)
+    # 450 answers give a bound of the 99 % quantile; 180 answers do not
     assert bins[0]["quantile_bound"] == np.inf
-    of_site = section.data["site"][0]
+    site_bin = section.data["site"][0]
     valid = frame[frame["answered"] & frame["site"].eq("a")]
-    assert np.quantile(valid[METRIC], 0.99) < of_site["quantile_bound"] <= of_site["largest"]
+    assert np.quantile(valid[METRIC], 0.99) < site_bin["quantile_bound"] <= site_bin["largest"]
 
 
-def test_conditions_that_do_not_vary_are_left_out(make_rows: Rows) -> None:
+def test_constant_conditions_are_omitted(make_rows: Rows) -> None:
     frame = make_rows(60).assign(sun_elevation_deg=40.0)
     assert "sun_elevation_deg" not in dict(cuts(frame))
-    assert conditions_section(subject(frame[["answered", METRIC]])) is None
-    # Few cases of many kinds say nothing, kind by kind.
+    assert conditions_section(make_subject(frame[["answered", METRIC]])) is None
+    # too few cases per category
     assert "site" not in dict(cuts(frame.assign(site=[f"site {k % 10}" for k in range(60)])))
 
 
-def test_spread_between_terrains_is_found() -> None:
+def test_variance_between_terrains_is_estimated() -> None:
     rng = np.random.default_rng(6)
     terrain = np.repeat(np.arange(200), 5)
-    # Deviations of 3 within and 2 between terrains: 4 of 13 of the variance. Standard error of the share: about 0.035.
+    # standard deviations 3 within and 2 between terrains: 4/13 of the variance, standard error about 0.035
     error = 2.0 * rng.standard_normal(200)[terrain] + 3.0 * rng.standard_normal(1000)
     frame = pd.DataFrame({"answered": True, "terrain": terrain, METRIC: error})
     spread = terrain_spread(frame, METRIC)
@@ -110,22 +112,22 @@ def test_spread_between_terrains_is_found() -> None:
     assert spread["within_sd"] == pytest.approx(3.0, rel=0.08)
     assert spread["between_sd"] == pytest.approx(2.0, rel=0.2)
     assert spread["p_value"] < 1e-6
-    alike = terrain_spread(frame.assign(**{METRIC: rng.standard_normal(1000)}), METRIC)
-    assert alike is not None
-    assert alike["p_value"] > 0.01
+    uncorrelated = terrain_spread(frame.assign(**{METRIC: rng.standard_normal(1000)}), METRIC)
+    assert uncorrelated is not None
+    assert uncorrelated["p_value"] > 0.01
     assert terrain_spread(frame.assign(terrain=np.arange(1000)), METRIC) is None
     assert terrain_spread(frame.drop(columns="terrain"), METRIC) is None
 
 
-def test_firing_section_wants_its_error(make_rows: Rows) -> None:
+def test_firing_section_needs_the_firing_error(make_rows: Rows) -> None:
     frame = make_rows(30)
-    assert FIRING(subject(frame)) is None
-    carried = FIRING(subject(frame.assign(firing_velocity_error_m_s=0.5, firing_after_s=18.0)))
-    assert cells(carried, "mean")[1] == "0.500"
-    assert cells(carried, "firing after (s)")[1:] == ["18.00"] * 3
+    assert FIRING(make_subject(frame)) is None
+    section = FIRING(make_subject(frame.assign(firing_velocity_error_m_s=0.5, firing_after_s=18.0)))
+    assert find_cells(section, "mean")[1] == "0.500"
+    assert find_cells(section, "firing after (s)")[1:] == ["18.00"] * 3
 
 
-def test_faults_by_size() -> None:
+def test_faults_are_grouped_by_kind_and_size() -> None:
     frame = pd.DataFrame(
         {
             "fault": ["none"] * 10 + ["dust"] * 20,
@@ -135,7 +137,7 @@ def test_faults_by_size() -> None:
             METRIC: [1.0] * 10 + [np.nan] * 6 + [9.0] * 3 + [1.0] * 11,
         }
     )
-    rows = FAULT_OUTCOMES.records(frame, subject(frame))
+    rows = FAULT_OUTCOMES.records(frame, make_subject(frame))
     assert [(row["fault"], row["n"], row["valid"], row["invalid"], row["wrong"]) for row in rows] == [
         ("none", 10, 10, 0, 0),
         ("dust", 10, 10, 0, 0),
@@ -143,13 +145,13 @@ def test_faults_by_size() -> None:
     ]
     assert [row["size"] for row in rows[1:]] == [0.1, 0.5]
     assert (rows[0]["commonest_refusal"], rows[2]["commonest_refusal"]) == ("", "NO_VALID_TRACK")
-    assert faults_section(subject(frame)) is not None
-    assert faults_section(subject(frame, None)) is None
-    assert faults_section(subject(frame.drop(columns="fault"))) is None
+    assert faults_section(make_subject(frame)) is not None
+    assert faults_section(make_subject(frame, None)) is None
+    assert faults_section(make_subject(frame.drop(columns="fault"))) is None
 
 
-def sensitive_rows(n: int, terrains: int, seed: int = 3) -> pd.DataFrame:
-    """Errors whose mean magnitude grows by 1 m/s from the 5 % to the 95 % quantile of the attitude rate alone."""
+def make_sensitive_rows(n: int, terrains: int, seed: int = 3) -> pd.DataFrame:
+    """Rows whose mean error grows by 1 m/s from the 5 % to the 95 % quantile of the attitude rate."""
     rng = np.random.default_rng(seed)
     rate = rng.uniform(0.0, 60.0, n)
     return pd.DataFrame(
@@ -164,56 +166,56 @@ def sensitive_rows(n: int, terrains: int, seed: int = 3) -> pd.DataFrame:
 
 
 def test_sensitivity_finds_the_driver_and_bounds_the_others() -> None:
-    found = {driver.column: driver for driver in rank_effects(subject(sensitive_rows(600, 600)), METRIC)}
-    effect, low, high = found["attitude_rate_max_deg_s"].effect
+    effects = {driver.column: driver for driver in rank_effects(make_subject(make_sensitive_rows(600, 600)), METRIC)}
+    effect, low, high = effects["attitude_rate_max_deg_s"].effect
     assert effect == pytest.approx(1.0, abs=0.08)
     assert low < 1.0 < high
-    # Of z + u, uniform with deviations 1.11 / sqrt(12) and 1 / sqrt(12), z has 0.743 of the whole deviation.
-    assert found["attitude_rate_max_deg_s"].coefficient[0] == pytest.approx(0.743, abs=0.05)
+    # sum of two uniform variables with standard deviations 1.11 / sqrt(12) and 1 / sqrt(12): 0.743 of the total
+    assert effects["attitude_rate_max_deg_s"].coefficient[0] == pytest.approx(0.743, abs=0.05)
     for name in ("descent_rate_m_s", "altitude_1_m"):
-        assert abs(found[name].effect[0]) < 0.1
-    correlation = found["attitude_rate_max_deg_s"].rank_correlation[0]
-    assert correlation == pytest.approx(sensitive_rows(600, 600).corr("spearman").loc[METRIC].iloc[2], abs=1e-9)
+        assert abs(effects[name].effect[0]) < 0.1
+    correlation = effects["attitude_rate_max_deg_s"].rank_correlation[0]
+    assert correlation == pytest.approx(make_sensitive_rows(600, 600).corr("spearman").loc[METRIC].iloc[2], abs=1e-9)
 
 
-def test_sensitivity_intervals_cover_the_truth_nine_times_of_ten() -> None:
-    covered = 0
+def test_sensitivity_intervals_have_90_percent_coverage() -> None:
+    n_covered = 0
     for seed in range(40):
         (driver,) = (
-            one
-            for one in rank_effects(subject(sensitive_rows(120, 120, seed)), METRIC)
-            if one.column == "attitude_rate_max_deg_s"
+            candidate
+            for candidate in rank_effects(make_subject(make_sensitive_rows(120, 120, seed)), METRIC)
+            if candidate.column == "attitude_rate_max_deg_s"
         )
-        # The truth at this sample's own quantiles: 1/54 m/s for each deg/s.
-        covered += driver.effect[1] <= (driver.high - driver.low) / 54.0 <= driver.effect[2]
-    # Binomial of 40 with 0.9: three standard deviations are 6.
-    assert covered >= 36 - 6
+        # true effect between this sample's quantiles: 1/54 m/s per deg/s
+        n_covered += driver.effect[1] <= (driver.high - driver.low) / 54.0 <= driver.effect[2]
+    # binomial(40, 0.9): three standard deviations are 6
+    assert n_covered >= 36 - 6
 
 
-def test_sensitivity_wants_all_drivers_and_enough_cases() -> None:
-    assert sensitivity_section(subject(sensitive_rows(49, 49))) is None
-    assert sensitivity_section(subject(sensitive_rows(60, 60).drop(columns="altitude_1_m"))) is None
-    assert sensitivity_section(subject(sensitive_rows(60, 60).assign(altitude_1_m=2000.0))) is None
-    section = sensitivity_section(subject(sensitive_rows(60, 6)))
-    assert len(cells(section, "descent rate (m/s)")) == 5
+def test_sensitivity_needs_all_drivers_and_enough_cases() -> None:
+    assert sensitivity_section(make_subject(make_sensitive_rows(49, 49))) is None
+    assert sensitivity_section(make_subject(make_sensitive_rows(60, 60).drop(columns="altitude_1_m"))) is None
+    assert sensitivity_section(make_subject(make_sensitive_rows(60, 60).assign(altitude_1_m=2000.0))) is None
+    section = sensitivity_section(make_subject(make_sensitive_rows(60, 6)))
+    assert len(find_cells(section, "descent rate (m/s)")) == 5
 
 
-def test_landing_tells_good_and_harm() -> None:
-    without = np.linspace(5.0, 25.0, 100)
-    with_it = without - 4.0
-    with_it[:10] = without[:10] + 2.0
-    with_it[10:30] = without[10:30]
-    frame = pd.DataFrame({"touchdown_speed_corrected_m_s": with_it, "touchdown_speed_uncorrected_m_s": without})
+def test_landing_section_reports_benefit_and_harm() -> None:
+    uncorrected = np.linspace(5.0, 25.0, 100)
+    corrected = uncorrected - 4.0
+    corrected[:10] = uncorrected[:10] + 2.0
+    corrected[10:30] = uncorrected[10:30]
+    frame = pd.DataFrame({"touchdown_speed_corrected_m_s": corrected, "touchdown_speed_uncorrected_m_s": uncorrected})
     frame.loc[100] = [np.nan, np.nan]  # crashed
-    section = LANDING(subject(frame))
+    section = LANDING(make_subject(frame))
     assert section is not None
     assert (section.data["landings"], section.data["helped"], section.data["harmed"]) == (100, 0.7, 0.1)
     assert (section.data["largest_gain_m_s"], section.data["largest_loss_m_s"]) == pytest.approx((4.0, 2.0))
-    assert cells(section, "faster than 20 m/s")[1:] == ["5.00 %", "25.00 %"]
-    assert LANDING(subject(frame[["touchdown_speed_corrected_m_s"]])) is None
+    assert find_cells(section, "faster than 20 m/s")[1:] == ["5.00 %", "25.00 %"]
+    assert LANDING(make_subject(frame[["touchdown_speed_corrected_m_s"]])) is None
 
 
-def test_page_and_twin_hold_every_section(make_rows: Rows, make_run: MakeRun) -> None:
+def test_page_and_json_contain_every_section(make_rows: Rows, make_run: MakeRun) -> None:
     rng = np.random.default_rng(4)
     frame = make_rows(120).assign(
         feasible_overlap=True,

@@ -1,3 +1,5 @@
+"""Tests of the tables of verdicts and statistics, of column names and of printed numbers."""
+
 from __future__ import annotations
 
 import io
@@ -11,23 +13,26 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from marsyard.reports.columns import (
+from marsyard.reports.rates import fraction_of
+from marsyard.reports.tables import outcome_counts, statistics_grid, verdict_table
+from marsyard.reports.verdicts import judge_campaign
+from marsyard.reports.wording import (
     axis_columns,
     category_column,
     driver_columns,
+    format_fraction,
+    interval,
     label,
     magnitude_label,
+    number,
+    percent,
     primary_metric,
 )
-from marsyard.reports.rates import share_of
-from marsyard.reports.tables import outcome_counts, statistics_grid, verdict_table
-from marsyard.reports.verdicts import judge_campaign
-from marsyard.reports.wording import interval, number, percent, stated
 
 Rows = Callable[..., pd.DataFrame]
 
 
-def _printed(table: Table, width: int) -> str:
+def _print_table(table: Table, width: int) -> str:
     console = Console(width=width, file=io.StringIO(), force_terminal=False, legacy_windows=False)
     console.print(table)
     text: str = console.file.getvalue()  # type: ignore[attr-defined]
@@ -35,27 +40,27 @@ def _printed(table: Table, width: int) -> str:
 
 
 @pytest.mark.parametrize("width", [80, 140])
-def test_verdict_table_holds_everything_at_any_width(make_rows: Rows, velocity: dict[str, Any], width: int) -> None:
+def test_verdict_table_is_complete_at_any_width(make_rows: Rows, velocity: dict[str, Any], width: int) -> None:
     verdicts = judge_campaign(make_rows(24), [velocity, {**velocity, "id": "DIMES-AVAIL", "population": "all"}])
-    text = _printed(verdict_table(verdicts), width)
+    text = _print_table(verdict_table(verdicts), width)
     assert max(len(line) for line in text.splitlines()) <= width
     for message in ("DIMES-VEL", "DIMES-AVAIL", "INSUFFICIENT", "4 terrains", "Clopper-Pearson"):
         assert message in " ".join(text.split())
-    # The column of numbers must not be cut.
+    # no number is truncated
     assert "…" not in text
 
 
-def test_verdict_table_without_requirements() -> None:
-    assert "none asked" in _printed(verdict_table([]), 80)
+def test_verdict_table_without_requirements_is_marked() -> None:
+    assert "none asked" in _print_table(verdict_table([]), 80)
 
 
-def test_texts_are_not_read_as_markup(make_rows: Rows, velocity: dict[str, Any]) -> None:
+def test_texts_are_not_interpreted_as_markup(make_rows: Rows, velocity: dict[str, Any]) -> None:
     verdicts = judge_campaign(make_rows(5), [{**velocity, "id": "[red]R[/red]", "metric": "[/]"}])
-    text = _printed(verdict_table(verdicts), 140)
+    text = _print_table(verdict_table(verdicts), 140)
     assert "[red]R[/red]" in text
 
 
-def test_outcomes_in_order(make_rows: Rows) -> None:
+def test_outcomes_are_ordered_and_counted(make_rows: Rows) -> None:
     frame = make_rows(200, crashed=2)
     counts = outcome_counts(frame)
     assert counts[0][0] == "VALID"
@@ -64,7 +69,7 @@ def test_outcomes_in_order(make_rows: Rows) -> None:
     assert outcome_counts(frame.drop(columns="outcome")) == []
 
 
-def test_table_of_statistics(make_rows: Rows) -> None:
+def test_statistics_table_has_errors_and_components(make_rows: Rows) -> None:
     grid = statistics_grid(make_rows(24), "velocity_error_m_s")
     assert list(grid.head) == ["", "velocity error (m/s)", "velocity error x (m/s)", "velocity error y (m/s)"]
     assert [row[0] for row in grid.rows if "interval" not in row[0] and "bounds" not in row[0]][:3] == [
@@ -74,32 +79,32 @@ def test_table_of_statistics(make_rows: Rows) -> None:
     ]
 
 
-def test_columns_in_words() -> None:
+def test_column_names_become_labels() -> None:
     assert label("attitude_rate_max_deg_s") == "attitude rate max (deg/s)"
     assert label("terrain") == "terrain"
     assert magnitude_label("velocity_error_m_s") == "|velocity error| (m/s)"
 
 
-def test_parts_of_an_error(make_rows: Rows) -> None:
+def test_components_of_an_error_are_found(make_rows: Rows) -> None:
     columns = list(make_rows(1).columns)
     assert axis_columns("velocity_error_m_s", columns) == ["velocity_error_x_m_s", "velocity_error_y_m_s"]
     assert axis_columns("score", columns) == []
 
 
-def test_drivers_leave_out_bookkeeping_and_the_error_itself(make_rows: Rows) -> None:
+def test_drivers_exclude_error_and_run_columns(make_rows: Rows) -> None:
     drivers = driver_columns(make_rows(50), "velocity_error_m_s", max_columns=20)
     assert drivers[:3] == ["off_nadir_max_deg", "attitude_rate_max_deg_s", "altitude_1_m"]
     assert not {"case", "wall_time_s", "velocity_error_x_m_s", "terrain", "answered"} & set(drivers)
 
 
-def test_category(make_rows: Rows) -> None:
+def test_category_column_is_site_or_terrain(make_rows: Rows) -> None:
     frame = make_rows(100)
     assert category_column(frame) == "terrain"
     assert category_column(frame.assign(site=["Gusev", "Meridiani"] * 50)) == "site"
     assert category_column(make_rows(100, terrains=50)) is None
 
 
-def test_primary_metric(make_rows: Rows, velocity: dict[str, Any]) -> None:
+def test_primary_metric_is_an_existing_column(make_rows: Rows, velocity: dict[str, Any]) -> None:
     frame = make_rows(3)
     assert primary_metric(frame, [{**velocity, "metric": "off_nadir_max_deg"}]) == "off_nadir_max_deg"
     assert primary_metric(frame, [{**velocity, "metric": "nonesuch"}]) == "velocity_error_m_s"
@@ -122,14 +127,14 @@ def test_rates_are_never_rounded_to_certainty(fraction: float, text: str) -> Non
     assert percent(fraction) == text
 
 
-def test_numbers() -> None:
+def test_numbers_and_intervals_are_printed_with_four_digits() -> None:
     assert [number(value) for value in (0.0, -1.5, 12.345, 123.45)] == ["0.000", "−1.500", "12.35", "123.5"]  # noqa: RUF100
-    assert (number(math.nan), number(math.inf), stated(0.9973)) == ("–", "∞", "99.73 %")
+    assert (number(math.nan), number(math.inf), format_fraction(0.9973)) == ("–", "∞", "99.73 %")
     assert (interval(1.0, math.inf), interval(-math.inf, math.inf)) == ("≥ 1.000", "–")
 
 
-def test_no_cases_have_no_rate_and_the_widest_interval() -> None:
-    empty = share_of(np.zeros(0, dtype=np.bool_), pd.DataFrame())
+def test_rate_without_cases_has_the_interval_0_to_1() -> None:
+    empty = fraction_of(np.zeros(0, dtype=np.bool_), pd.DataFrame())
     assert (empty.hits, empty.n) == (0, 0)
     assert math.isnan(empty.share)
     assert empty.sound == (0.0, 1.0)

@@ -1,4 +1,4 @@
-"""`report.json` keeps its layout."""
+"""Tests of the layout of `report.json`."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
 
 
-def test_the_schema_next_to_the_layout_is_its_own() -> None:
-    # To renew it: json.dump(Twin.model_json_schema(), file, indent=1), with a newline behind.
-    kept = SCHEMA_FILE.read_text()
-    assert json.loads(kept) == Twin.model_json_schema()
+def test_stored_schema_equals_the_layout() -> None:
+    # update: json.dump(Twin.model_json_schema(), file, indent=1), followed by a newline
+    stored = SCHEMA_FILE.read_text()
+    assert json.loads(stored) == Twin.model_json_schema()
     assert get_args(Twin.model_fields["report_schema"].annotation) == (SCHEMA,)
 
 
@@ -34,14 +34,14 @@ def test_the_schema_next_to_the_layout_is_its_own() -> None:
         {"cases": 1},
     ],
 )
-def test_reports_are_laid_out_so(make_rows: Rows, make_run: MakeRun, options: dict[str, float]) -> None:
+def test_reports_follow_the_layout(make_rows: Rows, make_run: MakeRun, options: dict[str, float]) -> None:
     directory = make_run(make_rows(**options)[["case", "outcome", "answered", "terrain", "velocity_error_m_s"]])
     write_report(directory)
     Twin.model_validate_json((directory / "report.json").read_text(), strict=True)
 
 
-def test_a_report_without_rows_or_requirements_too(make_rows: Rows, make_run: MakeRun) -> None:
+def test_empty_report_follows_the_layout(make_rows: Rows, make_run: MakeRun) -> None:
     directory = make_run(make_rows(24).head(0), [])
     write_report(directory)
-    found = Twin.model_validate_json((directory / "report.json").read_text(), strict=True)
-    assert (found.verdict, found.verdicts) == ("NO REQUIREMENT", [])
+    report = Twin.model_validate_json((directory / "report.json").read_text(), strict=True)
+    assert (report.verdict, report.verdicts) == ("NO REQUIREMENT", [])

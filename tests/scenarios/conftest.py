@@ -1,4 +1,4 @@
-"""Every row that a scenario gives in these tests has the columns that `scenarios/columns.toml` states."""
+"""Checks that each row of a scenario has only the columns of `scenarios/columns.toml`."""
 
 from __future__ import annotations
 
@@ -7,44 +7,44 @@ from typing import Any
 
 import pytest
 
-from marsyard.scenarios.import_path import import_object
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.systems import RowColumns, row_columns, scenario_paths
+from marsyard.scenarios.user_files import import_object
 
 
-def _unstated(row: Any, stated: RowColumns, own: tuple[str, ...]) -> list[str]:
-    """Columns of numbers and truth values that are stated nowhere; those of further algorithms are the judged one's."""
-    found = []
+def _list_undeclared_columns(row: Any, declared: RowColumns, custom_prefixes: tuple[str, ...]) -> list[str]:
+    """Return undeclared columns of numbers and truth values; prefixes of other algorithms are removed first."""
+    undeclared_names = []
     for name, value in row.items():
         plain = name.rpartition(".")[2] if not name.startswith("footprints_") else name
         is_flag = isinstance(value, bool)
-        known = stated.has_flag(plain) or plain == "answered" if is_flag else stated.has_number(plain)
-        if not isinstance(value, str) and not known and not plain.startswith(own):
-            found.append(name)
-    return found
+        known = declared.has_flag(plain) or plain == "answered" if is_flag else declared.has_number(plain)
+        if not isinstance(value, str) and not known and not plain.startswith(custom_prefixes):
+            undeclared_names.append(name)
+    return undeclared_names
 
 
-def _checked(run: Callable[..., CaseResult], stated: RowColumns) -> Callable[..., CaseResult]:
-    def checked(self: Any, parameters: Any, streams: Any) -> CaseResult:
+def _check_columns_of(run: Callable[..., CaseResult], declared: RowColumns) -> Callable[..., CaseResult]:
+    def run_and_check(self: Any, parameters: Any, streams: Any) -> CaseResult:
         result = run(self, parameters, streams)
-        named = [one.name for one in getattr(parameters, stated.named_flags, ())] if stated.named_flags else []
-        # columns of a user's own scores begin with the function's name
+        named = [flag.name for flag in getattr(parameters, declared.named_flags, ())] if declared.named_flags else []
+        # Columns of custom scores start with the function name.
         holder = parameters if getattr(parameters, "scores", ()) else getattr(parameters, "drive", None)
         specs: tuple[str, ...] = getattr(holder, "scores", ())
-        own = (*named, *(f"{spec.rpartition(':')[2]}_" for spec in specs))
-        unstated = _unstated(result.row, stated, own)
-        assert not unstated, f"columns that scenarios/columns.toml does not state for {self.name}: {unstated}"
+        custom_prefixes = (*named, *(f"{spec.rpartition(':')[2]}_" for spec in specs))
+        undeclared = _list_undeclared_columns(result.row, declared, custom_prefixes)
+        assert not undeclared, f"columns that scenarios/columns.toml does not state for {self.name}: {undeclared}"
         return result
 
-    return checked
+    return run_and_check
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _rows_have_the_columns_that_are_stated() -> Iterator[None]:
+def _check_row_columns() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name, path in scenario_paths().items():
-            kind = import_object(path)
-            stated = row_columns(name)
-            assert stated is not None
-            patch.setattr(kind, "run", _checked(kind.run, stated))
+            scenario_class = import_object(path)
+            declared = row_columns(name)
+            assert declared is not None
+            patch.setattr(scenario_class, "run", _check_columns_of(scenario_class.run, declared))
         yield

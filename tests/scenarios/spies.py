@@ -1,4 +1,4 @@
-"""Algorithms that keep what they are given, and scores that keep what is true of the same case."""
+"""Algorithms that record their inputs, and scores that record the truth of the same case."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from marsyard.sim.measurements import (
     TargetDesignation,
 )
 
-#: What algorithms were given, and the scored cases, in the order in which they came.
+#: Inputs of algorithms and scored cases, in call order.
 GIVEN: list[Any] = []
 TRUE: list[Any] = []
 
 
 class VelocitySpy:
-    """A velocity estimator without an answer."""
+    """A velocity estimator without a valid answer."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """See `VelocityEstimator`."""
@@ -50,7 +50,7 @@ class SiteSpy:
 
 
 class TrackerSpy:
-    """The paper's tracker; keeps (pose, mast) of each aim, and the measurements of each update."""
+    """The paper's tracker; records (pose, mast) of each aim and the measurements of each update."""
 
     def __init__(self) -> None:
         self.inner = VisualTargetTracker()
@@ -80,7 +80,7 @@ class TrackerSpy:
 
 
 def keep(case: ScoredVelocity | ScoredSite) -> dict[str, float]:
-    """A score that keeps the case."""
+    """A score that records the case."""
     TRUE.append(case)
     return {"kept": 1.0}
 
@@ -92,7 +92,7 @@ def _blacken(picture: Any, how: str) -> None:
 
 
 class WritingVelocity(VelocitySpy):
-    """Writes to its pictures."""
+    """Writes to its images."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """See `VelocityEstimator`."""
@@ -101,7 +101,7 @@ class WritingVelocity(VelocitySpy):
 
 
 class SpoilingVelocity(VelocitySpy):
-    """Makes its pictures writable first."""
+    """Makes its images writable before it writes."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """See `VelocityEstimator`."""
@@ -110,7 +110,7 @@ class SpoilingVelocity(VelocitySpy):
 
 
 class SpoilingSite(SiteSpy):
-    """The same for sites."""
+    """Makes site images writable before it writes."""
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
         """See `SiteEstimator`."""
@@ -119,7 +119,7 @@ class SpoilingSite(SiteSpy):
 
 
 class SpoilingTracker(TrackerSpy):
-    """The same for targets."""
+    """Makes tracker images writable before it writes."""
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """See `TargetTracker`."""
@@ -139,7 +139,7 @@ class RaisingTracker(TrackerSpy):
 
 
 class Leaving:
-    """An algorithm of any task that ends its process, as far as a test can bear that."""
+    """An algorithm that ends its process for any task, simulated within a test."""
 
     def _leave(self, *_: object) -> None:
         raise SystemExit("left")

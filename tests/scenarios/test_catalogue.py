@@ -1,4 +1,4 @@
-"""Requirements of the catalogue's campaigns ask for columns that their cases have."""
+"""Tests that requirements of catalogue campaigns use existing columns."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.campaigns.definition.catalogue import catalogue
-from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.loading import catalogue, load_campaign
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.campaigns.store.rows import Row
 from marsyard.scenarios.rover.scenario import SharedDriveParameters, SharedDriveScenario
@@ -15,10 +14,10 @@ from marsyard.scenarios.systems import systems
 from marsyard.sim.streams import Streams
 
 
-def _row_of(scenario: str) -> Row:
-    """The row of a small case."""
+def _run_small_case(scenario: str) -> Row:
+    """Return the row of a small case."""
     if scenario == "rover-drive":
-        result = SharedDriveScenario().run(_short_drive(), Streams(1, "catalogue", 0))
+        result = SharedDriveScenario().run(_make_short_drive(), Streams(1, "catalogue", 0))
     else:
         small = {
             load_campaign(name, settings).configuration.scenario: (name, settings)
@@ -30,9 +29,11 @@ def _row_of(scenario: str) -> Row:
     return {"case": 0, "outcome": result.outcome, "answered": result.answered, **result.row}
 
 
-def _short_drive() -> SharedDriveParameters:
-    """A drive of one step, with the bands of all campaigns."""
-    names = {band["name"] for campaign in _campaigns("rover-drive") for band in _stated(campaign)["bands"]}
+def _make_short_drive() -> SharedDriveParameters:
+    """Return a drive of one step with the bands of all campaigns."""
+    names = {
+        band["name"] for campaign in _list_campaigns("rover-drive") for band in _read_requirements(campaign)["bands"]
+    }
     return SharedDriveParameters.model_validate(
         {
             "drive": {
@@ -47,16 +48,16 @@ def _short_drive() -> SharedDriveParameters:
     )
 
 
-def _stated(campaign: str) -> dict[str, list[dict[str, str]]]:
+def _read_requirements(campaign: str) -> dict[str, list[dict[str, str]]]:
     return dict(load_campaign(campaign).configuration.parameters)
 
 
-def _campaigns(scenario: str) -> list[str]:
+def _list_campaigns(scenario: str) -> list[str]:
     return [name for name in catalogue() if load_campaign(name).configuration.scenario == scenario]
 
 
 @pytest.mark.parametrize("scenario", ["descent", "fieldtest", "rover", "rover-drive", "landing"])
-def test_requirements_ask_for_columns_that_cases_have(scenario: str) -> None:
-    row = _row_of(scenario)
-    for name in _campaigns(scenario):
+def test_requirements_use_existing_columns(scenario: str) -> None:
+    row = _run_small_case(scenario)
+    for name in _list_campaigns(scenario):
         check_metrics(load_campaign(name).configuration, row, Path(name))

@@ -1,4 +1,4 @@
-"""The suite passes what ships, and names what bad algorithms do."""
+"""Tests of the conformance suite for algorithms: shipped algorithms pass, and defects are reported."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.campaigns.running.conformance import examine
+from marsyard.campaigns.running.replay import examine
 from marsyard.scenarios.conformance import Finding, Subject, check_names, determine_task, inputs, run_check, trackers
 from marsyard.scenarios.conformance.inputs import TexturedPlane
 from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY
@@ -25,7 +25,7 @@ def seen(m):
 """
 
 
-def findings(spec: str, *only: str) -> dict[str, Finding]:
+def run_suite(spec: str, *only: str) -> dict[str, Finding]:
     subject = Subject(spec, determine_task(spec), 60.0)
     names = [name for name, _ in check_names(subject)]
     return {name: run_check(subject, names.index(name)) for name in (only or names)}
@@ -41,13 +41,13 @@ def findings(spec: str, *only: str) -> dict[str, Finding]:
         "velocity_stream:ChainedShifts",
     ],
 )
-def test_what_ships_conforms(spec: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shipped_algorithms_conform(spec: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "docs" / "examples"))
-    assert {name: one.problem for name, one in findings(spec).items() if not one.passed} == {}
+    assert {name: one.problem for name, one in run_suite(spec).items() if not one.passed} == {}
 
 
-def bad(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
-    """A module with a class `Bad`, in the current folder; its name is its own, as modules are kept."""
+def write_bad_module(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
+    """Write a module with a class `Bad` and a unique name to the current folder, as Python caches modules."""
     name = f"bad_{abs(hash(body))}"
     (folder / f"{name}.py").write_text(HEAD + textwrap.dedent(body))
     monkeypatch.chdir(folder)
@@ -55,7 +55,7 @@ def bad(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
     return f"{name}:Bad"
 
 
-def estimator(lines: str) -> str:
+def format_estimator(lines: str) -> str:
     return "class Bad:\n    def estimate(self, m):\n" + textwrap.indent(textwrap.dedent(lines), " " * 8)
 
 
@@ -86,10 +86,12 @@ def estimator(lines: str) -> str:
         ("truth", "from marsyard.sim import sensor\nreturn NOTHING", ": marsyard.sim.sensor"),
     ],
 )
-def test_bad_estimators(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, check: str, lines: str, problem: str) -> None:
-    found = findings(bad(tmp_path, monkeypatch, estimator(lines)), check)[check]
-    assert problem in found.problem
-    assert found.next_step
+def test_estimator_defects_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, check: str, lines: str, problem: str
+) -> None:
+    result = run_suite(write_bad_module(tmp_path, monkeypatch, format_estimator(lines)), check)[check]
+    assert problem in result.problem
+    assert result.next_step
 
 
 STREAM = """
@@ -137,14 +139,14 @@ MOVING = "return VelocityEstimate(Outcome.VALID, np.ones(2)) if len(self.kept) >
         ("number", "return None", "first, second, third = self.kept[:3]\n        return NOTHING", "not enough values"),
     ],
 )
-def test_bad_streams(
+def test_stream_defects_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, check: str, picture: str, finish: str, problem: str
 ) -> None:
     body = STREAM.format(picture=picture, finish=finish)
-    assert problem in findings(bad(tmp_path, monkeypatch, body), check)[check].problem
+    assert problem in run_suite(write_bad_module(tmp_path, monkeypatch, body), check)[check].problem
 
 
-def test_a_stream_that_keeps_a_descent_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_state_kept_between_descents_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     body = """
     class Bad:
         seen = 0.0
@@ -152,13 +154,13 @@ def test_a_stream_that_keeps_a_descent_is_found(tmp_path: Path, monkeypatch: pyt
         def picture(self, frame): self.seen += frame.image.counts.mean()
         def finish(self): return VelocityEstimate(Outcome.VALID, np.full(2, self.seen), span_s=(100.0, 100.0))
     """
-    found = findings(bad(tmp_path, monkeypatch, body), "deterministic", "start", "time")
-    assert found["deterministic"].problem == "its answer depends on earlier cases"
-    assert found["start"].problem == "started again after two pictures, it answers differently"
-    assert found["time"].passed
+    result = run_suite(write_bad_module(tmp_path, monkeypatch, body), "deterministic", "start", "time")
+    assert result["deterministic"].problem == "its answer depends on earlier cases"
+    assert result["start"].problem == "started again after two pictures, it answers differently"
+    assert result["time"].passed
 
 
-def test_state_of_the_estimator_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_estimator_state_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     body = """
     class Bad:
         def __init__(self):
@@ -167,10 +169,10 @@ def test_state_of_the_estimator_is_found(tmp_path: Path, monkeypatch: pytest.Mon
             answer, self.before = self.before, self.before + m.images[0].counts.mean()
             return VelocityEstimate(Outcome.VALID, answer)
     """
-    found = findings(bad(tmp_path, monkeypatch, body), "deterministic", "inputs", "time")
-    assert found["deterministic"].problem == "its answer depends on earlier cases"
-    assert found["inputs"].passed
-    assert found["time"].passed
+    result = run_suite(write_bad_module(tmp_path, monkeypatch, body), "deterministic", "inputs", "time")
+    assert result["deterministic"].problem == "its answer depends on earlier cases"
+    assert result["inputs"].passed
+    assert result["time"].passed
 
 
 @pytest.mark.parametrize(
@@ -192,10 +194,12 @@ def test_state_of_the_estimator_is_found(tmp_path: Path, monkeypatch: pytest.Mon
         ),
     ],
 )
-def test_bad_trackers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, check: str, changed: str, problem: str) -> None:
-    # the tracker that ships is final to type checkers alone
-    spec = bad(tmp_path, monkeypatch, f"class Bad(VisualTargetTracker):\n    {changed}\n")
-    assert problem in findings(spec, check)[check].problem
+def test_tracker_defects_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, check: str, changed: str, problem: str
+) -> None:
+    # Only type checkers treat the shipped tracker as final.
+    spec = write_bad_module(tmp_path, monkeypatch, f"class Bad(VisualTargetTracker):\n    {changed}\n")
+    assert problem in run_suite(spec, check)[check].problem
 
 
 @pytest.mark.parametrize(
@@ -206,19 +210,19 @@ def test_bad_trackers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, check: st
         ("signal.signal(signal.SIGTERM, signal.SIG_IGN)", "it changed the state of its process: "),
     ],
 )
-def test_state_left_behind_is_found_by_the_process(
+def test_changed_process_state_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: str, problem: str
 ) -> None:
-    """The suite has no check of its own for this: each check runs in a process that is compared after it."""
+    """Each check runs in a process whose state is compared afterwards."""
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    spec = bad(tmp_path, monkeypatch, estimator(f"{lines}\nreturn NOTHING"))
+    spec = write_bad_module(tmp_path, monkeypatch, format_estimator(f"{lines}\nreturn NOTHING"))
     first = next(iter(examine(Subject(spec, "velocity", 60.0))))
     assert (first.check, first.passed) == ("answer", False)
     assert problem in first.problem
     assert first.next_step
 
 
-def test_the_task_is_recognised_by_name_and_methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_task_is_inferred_from_name_and_methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert [determine_task(name) for name in ("homography", "semi-global", "pure-ncc", "exec:cat")] == [
         "velocity",
         "landing",
@@ -227,34 +231,34 @@ def test_the_task_is_recognised_by_name_and_methods(tmp_path: Path, monkeypatch:
     ]
     assert determine_task("marsyard.algorithms.hda:HdaEstimator") == "landing"
     assert determine_task("marsyard.algorithms.vtt:VisualTargetTracker") == "tracking"
-    assert determine_task(bad(tmp_path, monkeypatch, estimator("return NOTHING"))) == "velocity"
+    assert determine_task(write_bad_module(tmp_path, monkeypatch, format_estimator("return NOTHING"))) == "velocity"
     with pytest.raises(ValueError, match="unknown algorithm 'vt'"):
         determine_task("vt")
     with pytest.raises(ValueError, match="no algorithm at 'nowhere:Nothing'"):
         determine_task("nowhere:Nothing")
 
 
-def test_a_plane_is_seen_where_it_lies() -> None:
-    """A step of one sample along the plane moves the picture by focal length / distance pixels."""
+def test_rendered_plane_has_correct_parallax() -> None:
+    """A step of one sample along the plane moves the image by focal length / distance pixels."""
     down, right = np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0])
     camera = Cahv.from_axes((500.0, 500.0), (64, 48), axis=down, right=right, centre=np.array([0.0, 0.0, 10.0]))
     plane = TexturedPlane(np.zeros(3), np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), 0.02)
     before = plane.radiance(camera)
-    # 0.02 m at 10 m are 1 px: the picture is the same one, a column on
+    # 0.02 m at 10 m is 1 px: the image shifts by one column.
     moved = TexturedPlane(np.array([0.02, 0.0, 0.0]), plane.along, plane.step_m)
     assert np.allclose(moved.radiance(camera)[:, 1:], before[:, :-1], atol=1e-6)
     away = TexturedPlane(np.array([0.0, 0.0, 20.0]), plane.along, plane.step_m)
     assert np.ptp(away.radiance(camera)) == 0.0
 
 
-def test_inputs_are_what_instruments_deliver() -> None:
+def test_inputs_are_physically_consistent() -> None:
     descent, landing = inputs.descent(), inputs.landing()
     many = inputs.descent(5)
     assert (len(many.images), many.images[4].time_s, len(many.interval_velocities_m_s)) == (5, 107.5, 4)
     assert descent.images[0].counts.shape == (256, 1024)
     assert 200 < descent.images[0].counts.mean() < 4000
-    # the laser's ray ends on the ground
+    # The laser ray ends on the ground.
     assert abs(landing.apriori_site_world[2]) < 1e-9
-    blank = inputs.blanked(descent, inputs.BLANKS["saturated"])
+    blank = inputs.blank_pictures(descent, inputs.BLANKS["saturated"])
     assert {int(one.counts.min()) for one in blank.images} == {4095}
     assert trackers.take_pictures(trackers.aim_ahead(), trackers.pose(0.0)).left.counts.std() > 100

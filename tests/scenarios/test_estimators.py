@@ -1,4 +1,4 @@
-"""Algorithms by name, by path and by entry point; several of them in one case."""
+"""Tests of algorithms by name, path and entry point, and of several algorithms in one case."""
 
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -22,7 +22,7 @@ from marsyard.scenarios.velocity import consistency_row
 LIMITS = ExecutableLimits()
 
 
-def test_an_algorithm_in_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_algorithm_in_the_current_folder_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "lying_here.py").write_text("class Mine:\n    def estimate(self, measurements): ...\n")
     monkeypatch.chdir(tmp_path)
     VELOCITY.check("lying_here:Mine")
@@ -31,14 +31,14 @@ def test_an_algorithm_in_the_current_folder(tmp_path: Path, monkeypatch: pytest.
         TRACKING.check("lying_here:Mine")
 
 
-def test_a_module_that_raises_is_reported_and_not_a_traceback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_module_that_raises_gives_a_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "broken_here.py").write_text("1 / 0\n")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match="no algorithm at 'broken_here:Mine': ZeroDivisionError"):
         VELOCITY.check("broken_here:Mine")
 
 
-def test_an_entry_point_is_named_like_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_entry_point_is_named_like_builtin_algorithms(monkeypatch: pytest.MonkeyPatch) -> None:
     group = estimators.GROUP
     points = [
         EntryPoint(name, "marsyard.algorithms.baselines:HomographyEstimator", group) for name in ("theirs", "dimes")
@@ -50,7 +50,7 @@ def test_an_entry_point_is_named_like_ours(monkeypatch: pytest.MonkeyPatch) -> N
         VELOCITY.check("their")
 
 
-def test_programs_estimate_and_track() -> None:
+def test_programs_are_accepted_as_algorithms() -> None:
     made = VELOCITY.make("exec:cat --number", DimesOptions(), LIMITS)
     assert isinstance(made, ExecutableVelocityEstimator)
     assert made.command.words == ("cat", "--number")
@@ -59,20 +59,20 @@ def test_programs_estimate_and_track() -> None:
     assert isinstance(TRACKING.make("serve:cat", VttOptions(), LIMITS), ExecutableTargetTracker)
 
 
-def test_labels_tell_algorithms_apart_and_are_names_of_columns() -> None:
-    given = labels(["dimes", "phase-correlation", "a.b:Mine", "exec:./x/mine-1 --fast", "c:Mine", "exec:./7"])
-    assert given == ("dimes", "phase_correlation", "Mine", "mine_1", "Mine_2", "a_7")
+def test_labels_are_unique_column_names() -> None:
+    inputs = labels(["dimes", "phase-correlation", "a.b:Mine", "exec:./x/mine-1 --fast", "c:Mine", "exec:./7"])
+    assert inputs == ("dimes", "phase_correlation", "Mine", "mine_1", "Mine_2", "a_7")
 
 
-def test_the_same_algorithm_twice_is_refused() -> None:
+def test_duplicate_algorithm_is_rejected() -> None:
     with pytest.raises(ValueError, match="'dimes' is named twice"):
         check_algorithms(VELOCITY, ["dimes", "dimes"])
     with pytest.raises(ValueError, match="'dimes' is named twice"):
         DescentScenarioParameters.model_validate({"compared": ["dimes"]})
 
 
-def test_what_one_algorithm_does_wrong_does_not_touch_the_others() -> None:
-    def judge(spec: str) -> CaseResult:
+def test_failing_algorithm_does_not_affect_others() -> None:
+    def run_with(spec: str) -> CaseResult:
         def ask() -> float:
             return 1.0 / float(spec)
 
@@ -81,21 +81,21 @@ def test_what_one_algorithm_does_wrong_does_not_touch_the_others() -> None:
             tried.outcome(lambda _: "VALID"), tried.answer is not None, {"error_m": 0.5}, failure=tried.failure
         )
 
-    case = case_result(["2", "0"], judge, {"altitude_m": 7.0})
+    case = case_result(["2", "0"], run_with, {"altitude_m": 7.0})
     assert (case.outcome, case.answered, case.failure) == ("VALID", True, None)
     assert case.row["algorithm"] == "a_2"
     assert case.row["a_0.outcome"] == "CRASHED"
     assert case.row["a_0.answered"] is False
     assert case.row["a_0.error"] == "ZeroDivisionError: float division by zero"
     assert "a_0.altitude_m" not in case.row
-    other = case_result(["0", "2"], judge, {"altitude_m": 7.0})
+    other = case_result(["0", "2"], run_with, {"altitude_m": 7.0})
     assert other.failure is not None
     assert other.outcome == other.failure.outcome == "CRASHED"
     assert other.row["altitude_m"] == 7.0
     assert other.row["a_2.outcome"] == "VALID"
 
 
-def test_an_error_in_units_of_its_covariance() -> None:
+def test_normalised_error_uses_the_covariance() -> None:
     # sd 3 and 2, correlation 0.5, error (3, 2): (1 + 1 - 2 * 0.5) / (1 - 0.25) = 4 / 3
     covariance = np.array([[9.0, 3.0], [3.0, 4.0]])
     estimate = VelocityEstimate(VelocityOutcome.VALID, np.array([3.0, 2.0]), covariance_m2_s2=covariance)
@@ -109,7 +109,7 @@ def test_an_error_in_units_of_its_covariance() -> None:
 STREAM = "class Mine:\n    def start(self): ...\n    def picture(self, frame): ...\n"
 
 
-def test_streams_are_reported_from_estimators_of_three(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_streams_are_distinguished_from_three_image_estimators(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     finish = "    def finish(self): ...\n"
     (tmp_path / "streams_here.py").write_text(f"{STREAM}{finish}\ndef made():\n    return Mine()\n")
     (tmp_path / "streams_half.py").write_text(STREAM)
@@ -121,7 +121,7 @@ def test_streams_are_reported_from_estimators_of_three(tmp_path: Path, monkeypat
         assert isinstance(VELOCITY.make(spec, DimesOptions(), LIMITS), StreamedEstimator)
     kinds = {spec: VELOCITY.takes_stream(spec) for spec in ("theirs", "serve-stream:cat", "exec:cat", "dimes")}
     assert kinds == {"theirs": True, "serve-stream:cat": True, "exec:cat": False, "dimes": False}
-    # only what a function returns tells
+    # Only the return type of a function distinguishes them.
     assert VELOCITY.takes_stream("streams_here:made") is None
     with pytest.raises(ValueError, match="is no velocity estimator: it has no finish"):
         VELOCITY.check("streams_half:Mine")

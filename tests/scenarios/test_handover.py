@@ -1,6 +1,4 @@
-"""What one algorithm does to its inputs, or to its process, is its own: no other notices, and the case's row keeps what
-does not depend on it.
-"""
+"""Tests that an algorithm cannot affect the inputs, process or row of other algorithms."""
 
 from __future__ import annotations
 
@@ -33,25 +31,25 @@ SPY = "tests.scenarios.spies"
 
 
 @pytest.fixture(autouse=True)
-def _empty() -> Iterator[None]:
+def _clear_spies() -> Iterator[None]:
     yield
     spies.GIVEN.clear()
     spies.TRUE.clear()
 
 
-def run(name: str, algorithm: str, compared: tuple[str, ...] = (), case: int = 0) -> CaseResult:
-    """A small case of a scenario."""
+def run_small_case(name: str, algorithm: str, compared: tuple[str, ...] = (), case: int = 0) -> CaseResult:
+    """Run a small case of a scenario."""
     from tests.scenarios.descent.settings import DESCENT, WORLD
     from tests.scenarios.rover.short_run import SHORT
-    from tests.scenarios.test_fieldtest import stated
+    from tests.scenarios.test_fieldtest import make_parameters
 
     chosen: dict[str, Any] = {"algorithm": f"{SPY}:{algorithm}", "compared": [f"{SPY}:{one}" for one in compared]}
     turn = {"legs": [{"motion": "circle", "step_deg": 5.0, "steps": 1}]}
     parameters: dict[str, Any] = {
         "descent": {**WORLD, "descent": DESCENT, **chosen},
         "fieldtest": {
-            **stated().model_dump(),
-            "runs": [stated().runs[4].model_dump() | {"same_direction": 0, "opposite_direction": 0}],
+            **make_parameters().model_dump(),
+            "runs": [make_parameters().runs[4].model_dump() | {"same_direction": 0, "opposite_direction": 0}],
             **chosen,
         },
         "landing": {"site": "heli-benign", "terrain": {"samples": 256}, **chosen},
@@ -62,13 +60,13 @@ def run(name: str, algorithm: str, compared: tuple[str, ...] = (), case: int = 0
             "targets": [{"across": 0.0, "up": 0.5}],
         },
     }
-    found = scenario(name)
-    return found.run(found.parameters_type.model_validate(parameters[name]), Streams(1, "handover", case))
+    result = scenario(name)
+    return result.run(result.parameters_type.model_validate(parameters[name]), Streams(1, "handover", case))
 
 
-def pictures(given: Any) -> list[np.ndarray]:
-    """The counts in what an algorithm was given."""
-    images = given.images if hasattr(given, "images") else (given.left, given.right)
+def list_images(inputs: Any) -> list[np.ndarray]:
+    """Return the counts in the inputs of an algorithm."""
+    images = inputs.images if hasattr(inputs, "images") else (inputs.left, inputs.right)
     return [image.counts for image in images]
 
 
@@ -81,40 +79,40 @@ def pictures(given: Any) -> list[np.ndarray]:
         ("rover-drive", "SpoilingTracker", "TrackerSpy"),
     ],
 )
-def test_an_algorithm_cannot_spoil_the_measurements_of_the_next(name: str, spoiler: str, spy: str) -> None:
-    result = run(name, spoiler, (spy,))
+def test_algorithm_cannot_change_measurements_of_the_next(name: str, spoiler: str, spy: str) -> None:
+    result = run_small_case(name, spoiler, (spy,))
     assert (result.outcome, result.answered) == ("BAD_ANSWER", False)
     assert result.failure is not None
     assert "changed the measurements" in result.failure.error
-    given = next(one for one in spies.GIVEN if not isinstance(one, tuple))
-    assert all(counts.mean() > 1.0 for counts in pictures(given))
+    inputs = next(one for one in spies.GIVEN if not isinstance(one, tuple))
+    assert all(counts.mean() > 1.0 for counts in list_images(inputs))
     assert result.row[f"{spy}.error"] == ""
 
 
-def test_writing_to_a_picture_is_an_error_of_the_algorithm() -> None:
-    result = run("descent", "WritingVelocity", ("VelocitySpy",))
+def test_writing_to_an_image_is_an_algorithm_error() -> None:
+    result = run_small_case("descent", "WritingVelocity", ("VelocitySpy",))
     assert result.outcome == "CRASHED"
     assert result.failure is not None
     assert "read-only" in result.failure.error
     assert result.row["VelocitySpy.outcome"] == "NO_VALID_TRACK"
 
 
-def test_copies_are_the_same_bit_for_bit_and_nobody_elses() -> None:
-    given = descent()
-    first, second = Handover(given).given, Handover(given).given
-    assert first.images[0].counts.tobytes() == given.images[0].counts.tobytes()
+def test_copies_are_equal_and_independent() -> None:
+    inputs = descent()
+    first, second = Handover(inputs).given, Handover(inputs).given
+    assert first.images[0].counts.tobytes() == inputs.images[0].counts.tobytes()
     assert first.attitudes[0].world_from_body.as_quat().tobytes() == (
-        given.attitudes[0].world_from_body.as_quat().tobytes()
+        inputs.attitudes[0].world_from_body.as_quat().tobytes()
     )
-    for one in (given, second):
+    for one in (inputs, second):
         assert not np.shares_memory(first.images[0].counts, one.images[0].counts)
         assert not np.shares_memory(first.sun_direction, one.sun_direction)
     assert not first.sun_direction.flags.writeable
-    assert given.sun_direction.flags.writeable
+    assert inputs.sun_direction.flags.writeable
 
 
 class Lying(np.ndarray):
-    """An array that is always equal to what it is compared with."""
+    """An array that compares equal to any value."""
 
     def __sub__(self, other: Any) -> Any:
         return np.zeros(self.shape)
@@ -123,26 +121,26 @@ class Lying(np.ndarray):
 
 
 class LyingEstimator:
-    """Reports a velocity that is far off, whose error is 0 by its own account."""
+    """Reports a wrong velocity whose own comparison gives an error of 0."""
 
     def estimate(self, _: object) -> VelocityEstimate:
         """See `VelocityEstimator`."""
         return VelocityEstimate(VelocityOutcome.VALID, np.array([400.0, 0.0]).view(Lying))
 
 
-def test_answers_are_plain_numbers_before_they_are_scored() -> None:
+def test_answers_are_converted_to_plain_numbers() -> None:
     answer = run_estimator(LyingEstimator, descent()).answer
     assert answer is not None
     assert type(answer.velocity_m_s) is np.ndarray
     assert (answer.velocity_m_s - np.array([1.0, 0.0])).tolist() == [399.0, 0.0]
-    place, plane = np.arange(3, dtype=np.float32).view(Lying), np.eye(2).view(Lying)
+    position, plane = np.arange(3, dtype=np.float32).view(Lying), np.eye(2).view(Lying)
     velocity = VelocityEstimate(
         VelocityOutcome.VALID, np.zeros(2), covariance_m2_s2=plane, span_s=(np.float64(0.0), 1.0)
     )
     checked = (
         check_velocity(velocity).covariance_m2_s2,
-        check_site(SiteEstimate(SiteOutcome.SAFE_SITE, place)).site_world,
-        check_update(TargetUpdate(TrackingState.NORMAL, (), place)).position_rover,
+        check_site(SiteEstimate(SiteOutcome.SAFE_SITE, position)).site_world,
+        check_update(TargetUpdate(TrackingState.NORMAL, (), position)).position_rover,
     )
     assert len([one for one in checked if type(one) is np.ndarray and one.dtype == np.float64]) == 3
     assert [type(one) for one in check_velocity(velocity).span_s or ()] == [float, float]
@@ -158,30 +156,30 @@ def test_answers_are_plain_numbers_before_they_are_scored() -> None:
         ("rover-drive", {"selectable", "in_view", "on_face", "with_scale"}),
     ],
 )
-def test_conditions_are_recorded_before_an_algorithm_can_end_its_process(name: str, flags: set[str]) -> None:
+def test_conditions_are_recorded_before_the_algorithm_runs(name: str, flags: set[str]) -> None:
     recorded: dict[str, Scalar] = {}
     with conditions_recorded_by(recorded.update), pytest.raises(SystemExit):
-        run(name, "Leaving")
+        run_small_case(name, "Leaving")
     assert flags <= recorded.keys()
 
 
-def test_trackers_that_raise_fail_the_runs_in_which_the_target_is_selectable() -> None:
-    """5 of 20 runs raise: 15 of 15 of the others must not be what the requirement sees."""
-    raised, whole = (run("rover", spy, case=4) for spy in ("RaisingTracker", "TrackerSpy"))
+def test_raising_tracker_fails_runs_with_selectable_targets() -> None:
+    """5 of 20 runs raise: the requirement must not count only the other 15."""
+    raised, full = (run_small_case("rover", spy, case=4) for spy in ("RaisingTracker", "TrackerSpy"))
     assert raised.outcome == "CRASHED"
-    assert raised.row["selectable"] is whole.row["selectable"] is True
+    assert raised.row["selectable"] is full.row["selectable"] is True
     head = (
-        {"outcome": one.outcome, "answered": one.answered, **one.row, "handed_over": True} for one in (raised, whole)
+        {"outcome": one.outcome, "answered": one.answered, **one.row, "handed_over": True} for one in (raised, full)
     )
     crashed, good = head
     crashed.pop("handed_over")
     frame = pd.DataFrame([crashed] * 5 + [good] * 15)
-    asked_for = {"id": "VTT-HANDED", "metric": "handed_over", "probability": 0.9, "confidence": 0.9}
-    (found,) = judge_campaign(frame, [{**asked_for, "population": "selectable", "decide_by": "estimate"}])
-    assert (found.status, found.n, found.failures) == (Status.FAIL, 20, 5)
+    requested = {"id": "VTT-HANDED", "metric": "handed_over", "probability": 0.9, "confidence": 0.9}
+    (result,) = judge_campaign(frame, [{**requested, "population": "selectable", "decide_by": "estimate"}])
+    assert (result.status, result.n, result.failures) == (Status.FAIL, 20, 5)
 
 
-def test_the_row_of_a_crashed_landing_does_not_say_whether_a_site_was_reported() -> None:
-    """Whether it would have reported a site is unknown: it counts as if it had, and failed."""
-    row = run("landing", "SpoilingSite").row
+def test_crashed_landing_has_no_site_report_column() -> None:
+    """The report of a site is unknown: the case counts as reported and failed."""
+    row = run_small_case("landing", "SpoilingSite").row
     assert not {"site_reported", "no_site_reported", "converged"} & row.keys()

@@ -1,4 +1,4 @@
-"""Files that would exhaust the memory or never end are refused by what they expand to, or at once, with one message."""
+"""Tests that oversized, expanding or blocking files are rejected with one message."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from marsyard.sim.dynamics.recorded import COLUMNS, MAX_ROWS, TrajectoryFileErro
 from marsyard.sim.sensor import read_datasheet
 
 
-def test_a_calibration_with_aliases_is_refused(tmp_path: Path) -> None:
-    """Nine lists of nine aliases each, in 500 bytes: 9**8 numbers where they are expanded."""
+def test_calibration_with_aliases_is_rejected(tmp_path: Path) -> None:
+    """Nine lists of nine aliases each, in 500 bytes, expand to 9**8 numbers."""
     lines = ["a0: &a0 [0,0,0,0,0,0,0,0,0]"]
     lines += [f"a{n}: &a{n} [{','.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 8)]
     path = tmp_path / "camera.yaml"
@@ -44,7 +44,7 @@ def test_a_calibration_with_aliases_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", ["zip", "tar.gz", "bz2"])
-def test_archives_are_no_meshes(tmp_path: Path, ending: str) -> None:
+def test_archives_are_rejected_as_meshes(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"rock.{ending}"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("rock.stl", b"solid\n" + b" " * 10_000_000)
@@ -52,10 +52,8 @@ def test_archives_are_no_meshes(tmp_path: Path, ending: str) -> None:
         read_mesh(str(path))
 
 
-def test_zipped_formats_of_meshes_are_measured_before_they_expand(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """300 MB of blanks, 300 kB in the archive; trimesh reads 3MF where lxml and networkx are installed."""
+def test_zipped_mesh_size_is_checked_before_expansion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """300 MB of blanks in an archive of 300 kB; trimesh reads 3MF if lxml and networkx are installed."""
     monkeypatch.setattr(trimesh, "available_formats", lambda: {"3mf", "stl"})
     monkeypatch.setattr(trimesh, "load", lambda *_, **__: pytest.fail("was expanded"))
     path = tmp_path / "rock.3mf"
@@ -67,8 +65,8 @@ def test_zipped_formats_of_meshes_are_measured_before_they_expand(
         read_mesh(str(path))
 
 
-def test_accessors_without_a_buffer_are_measured_before_they_expand(tmp_path: Path) -> None:
-    """glTF's accessors without a buffer are zeros, as many as they state."""
+def test_gltf_accessor_size_is_checked_before_expansion(tmp_path: Path) -> None:
+    """glTF accessors without a buffer expand to the stated number of zeros."""
     scene = {
         "asset": {"version": "2.0"},
         "accessors": [{"componentType": 5126, "count": 1_000_000_000, "type": "VEC3"}],
@@ -85,27 +83,27 @@ def test_accessors_without_a_buffer_are_measured_before_they_expand(tmp_path: Pa
         read_mesh(str(path))
 
 
-def _parquet(path: Path, rows: int, **columns: pa.Array) -> Path:
-    """A table of equal values, which Parquet keeps in a few bytes."""
+def _write_parquet(path: Path, rows: int, **columns: pa.Array) -> Path:
+    """Write a table of equal values, which Parquet stores in a few bytes."""
     zeros = pa.array(np.zeros(rows))
     pq.write_table(pa.table({**dict.fromkeys(COLUMNS, zeros), **columns}), path)
     return path
 
 
-def test_a_table_of_poses_with_too_many_rows_is_refused_unread(tmp_path: Path) -> None:
-    path = _parquet(tmp_path / "flight.parquet", MAX_ROWS + 1)
+def test_pose_table_with_too_many_rows_is_rejected(tmp_path: Path) -> None:
+    path = _write_parquet(tmp_path / "flight.parquet", MAX_ROWS + 1)
     assert path.stat().st_size < 3_000_000
     with pytest.raises(TrajectoryFileError, match=rf"has {MAX_ROWS + 1} rows; allowed: up to {MAX_ROWS}"):
         read_poses(path)
 
 
-def test_only_columns_of_poses_are_read_and_they_are_numbers(tmp_path: Path) -> None:
-    path = _parquet(tmp_path / "flight.parquet", 10, qw=pa.array(["a"] * 10))
+def test_only_numeric_pose_columns_are_read(tmp_path: Path) -> None:
+    path = _write_parquet(tmp_path / "flight.parquet", 10, qw=pa.array(["a"] * 10))
     with pytest.raises(TrajectoryFileError, match="the column qw holds string; allowed: numbers"):
         read_poses(path)
 
 
-def test_a_flat_field_is_measured_before_it_expands(tmp_path: Path) -> None:
+def test_flat_field_size_is_checked_before_expansion(tmp_path: Path) -> None:
     path = tmp_path / "flat.npy"
     with path.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**6)})
@@ -129,12 +127,12 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 @pytest.fixture
 def alarm() -> Iterator[None]:
-    """Ends a test that waits."""
+    """Interrupt a test that blocks."""
 
-    def end(*_: object) -> None:
+    def raise_timeout(*_: object) -> None:
         raise TimeoutError("waited for a file that never ends")
 
-    before = signal.signal(signal.SIGALRM, end)
+    before = signal.signal(signal.SIGALRM, raise_timeout)
     signal.alarm(60)
     yield
     signal.alarm(0)
@@ -143,8 +141,8 @@ def alarm() -> Iterator[None]:
 
 @pytest.mark.usefixtures("alarm")
 @pytest.mark.parametrize("name", READERS)
-def test_a_named_pipe_is_refused_at_once_wherever_a_file_is_read(tmp_path: Path, name: str) -> None:
-    """Opening a pipe that nothing writes to waits for ever."""
+def test_named_pipe_is_rejected_by_each_reader(tmp_path: Path, name: str) -> None:
+    """Opening a pipe without a writer blocks forever."""
     path = tmp_path / name
     os.mkfifo(path)
     with pytest.raises(ValueError, match="is a named pipe; a regular file is needed") as raised:
@@ -152,7 +150,7 @@ def test_a_named_pipe_is_refused_at_once_wherever_a_file_is_read(tmp_path: Path,
     assert name in str(raised.value)
 
 
-def test_a_device_is_refused(tmp_path: Path) -> None:
+def test_device_file_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "flight.csv"
     path.symlink_to("/dev/zero")
     with pytest.raises(TrajectoryFileError, match="is a character device; a regular file is needed"):

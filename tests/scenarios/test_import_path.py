@@ -1,14 +1,14 @@
-"""What `module:name` stands for."""
+"""Tests of import paths `module:name`."""
 
 from pathlib import Path
 
 import pytest
 
 from marsyard.algorithms.dimes import DimesEstimator
-from marsyard.scenarios.import_path import current_module, import_object, source_files
+from marsyard.scenarios.user_files import current_module, import_object, source_files
 
 
-def test_former_module_names_are_still_found() -> None:
+def test_former_module_names_are_resolved() -> None:
     assert import_object("algorithms.dimes:DimesEstimator") is DimesEstimator
     assert current_module("marsyard.algorithms.dimes") == "marsyard.algorithms.dimes"
     names = [name for name, _ in source_files("algorithms.dimes:DimesEstimator")]
@@ -16,7 +16,7 @@ def test_former_module_names_are_still_found() -> None:
     assert {name.partition("/")[0] for name in names} == {"algorithms"}
 
 
-def test_a_users_own_module_may_have_such_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_custom_module_may_have_a_former_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "reports_of_mine.py").write_text("class Estimator: ...\n")
     monkeypatch.chdir(tmp_path)
     assert current_module("reports.mine") == "reports.mine"

@@ -1,4 +1,4 @@
-"""Own meshes, written by trimesh: they stand where and as large as stated, in scenes and in the truth of landings."""
+"""Tests of custom meshes: position and size in scenes and in the truth of landings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.relief import Relief
-from marsyard.scenarios.meshes import MeshFileError, MeshParameters, read_mesh, standing
+from marsyard.scenarios.meshes import MeshFileError, MeshParameters, read_mesh
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.terrain import Surface, TerrainParameters, site, synthesise
 
@@ -24,14 +24,14 @@ def surface() -> Surface:
     return synthesise(flat, np.random.default_rng(1))
 
 
-def box(folder: Path, name: str = "box.stl", extents: tuple[float, float, float] = BOX) -> str:
+def write_box(folder: Path, name: str = "box.stl", extents: tuple[float, float, float] = BOX) -> str:
     trimesh.creation.box(extents).export(folder / name)
     return str(folder / name)
 
 
 @pytest.mark.parametrize("ending", ["stl", "obj", "ply", "glb", "off"])
-def test_formats_hold_the_same_box(tmp_path: Path, surface: Surface, ending: str) -> None:
-    file = box(tmp_path, f"box.{ending}")
+def test_mesh_formats_give_the_same_box(tmp_path: Path, surface: Surface, ending: str) -> None:
+    file = write_box(tmp_path, f"box.{ending}")
     stated = MeshParameters(file=file, kind="lander", east_m=20.0, north_m=30.0, sink_m=0.1, sha256=None)
     own = stated.standing(surface, (25.0, 25.0))
     corners = own.triangles.reshape(-1, 3)
@@ -40,23 +40,23 @@ def test_formats_hold_the_same_box(tmp_path: Path, surface: Surface, ending: str
     assert np.allclose(corners.max(axis=0), [21.0, 30.5, ground + 0.4], atol=1e-6)
     assert len(own.albedo) == 1
     assert own.albedo[0] == 0.5
-    # a lander's faces are flat: each normal is square to its triangle and points outwards
+    # Lander faces are flat: each normal is perpendicular to its triangle and points outwards.
     middle = own.triangles.mean(axis=1)
     outwards = np.sum(own.normals[:, 0] * (middle - corners.mean(axis=0)), axis=1)
     assert np.all(outwards > 0.0)
     assert np.allclose(np.abs(own.normals).max(axis=2), 1.0)
 
 
-def test_size_heading_and_the_axis_that_points_up(tmp_path: Path, surface: Surface) -> None:
-    file = box(tmp_path, extents=(2.0, 0.5, 1.0))  # its y points up
+def test_size_heading_and_up_axis_are_applied(tmp_path: Path, surface: Surface) -> None:
+    file = write_box(tmp_path, extents=(2.0, 0.5, 1.0))  # y axis up
     own = MeshParameters(file=file, up="y", size_m=4.0, heading_deg=90.0, east_m=20.0, north_m=30.0)
     extent = np.ptp(own.standing(surface, (20.0, 30.0)).triangles.reshape(-1, 3), axis=0)
     assert np.allclose(extent, [2.0, 4.0, 1.0], atol=1e-6)
 
 
-def test_rocks_are_smooth(tmp_path: Path, surface: Surface) -> None:
+def test_rocks_have_smooth_normals(tmp_path: Path, surface: Surface) -> None:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
-    ball.export(tmp_path / "ball.stl")  # loose triangles: corners are written three times over
+    ball.export(tmp_path / "ball.stl")  # separate triangles: each corner is stored three times
     own = MeshParameters(file=str(tmp_path / "ball.stl")).standing(surface, (0.0, 0.0))
     corners = own.triangles.reshape(-1, 3)
     radial = corners - (corners.min(axis=0) + corners.max(axis=0)) / 2.0
@@ -64,16 +64,16 @@ def test_rocks_are_smooth(tmp_path: Path, surface: Surface) -> None:
     assert np.min(np.sum(radial * own.normals.reshape(-1, 3), axis=1)) > 0.999
 
 
-def test_the_terrain_repeats_them_nearest_to_the_eye(tmp_path: Path, surface: Surface) -> None:
-    one = MeshParameters(file=box(tmp_path), east_m=2.0, north_m=60.0)
-    corners = standing([one, one], surface, (65.0, 3.0)).triangles.reshape(-1, 3)
+def test_meshes_repeat_with_the_terrain_period(tmp_path: Path, surface: Surface) -> None:
+    one = MeshParameters(file=write_box(tmp_path), east_m=2.0, north_m=60.0)
+    corners = one.standing(surface, (65.0, 3.0)).triangles.reshape(-1, 3)
     assert np.allclose((corners.min(axis=0) + corners.max(axis=0))[:2] / 2.0, [66.0, -4.0])
 
 
-def test_landers_are_reported_not_to_stand_on_them(tmp_path: Path, surface: Surface) -> None:
+def test_meshes_are_hazards_for_landers(tmp_path: Path, surface: Surface) -> None:
     ground = SiteGround(site("heli-benign"), TerrainParameters(samples=64), surface, None)
-    # its edges between the points of the grid
-    one = MeshParameters(file=box(tmp_path), east_m=20.02, north_m=30.02)
+    # The edges lie between grid points.
+    one = MeshParameters(file=write_box(tmp_path), east_m=20.02, north_m=30.02)
     low, high = np.array([15.0, 25.0]), np.array([25.0, 35.0])
     bare, raised = (Relief.of(ground, low, high, 0.05, meshes) for meshes in ((), (one,)))
     higher = raised.heights_m - bare.heights_m
@@ -81,32 +81,32 @@ def test_landers_are_reported_not_to_stand_on_them(tmp_path: Path, surface: Surf
     assert np.count_nonzero(higher > 0.25) * 0.05**2 == pytest.approx(2.0, rel=0.06)
 
 
-def test_campaigns_name_them_and_know_them_again(tmp_path: Path) -> None:
-    file = box(tmp_path)
+def test_campaigns_store_mesh_and_detect_changes(tmp_path: Path) -> None:
+    file = write_box(tmp_path)
     p = LandingScenarioParameters.model_validate({"meshes": [{"file": file, "kind": "rock", "size_m": 1.0}]})
     stored = p.model_dump(mode="json", round_trip=True)
     assert LandingScenarioParameters.model_validate(stored) == p
-    box(tmp_path, extents=(1.0, 1.0, 1.0))
+    write_box(tmp_path, extents=(1.0, 1.0, 1.0))
     with pytest.raises(ValidationError, match="has changed since the campaign was made"):
         LandingScenarioParameters.model_validate(stored)
 
 
-def test_faults_are_named(tmp_path: Path) -> None:
-    def refused(path: Path, fault: str) -> None:
+def test_mesh_faults_are_reported(tmp_path: Path) -> None:
+    def expect_error(path: Path, fault: str) -> None:
         with pytest.raises(MeshFileError, match=fault) as raised:
             read_mesh(str(path))
         assert path.name in str(raised.value)
 
-    refused(tmp_path / "absent.stl", "cannot be read")
+    expect_error(tmp_path / "absent.stl", "cannot be read")
     (tmp_path / "text.txt").write_text("hello")
-    refused(tmp_path / "text.txt", "is no format of meshes; allowed: .*stl")
+    expect_error(tmp_path / "text.txt", "is no format of meshes; allowed: .*stl")
     (tmp_path / "broken.ply").write_text("ply\nnot at all")
-    refused(tmp_path / "broken.ply", "cannot be read as a mesh|holds no triangle")
+    expect_error(tmp_path / "broken.ply", "cannot be read as a mesh|holds no triangle")
     (tmp_path / "empty.obj").write_text("# nothing\n")
-    refused(tmp_path / "empty.obj", "cannot be read as a mesh|holds no triangle")
+    expect_error(tmp_path / "empty.obj", "cannot be read as a mesh|holds no triangle")
     flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
     flat.export(tmp_path / "flat.stl")
-    refused(tmp_path / "flat.stl", "is flat")
+    expect_error(tmp_path / "flat.stl", "is flat")
     with (tmp_path / "huge.stl").open("wb") as file:
         file.truncate(1 << 30)
-    refused(tmp_path / "huge.stl", "larger than 256 MiB")
+    expect_error(tmp_path / "huge.stl", "larger than 256 MiB")

@@ -1,4 +1,4 @@
-"""Tables of answers are read as they are meant, or refused with line, column and what is allowed."""
+"""Tests of answer tables: valid tables are read, invalid tables are rejected with line, column and allowed values."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from marsyard.algorithms.answers import AlgorithmError
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.algorithms.exchange import ExecutableLimits, read_case
-from marsyard.algorithms.faults import AlgorithmError
 from marsyard.algorithms.hda import HdaOptions
 from marsyard.algorithms.interface import SiteOutcome, VelocityOutcome
 from marsyard.scenarios.algorithm_run import hash_inputs
@@ -22,14 +22,14 @@ HEAD = "case,outcome,velocity_east_m_s,velocity_north_m_s\n"
 COVARIANCE = "covariance_east_m2_s2,covariance_east_north_m2_s2,covariance_north_m2_s2"
 
 
-def table(folder: Path, text: str) -> Path:
+def write_table(folder: Path, text: str) -> Path:
     path = folder / "answers.csv"
     path.write_text(text)
     return path
 
 
-def test_answers_of_velocity(tmp_path: Path) -> None:
-    path = table(
+def test_velocity_answers_are_read(tmp_path: Path) -> None:
+    path = write_table(
         tmp_path, HEAD.strip() + f",{COVARIANCE}\n7,,1.5,-2,4,1,9\n\n 0 , NO_VALID_TRACK ,,,,,\n1,VALID,3,4,,,\n"
     )
     answers = read_answers(path, VELOCITY_FORM)
@@ -63,23 +63,23 @@ def test_answers_of_velocity(tmp_path: Path) -> None:
         (f"{HEAD.strip()},{COVARIANCE}\n1,,2,3,1,2,1\n", "covariance_m2_s2 is not positive definite"),
     ],
 )
-def test_tables_that_are_none(tmp_path: Path, text: str, message: str) -> None:
-    path = table(tmp_path, text)
+def test_invalid_tables_are_rejected(tmp_path: Path, text: str, message: str) -> None:
+    path = write_table(tmp_path, text)
     with pytest.raises(ValueError, match=r"answers\.csv") as caught:
         read_answers(path, VELOCITY_FORM)
     assert message in str(caught.value)
 
 
-def test_all_that_is_wrong_is_reported_but_not_without_end(tmp_path: Path) -> None:
-    path = table(tmp_path, HEAD + "".join(f"{case},VALID,x,1\n" for case in range(30)))
+def test_all_errors_are_reported_up_to_a_limit(tmp_path: Path) -> None:
+    path = write_table(tmp_path, HEAD + "".join(f"{case},VALID,x,1\n" for case in range(30)))
     with pytest.raises(ValueError, match=r"(?s)line 2:.*line 21:.*\.\.\. and 10 more"):
         read_answers(path, VELOCITY_FORM)
     with pytest.raises(ValueError, match="No such file"):
         VELOCITY.check(f"answers:{tmp_path}/nothing.csv")
 
 
-def test_answers_stand_in_for_an_algorithm(tmp_path: Path) -> None:
-    spec = f"answers:{table(tmp_path, HEAD + '3,,1,2')}"
+def test_answer_table_replaces_an_algorithm(tmp_path: Path) -> None:
+    spec = f"answers:{write_table(tmp_path, HEAD + '3,,1,2')}"
     VELOCITY.check(spec)
     assert labels(["dimes", spec]) == ("dimes", "answers")
     assert algorithm_sources(spec) == []
@@ -91,8 +91,8 @@ def test_answers_stand_in_for_an_algorithm(tmp_path: Path) -> None:
         TRACKING.check(spec)
 
 
-def test_answers_of_landing_sites(tmp_path: Path) -> None:
-    path = table(
+def test_landing_site_answers_are_read(tmp_path: Path) -> None:
+    path = write_table(
         tmp_path,
         "case,outcome,site_east_m,site_north_m,site_up_m\n0,SAFE_SITE,1,2,3\n1,NO_SAFE_SITE,,,\n2,NO_MOTION,,,\n",
     )
@@ -101,24 +101,27 @@ def test_answers_of_landing_sites(tmp_path: Path) -> None:
         SiteOutcome.NO_SAFE_SITE,
         SiteOutcome.NO_MOTION,
     ]
-    given = inputs.landing()
+    measurements = inputs.landing()
     sites = [
-        LANDING.make(f"answers:{path}", HdaOptions(), LIMITS, case).estimate(given).site_world for case in range(3)
+        LANDING.make(f"answers:{path}", HdaOptions(), LIMITS, case).estimate(measurements).site_world
+        for case in range(3)
     ]
     assert np.array_equal(sites[0], [1.0, 2.0, 3.0])  # type: ignore[arg-type]
     assert sites[1] is None
-    # where the algorithm did not converge, the a-priori site is what is left
-    assert np.array_equal(sites[2], given.apriori_site_world)  # type: ignore[arg-type]
+    # Without convergence the a-priori site is used.
+    assert np.array_equal(sites[2], measurements.apriori_site_world)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("task", ["velocity", "landing"])
-def test_what_is_exported_is_what_was_measured(tmp_path: Path, task: str) -> None:
+def test_exported_cases_equal_the_measurements(tmp_path: Path, task: str) -> None:
     if task == "velocity":
-        given = inputs.descent()
-        answer = VELOCITY.make(f"export:{tmp_path}", DimesOptions(), LIMITS, 12).estimate(given)
+        measurements = inputs.descent()
+        answer = VELOCITY.make(f"export:{tmp_path}", DimesOptions(), LIMITS, 12).estimate(measurements)
         assert answer.velocity_m_s is None
         read = read_case(tmp_path / "cases" / "000012")
-        assert [hash_inputs(one.counts) for one in read.images] == [hash_inputs(one.counts) for one in given.images]
+        assert [hash_inputs(one.counts) for one in read.images] == [
+            hash_inputs(one.counts) for one in measurements.images
+        ]
     else:
         site = LANDING.make(f"export:{tmp_path}", HdaOptions(), LIMITS, 12).estimate(inputs.landing())
         assert not site.outcome.converged

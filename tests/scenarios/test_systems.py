@@ -1,4 +1,4 @@
-"""The registry of systems: what an installed package brings is found; a system that cannot be used is left out."""
+"""Tests of the registry of systems: installed packages are found, and invalid systems are skipped."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from marsyard.campaigns.definition import requirements
-from marsyard.campaigns.definition.catalogue import catalogue
 from marsyard.campaigns.definition.identity import custom_sources
-from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.loading import catalogue, load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli.app import app
 from marsyard.doctor import Verdict, check_systems
@@ -21,34 +20,34 @@ from marsyard.scenarios.estimators import shipped_names
 from marsyard.scenarios.systems import (
     BUILT_IN,
     UnknownScenarioError,
+    find_system,
     problems,
     registry,
     row_columns,
     scenario,
     scenario_names,
     scenario_source,
-    system_of,
     systems,
     template_paths,
 )
 
 CACHED = (registry, row_columns, shipped_names, requirements.shipped_requirements, requirements._read_shipped)
-HEAD = "from pathlib import Path\nfrom marsyard.scenarios.system import System\nHERE = Path(__file__).parent\n"
+HEAD = "from pathlib import Path\nfrom marsyard.scenarios.systems import System\nHERE = Path(__file__).parent\n"
 Install = Callable[..., None]
 
 
-def _clear() -> None:
+def _clear_caches() -> None:
     for one in CACHED:
         one.cache_clear()
 
 
 @pytest.fixture
 def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
-    """Installs a package with one module and entry points for systems: files below a folder of `sys.path`."""
+    """Install a package with one module and entry points for systems: files in a folder of `sys.path`."""
     monkeypatch.syspath_prepend(str(tmp_path))
     modules: list[str] = []
 
-    def installed(package: str, source: str, *points: str, **files: str) -> None:
+    def install_package(package: str, source: str, *points: str, **files: str) -> None:
         info = tmp_path / f"{package}-1.0.dist-info"
         info.mkdir()
         (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
@@ -58,20 +57,20 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         for name, text in files.items():
             (tmp_path / f"{name}.toml").write_text(text)
         modules.append(package)
-        _clear()
+        _clear_caches()
 
-    yield installed
+    yield install_package
     for module in modules:
         sys.modules.pop(module, None)
     monkeypatch.undo()
-    _clear()
+    _clear_caches()
 
 
-def _system(name: str, more: str = "") -> str:
+def _format_system(name: str, more: str = "") -> str:
     return f"SYSTEM = System(name={name!r}, title='T', summary='S', scenarios={{'{name}-case': 'x:Y'}}{more})\n"
 
 
-def test_the_systems_of_marsyard_are_whole() -> None:
+def test_marsyard_systems_are_complete() -> None:
     assert not problems()
     assert [one.name for one in systems()][: len(BUILT_IN)] == ["measured", "dimes", "fieldtest", "vtt", "hda"]
     for system in systems():
@@ -79,24 +78,24 @@ def test_the_systems_of_marsyard_are_whole() -> None:
         assert system.summary.endswith("."), system.name
         for name in system.scenarios:
             assert scenario(name).name == name
-            assert system_of(name) is system
+            assert find_system(name) is system
             assert row_columns(name) is not None
         for name, path in system.campaigns.items():
             assert catalogue()[name] == path
         assert set(system.compiled_by) <= set(system.campaigns)
-    # every file of the folder belongs to a system
+    # Each file in the folder belongs to a system.
     folder = next(iter(catalogue().values())).parent
     assert set(catalogue()) == {path.stem for path in folder.glob("*.toml")}
     assert list(template_paths()) == ["velocity", "tracking", "landing"]
     assert {"dimes", "vtt", "hda", "homography"} <= shipped_names()
 
 
-def test_a_system_of_another_package_is_found_everywhere(install: Install) -> None:
+def test_system_of_another_package_is_found(install: Install) -> None:
     files = ", catalogue=HERE / 'mine-*.toml', requirements=HERE / 'asked.toml', columns=HERE / 'columns.toml'"
     stated = 'statement = "S"\nmetric = "metres"\nbound = 1.0\nprobability = 0.9\nconfidence = 0.9\n'
     install(
         "mine",
-        _system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.scenarios:MatchingScenario'"),
+        _format_system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.scenarios:MatchingScenario'"),
         **{"mine-one": 'scenario = "mine-case"\n', "asked": f'[[requirements]]\nid = "MINE"\n{stated}'},
         columns='[mine-case]\nflags = []\nnumbers = ["metres"]\n',
     )
@@ -112,11 +111,11 @@ def test_a_system_of_another_package_is_found_everywhere(install: Install) -> No
     assert "mine-one" in [one["name"] for one in listed]
 
 
-def test_the_code_of_a_foreign_scenario_is_part_of_the_identity(install: Install, tmp_path: Path) -> None:
-    install("mine", _system("mine").replace("x:Y", "mine:Case"))
+def test_external_scenario_code_is_part_of_the_identity(install: Install, tmp_path: Path) -> None:
+    install("mine", _format_system("mine").replace("x:Y", "mine:Case"))
     assert scenario_source("mine-case") == "mine:Case"
     assert list(custom_sources(scenario_source("mine-case"))) == [("mine.py", tmp_path / "mine.py")]
-    # that of ours is hashed as a whole for every scenario
+    # Marsyard's own code is hashed completely for each scenario.
     assert scenario_source("descent") == "descent"
     assert list(custom_sources("descent")) == []
 
@@ -127,18 +126,24 @@ def test_the_code_of_a_foreign_scenario_is_part_of_the_identity(install: Install
         ("import absent_module\n", "it cannot be imported: No module named 'absent_module'"),
         ("raise RuntimeError('broken')\n", "it cannot be imported: RuntimeError: broken"),
         ("", "has no attribute 'SYSTEM'"),
-        ("SYSTEM = {'name': 'mine'}\n", "it is a dict; allowed: a marsyard.scenarios.system.System"),
-        (_system("dimes"), "the system 'dimes' already has the name 'dimes'"),
-        (_system("descent").replace("-case", ""), "the system 'dimes' already has the scenario 'descent'"),
-        (_system("mine", ", templates={'tracking': 'x:Y'}"), "the system 'vtt' already has the template 'tracking'"),
-        (_system("mine", ", catalogue=HERE / 'hda-*.toml'"), "the system 'hda' already has the campaign 'hda-map'"),
-        (_system("mine", ", columns=HERE / 'none.toml'"), "it names what is not there: "),
-        (_system("mine", ", catalogue=HERE / 'none-*.toml'"), "it names what is not there: "),
+        ("SYSTEM = {'name': 'mine'}\n", "it is a dict; allowed: a marsyard.scenarios.systems.System"),
+        (_format_system("dimes"), "the system 'dimes' already has the name 'dimes'"),
+        (_format_system("descent").replace("-case", ""), "the system 'dimes' already has the scenario 'descent'"),
+        (
+            _format_system("mine", ", templates={'tracking': 'x:Y'}"),
+            "the system 'vtt' already has the template 'tracking'",
+        ),
+        (
+            _format_system("mine", ", catalogue=HERE / 'hda-*.toml'"),
+            "the system 'hda' already has the campaign 'hda-map'",
+        ),
+        (_format_system("mine", ", columns=HERE / 'none.toml'"), "it names what is not there: "),
+        (_format_system("mine", ", catalogue=HERE / 'none-*.toml'"), "it names what is not there: "),
     ],
 )
-def test_a_system_that_cannot_be_used_leaves_the_others_alone(install: Install, source: str, reason: str) -> None:
+def test_invalid_system_does_not_affect_others(install: Install, source: str, reason: str) -> None:
     install("mine", source, **{"hda-map": ""})
-    install("sound", _system("sound"))
+    install("sound", _format_system("sound"))
     (message,) = problems()
     assert message.startswith("system 'mine' (mine:SYSTEM) is left out: ")
     assert reason in message
@@ -153,14 +158,16 @@ def test_a_system_that_cannot_be_used_leaves_the_others_alone(install: Install, 
         scenario("unheard-of")
 
 
-def test_of_two_entry_points_of_one_system_the_first_counts(install: Install) -> None:
-    install("mine", _system("mine"), "a", "b")
+def test_first_of_two_entry_points_is_used(install: Install) -> None:
+    install("mine", _format_system("mine"), "a", "b")
     assert [one.name for one in systems()].count("mine") == 1
     assert problems() == ("system 'b' (mine:SYSTEM) is left out: the system 'mine' already has the name 'mine'",)
 
 
-def test_a_file_of_requirements_that_is_wrong_is_named_where_one_is_missed(install: Install, tmp_path: Path) -> None:
-    install("mine", _system("mine", ", requirements=HERE / 'asked.toml'"), asked='[[requirements]]\nid = "MINE"\n')
+def test_invalid_requirements_file_is_reported(install: Install, tmp_path: Path) -> None:
+    install(
+        "mine", _format_system("mine", ", requirements=HERE / 'asked.toml'"), asked='[[requirements]]\nid = "MINE"\n'
+    )
     assert "DIMES-VEL" in requirements.shipped_requirements()
     campaign = tmp_path / "campaign.toml"
     campaign.write_text('name = "c"\nscenario = "descent"\ncases = 1\n[[requirements]]\nid = "MINE"\n')
@@ -168,9 +175,11 @@ def test_a_file_of_requirements_that_is_wrong_is_named_where_one_is_missed(insta
         load_campaign(str(campaign))
 
 
-def test_columns_that_cannot_be_read_stop_the_systems_own_campaigns_alone(install: Install, tmp_path: Path) -> None:
+def test_invalid_columns_stop_only_campaigns_of_the_system(install: Install, tmp_path: Path) -> None:
     scenario_path = "marsyard.scenarios.measured.scenarios:MatchingScenario"
-    install("mine", _system("mine", ", columns=HERE / 'columns.toml'").replace("x:Y", scenario_path), columns="x = [")
+    install(
+        "mine", _format_system("mine", ", columns=HERE / 'columns.toml'").replace("x:Y", scenario_path), columns="x = ["
+    )
     with pytest.raises(ValueError, match=r"columns\.toml: states no columns: TOMLDecodeError"):
         row_columns("mine-case")
     assert row_columns("descent") is not None

@@ -1,4 +1,6 @@
-"""Own terrain: the real tile passes, and files that cannot be meant are refused with their names, unread."""
+"""Tests of custom terrain files: a real tile passes, and invalid files are rejected with a message before they are
+read.
+"""
 
 from __future__ import annotations
 
@@ -31,8 +33,8 @@ from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError
 MARS = "+proj=eqc +lat_ts=0 +lon_0=0 +R=3396190 +units=m +no_defs"
 
 
-def tif(folder: Path, name: str = "dtm.tif", **changes: Any) -> Path:
-    """A DTM of 40 x 50 posts, written by GDAL."""
+def write_tif(folder: Path, name: str = "dtm.tif", **changes: Any) -> Path:
+    """Write a DTM of 40 x 50 posts with GDAL."""
     path = folder / name
     values = changes.pop("values", np.full((50, 40), -4450.0, dtype=np.float32))
     tags: Mapping[str, Any] = changes.pop("tags", {})
@@ -47,7 +49,7 @@ def tif(folder: Path, name: str = "dtm.tif", **changes: Any) -> Path:
         "nodata": -32767.0,
     } | changes
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # files without a place are meant to be
+        warnings.simplefilter("ignore")  # files without a geotransform are intended
         with rasterio.open(path, "w", **profile) as file:
             file.write(values, 1)
             for key, value in tags.items():
@@ -55,7 +57,7 @@ def tif(folder: Path, name: str = "dtm.tif", **changes: Any) -> Path:
     return path
 
 
-def test_the_hirise_tile_passes(shared_data: Path) -> None:
+def test_hirise_tile_passes(shared_data: Path) -> None:
     folder = shared_data / "gale_hirise"
     check_source(RealTerrain(dtm=folder / "dem.tif"))
     check_source(RealTerrain(dtm=folder / "gale_1m_dem_0p5m_ortho.npz"))
@@ -63,15 +65,15 @@ def test_the_hirise_tile_passes(shared_data: Path) -> None:
 
 @pytest.mark.parametrize("name", ["dimes-hirise", "hda-hirise"])
 def test_campaigns_over_the_tile_are_complete(shared_data: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """They name its file from the checkout's own folder, as they are run."""
+    """The campaigns name the file relative to the checkout."""
     monkeypatch.chdir(shared_data.parents[1] / Path(__file__).parents[2].name)
     loaded = load_campaign(f"docs/examples/{name}.toml")
     assert loaded.draws(7)
 
 
-def test_a_dtm_and_its_picture_pass(tmp_path: Path) -> None:
-    picture = tif(tmp_path, "ortho.tif", values=np.full((100, 80), 120, dtype=np.uint8), nodata=0)
-    check_source(RealTerrain(dtm=tif(tmp_path), ortho=picture))
+def test_dtm_and_orthoimage_pass(tmp_path: Path) -> None:
+    picture = write_tif(tmp_path, "ortho.tif", values=np.full((100, 80), 120, dtype=np.uint8), nodata=0)
+    check_source(RealTerrain(dtm=write_tif(tmp_path), ortho=picture))
 
 
 FAULTS: list[tuple[dict[str, Any], str]] = [
@@ -94,15 +96,15 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("changes", "fault"), FAULTS, ids=[fault for _, fault in FAULTS])
-def test_faults_are_named(tmp_path: Path, changes: dict[str, Any], fault: str) -> None:
+def test_terrain_file_faults_are_reported(tmp_path: Path, changes: dict[str, Any], fault: str) -> None:
     with pytest.raises(TerrainFileError, match=fault) as raised:
-        check_source(RealTerrain(dtm=tif(tmp_path, **changes)))
+        check_source(RealTerrain(dtm=write_tif(tmp_path, **changes)))
     assert "dtm.tif" in str(raised.value)
 
 
 MOON, MARS_ELLIPSOID = "+R=1737400", "+a=3396190 +b=3376200"
-#: Projection, and where a file lies in it: longitude, latitude, and grid convergence there (degrees, Snyder 1987:
-#: equations 8-9 for transverse Mercator, (lon - lon_0) times the cone's constant n for polar and conic projections).
+#: Projection, longitude, latitude and grid convergence of a file in degrees (Snyder 1987). Equations 8-9 for transverse
+#: Mercator; (lon - lon_0) times the cone constant n for polar and conic projections.
 CONFORMAL: list[tuple[str, float, float, float]] = [
     *[("+proj=stere +lat_0=90 +lon_0=0 +k=1", lon, 85.0, lon) for lon in (0.0, 45.0, 90.0, 177.0, -120.0)],
     *[("+proj=stere +lat_0=-90 +lon_0=0 +k=1", lon, -85.0, -lon) for lon in (0.0, 45.0, 90.0, 177.0, -120.0)],
@@ -122,35 +124,35 @@ CONFORMAL: list[tuple[str, float, float, float]] = [
 
 @pytest.mark.parametrize("body", [MOON, MARS_ELLIPSOID], ids=["moon", "mars"])
 @pytest.mark.parametrize(("projection", "lon", "lat", "convergence"), CONFORMAL)
-def test_conformal_maps_pass_off_their_central_meridian(
+def test_conformal_maps_pass_away_from_central_meridian(
     tmp_path: Path, projection: str, lon: float, lat: float, convergence: float, body: str
 ) -> None:
     crs = CRS.from_string(f"{projection} {body} +units=m")
     (x,), (y,) = transform(CRS.from_string(f"+proj=longlat {body} +no_defs"), crs, [lon], [lat])
-    path = tif(tmp_path, crs=crs, transform=Affine(2.0, 0.0, x - 40.0, 0.0, -2.0, y + 50.0))
+    path = write_tif(tmp_path, crs=crs, transform=Affine(2.0, 0.0, x - 40.0, 0.0, -2.0, y + 50.0))
     check_source(RealTerrain(dtm=path))
-    # the formulas are the sphere's; Mars' flattening turns north by thousandths of a degree
+    # The formulas are spherical; the flattening of Mars rotates north by thousandths of a degree.
     assert grid_north_deg(path) == pytest.approx(convergence, abs=0.01)
 
 
-def test_a_map_of_the_pole_itself_passes_and_has_no_true_north(tmp_path: Path) -> None:
+def test_map_centred_on_pole_passes_without_true_north(tmp_path: Path) -> None:
     crs = CRS.from_string(f"+proj=stere +lat_0=-90 +lon_0=0 +k=1 {MOON} +units=m")
-    path = tif(tmp_path, crs=crs, transform=Affine(5.0, 0.0, -100.0, 0.0, -5.0, 125.0))
+    path = write_tif(tmp_path, crs=crs, transform=Affine(5.0, 0.0, -100.0, 0.0, -5.0, 125.0))
     check_source(RealTerrain(dtm=path))
     assert grid_north_deg(path) is None
 
 
-def test_a_sheared_map_is_refused(tmp_path: Path) -> None:
-    """Sinusoidal 10 deg off its meridian at 60 deg: areas are true, but x and y are not at right angles."""
+def test_sheared_map_is_rejected(tmp_path: Path) -> None:
+    """Sinusoidal projection 10 deg off its meridian at 60 deg: equal area, but x and y are not perpendicular."""
     crs = CRS.from_string(f"+proj=sinu +lon_0=0 {MOON} +units=m")
     (x,), (y,) = transform(CRS.from_string(f"+proj=longlat {MOON} +no_defs"), crs, [10.0], [60.0])
-    path = tif(tmp_path, crs=crs, transform=Affine(2.0, 0.0, x - 40.0, 0.0, -2.0, y + 50.0))
-    # a shear by s = lon sin(lat) = 0.1511, whose singular values are (sqrt(4 + s**2) -+ s) / 2
+    path = write_tif(tmp_path, crs=crs, transform=Affine(2.0, 0.0, x - 40.0, 0.0, -2.0, y + 50.0))
+    # The shear s = lon sin(lat) = 0.1511 has the singular values (sqrt(4 + s**2) -+ s) / 2.
     with pytest.raises(TerrainFileError, match=r"stretches lengths by 0\.927 to 1\.078"):
         check_source(RealTerrain(dtm=path))
 
 
-def npz(folder: Path, **arrays: Any) -> Path:
+def write_npz(folder: Path, **arrays: Any) -> Path:
     path = folder / "dtm.npz"
     contents: dict[str, Any] = {"dem": np.zeros((20, 30)), "dem_gsd": 1.0} | arrays
     np.savez_compressed(path, **contents)
@@ -175,14 +177,14 @@ NPZ_FAULTS: list[tuple[dict[str, Any], str]] = [
 
 
 @pytest.mark.parametrize(("arrays", "fault"), NPZ_FAULTS, ids=[fault for _, fault in NPZ_FAULTS])
-def test_archives_get_the_checks_of_geotiffs(tmp_path: Path, arrays: dict[str, Any], fault: str) -> None:
+def test_archives_have_the_same_checks_as_geotiffs(tmp_path: Path, arrays: dict[str, Any], fault: str) -> None:
     with pytest.raises(TerrainFileError, match=fault) as raised:
-        check_source(RealTerrain(dtm=npz(tmp_path, **arrays)))
+        check_source(RealTerrain(dtm=write_npz(tmp_path, **arrays)))
     assert "dtm.npz" in str(raised.value)
 
 
-def test_an_archive_that_expands_to_gigabytes_is_refused_by_its_headers(tmp_path: Path) -> None:
-    """20000 x 20000 zeros, 3.2 GB, of which the archive holds the header alone."""
+def test_oversized_archive_is_rejected_from_its_headers(tmp_path: Path) -> None:
+    """20000 x 20000 zeros, 3.2 GB; the archive contains only the header."""
     path = tmp_path / "bomb.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, shape in (("dem", (20000, 20000)), ("dem_gsd", ())):
@@ -194,36 +196,36 @@ def test_an_archive_that_expands_to_gigabytes_is_refused_by_its_headers(tmp_path
 
 
 @pytest.mark.parametrize("name", ["pipe.tif", "pipe.npz"])
-def test_a_named_pipe_is_refused_at_once(tmp_path: Path, name: str) -> None:
+def test_named_pipe_is_rejected(tmp_path: Path, name: str) -> None:
     os.mkfifo(tmp_path / name)
     with pytest.raises(TerrainFileError, match=f"{name}: is a named pipe; a regular file is needed"):
         check_source(RealTerrain(dtm=tmp_path / name))
 
 
-def test_missing_nodata_is_recognised_by_impossible_heights(tmp_path: Path) -> None:
+def test_missing_nodata_is_detected_from_implausible_heights(tmp_path: Path) -> None:
     values = np.full((50, 40), -4450.0, dtype=np.float32)
     values[10, 10] = -32767.0
     with pytest.raises(TerrainFileError, match=r"holds heights of -32767 m; .*it states no nodata value"):
-        check_source(RealTerrain(dtm=tif(tmp_path, values=values, nodata=None)))
-    check_source(RealTerrain(dtm=tif(tmp_path, "stated.tif", values=values)))
+        check_source(RealTerrain(dtm=write_tif(tmp_path, values=values, nodata=None)))
+    check_source(RealTerrain(dtm=write_tif(tmp_path, "stated.tif", values=values)))
 
 
-def test_pictures_of_another_projection_are_refused(tmp_path: Path) -> None:
+def test_image_with_another_projection_is_rejected(tmp_path: Path) -> None:
     other = CRS.from_string(MARS.replace("lon_0=0", "lon_0=137"))
-    picture = tif(tmp_path, "ortho.tif", values=np.full((100, 80), 120, dtype=np.uint8), nodata=0, crs=other)
+    picture = write_tif(tmp_path, "ortho.tif", values=np.full((100, 80), 120, dtype=np.uint8), nodata=0, crs=other)
     with pytest.raises(TerrainFileError, match=r"ortho.tif: its projection is not that of .*dtm.tif"):
-        check_source(RealTerrain(dtm=tif(tmp_path), ortho=picture))
+        check_source(RealTerrain(dtm=write_tif(tmp_path), ortho=picture))
 
 
-def test_a_picture_of_a_gigabyte_is_refused_by_its_header(tmp_path: Path) -> None:
-    """32768 x 32768 bytes, none of which are written."""
+def test_oversized_image_is_rejected_from_its_header(tmp_path: Path) -> None:
+    """32768 x 32768 bytes that are not written."""
     path = tmp_path / "huge.tif"
     profile = {"driver": "GTiff", "height": 32768, "width": 32768, "count": 1, "dtype": "uint8", "SPARSE_OK": "TRUE"}
-    place = {"crs": CRS.from_string(MARS), "transform": Affine(0.25, 0.0, 0.0, 0.0, -0.25, 0.0)}
-    with rasterio.open(path, "w", **profile, **place):
+    position = {"crs": CRS.from_string(MARS), "transform": Affine(0.25, 0.0, 0.0, 0.0, -0.25, 0.0)}
+    with rasterio.open(path, "w", **profile, **position):
         pass
     with pytest.raises(TerrainFileError, match=r"huge.tif: has 32768 x 32768 values; at most 8192 along a side"):
-        check_source(RealTerrain(dtm=tif(tmp_path), ortho=path))
+        check_source(RealTerrain(dtm=write_tif(tmp_path), ortho=path))
 
 
 @pytest.mark.parametrize(
@@ -235,7 +237,7 @@ def test_a_picture_of_a_gigabyte_is_refused_by_its_header(tmp_path: Path) -> Non
         ("empty.npz", b"", "is empty"),
     ],
 )
-def test_files_that_are_none(tmp_path: Path, name: str, contents: bytes, fault: str) -> None:
+def test_invalid_files_are_rejected(tmp_path: Path, name: str, contents: bytes, fault: str) -> None:
     (tmp_path / name).write_bytes(contents)
     with pytest.raises(TerrainFileError, match=fault):
         check_source(RealTerrain(dtm=tmp_path / name))
@@ -243,13 +245,13 @@ def test_files_that_are_none(tmp_path: Path, name: str, contents: bytes, fault: 
         check_source(RealTerrain(dtm=tmp_path / "absent.tif"))
 
 
-def test_campaigns_refuse_them_when_they_are_read(tmp_path: Path) -> None:
-    path = tif(tmp_path, crs=None)
+def test_campaigns_reject_invalid_terrain_on_load(tmp_path: Path) -> None:
+    path = write_tif(tmp_path, crs=None)
     with pytest.raises(ValidationError, match=r"dtm.tif: states no projection"):
         DescentScenarioParameters.model_validate({"terrain": {"source": {"dtm": str(path)}}})
 
 
-def test_advice_names_commands_that_are_installed() -> None:
+def test_advice_names_installed_commands() -> None:
     named = set(re.findall(r"\brio ([a-z]+(?:-[a-z]+)*)", Path(terrain_files.__file__).read_text()))
     assert "warp" in named
     assert named <= {command.name for command in entry_points(group="rasterio.rio_commands")}

@@ -1,8 +1,6 @@
-"""No algorithm is given the truth: each field that it gets differs from what is true in every one of several cases.
-
-The algorithms here keep what they are given (`spies`), so that a scenario that hands over anything else than what it
-measured is seen too. Not compared are pictures and their exposure times, the direction of the sun (from the ephemeris,
-known far better than any camera resolves), and the geometry of a mast (its errors are those of its angles and cameras).
+"""Tests that no algorithm receives the truth: each input field differs from the truth in each of several cases. Spy
+algorithms record their inputs. Not compared: images, exposure times, the sun direction (known from the ephemeris),
+and the mast geometry (its errors are in angles and cameras).
 """
 
 from __future__ import annotations
@@ -40,51 +38,51 @@ Numbers = Float[np.ndarray, "..."]
 
 
 @pytest.fixture(autouse=True)
-def _empty() -> Iterator[None]:
+def _clear_spies() -> Iterator[None]:
     yield
     spies.GIVEN.clear()
     spies.TRUE.clear()
 
 
-def assert_apart(name: str, given: Any, true: Any) -> None:
-    """Every case's field differs from its truth by more than rounding."""
-    given, true = np.asarray(given, dtype=np.float64), np.asarray(true, dtype=np.float64)
-    assert np.abs(given - true).max() > 1e-9 * max(np.abs(true).max(), 1.0), f"{name} is the truth: {given}"
+def assert_differs(name: str, inputs: Any, true: Any) -> None:
+    """Assert that the field of each case differs from its truth by more than rounding."""
+    inputs, true = np.asarray(inputs, dtype=np.float64), np.asarray(true, dtype=np.float64)
+    assert np.abs(inputs - true).max() > 1e-9 * max(np.abs(true).max(), 1.0), f"{name} is the truth: {inputs}"
 
 
-def assert_cameras_apart(name: str, given: CameraModel, true: CameraModel) -> None:
-    """Cameras project the same points to other pixels."""
-    assert given.size == true.size
-    columns, rows = given.size
+def assert_cameras_differ(name: str, inputs: CameraModel, true: CameraModel) -> None:
+    """Assert that the cameras project the same points to other pixels."""
+    assert inputs.size == true.size
+    columns, rows = inputs.size
     corners = np.array([[0.1 * columns, 0.1 * rows], [0.5 * columns, 0.5 * rows], [0.9 * columns, 0.8 * rows]])
-    assert_apart(name, given.rays(corners)[1], true.rays(corners)[1])
+    assert_differs(name, inputs.rays(corners)[1], true.rays(corners)[1])
 
 
-def assert_poses_apart(name: str, given: RigidTransform, true: RigidTransform) -> None:
-    """Poses differ in place and attitude."""
-    assert_apart(f"{name}: place", given.translation, true.translation)
-    assert_rotations_apart(name, given.rotation, true.rotation)
+def assert_poses_differ(name: str, inputs: RigidTransform, true: RigidTransform) -> None:
+    """Assert that the poses differ in position and attitude."""
+    assert_differs(f"{name}: place", inputs.translation, true.translation)
+    assert_rotations_differ(name, inputs.rotation, true.rotation)
 
 
-def assert_rotations_apart(name: str, given: Rotation, true: Rotation) -> None:
-    """Rotations differ by more than rounding, which is 1e-8 rad of an angle."""
-    assert (given * true.inv()).magnitude() > 1e-7, f"{name} is the true attitude"
+def assert_rotations_differ(name: str, inputs: Rotation, true: Rotation) -> None:
+    """Assert that the rotations differ by more than rounding, 1e-8 rad of an angle."""
+    assert (inputs * true.inv()).magnitude() > 1e-7, f"{name} is the true attitude"
 
 
-def assert_flat_field_apart(given: Numbers, detector: Detector) -> None:
-    """The calibrated response of pixels is not a multiple of the true one."""
-    rows, columns = given.shape
+def assert_flat_field_differs(inputs: Numbers, detector: Detector) -> None:
+    """Assert that the calibrated pixel response is not a multiple of the true response."""
+    rows, columns = inputs.shape
     true = detector.response.reshape(rows, -1, columns).mean(axis=1)
-    assert float(np.std(given / true)) > 1e-6
+    assert float(np.std(inputs / true)) > 1e-6
 
 
-def assert_all_are_looked_at(kind: type[Any], names: set[str]) -> None:
-    """A new field of measurements must be compared here, or exempted with a reason."""
-    assert {one.name for one in fields(kind)} == names
+def assert_all_fields_are_compared(measurement_class: type[Any], names: set[str]) -> None:
+    """Assert that each field of the measurements is compared, or exempted with a reason."""
+    assert {one.name for one in fields(measurement_class)} == names
 
 
 @pytest.mark.parametrize("case", range(3))
-def test_descents_are_measured(case: int) -> None:
+def test_descent_inputs_differ_from_truth(case: int) -> None:
     from tests.scenarios.descent.settings import DESCENT, WORLD
 
     p = DescentScenarioParameters.model_validate(
@@ -92,55 +90,55 @@ def test_descents_are_measured(case: int) -> None:
     )
     streams = Streams(1, "truth", case)
     row = DescentScenario().run(p, streams).row
-    (given,), (true,) = spies.GIVEN, spies.TRUE
+    (inputs,), (true,) = spies.GIVEN, spies.TRUE
     assert isinstance(true, ScoredDescent)
-    camera = camera_optics(p.camera).camera.binned(columns=1, rows=p.detector.rows_summed)
-    response = Detector.drawn(camera_optics(p.camera).fall_off, p.detector, streams.generator("detector response"))
-    assert_flight_is_measured(given, true, camera, [float(row[f"altitude_{k}_m"]) for k in (1, 2, 3)])
-    assert_flat_field_apart(given.images[0].calibration.flat_field, response)
+    camera = camera_optics(p.camera).camera.bin(columns=1, rows=p.detector.rows_summed)
+    response = Detector.draw(camera_optics(p.camera).fall_off, p.detector, streams.generator("detector response"))
+    assert_flight_inputs_differ(inputs, true, camera, [float(row[f"altitude_{k}_m"]) for k in (1, 2, 3)])
+    assert_flat_field_differs(inputs.images[0].calibration.flat_field, response)
     times = np.array(p.picture_times_s)
-    for image, attitude, time_s in zip(given.images, given.attitudes, times, strict=True):
-        assert_apart("time tag", image.time_s, time_s)
-        assert_apart("attitude's time tag", attitude.time_s, time_s)
-    moved = np.diff([state.position_m for state in true.states], axis=0)
-    assert_apart("interval velocities", given.interval_velocities_m_s, moved / np.diff(times)[:, None])
-    for inertial, state in zip(given.inertial_velocities_m_s, true.states, strict=True):
-        assert_apart("inertial velocity", inertial, state.velocity_m_s)
+    for image, attitude, time_s in zip(inputs.images, inputs.attitudes, times, strict=True):
+        assert_differs("time tag", image.time_s, time_s)
+        assert_differs("attitude's time tag", attitude.time_s, time_s)
+    transformed = np.diff([state.position_m for state in true.states], axis=0)
+    assert_differs("interval velocities", inputs.interval_velocities_m_s, transformed / np.diff(times)[:, None])
+    for inertial, state in zip(inputs.inertial_velocities_m_s, true.states, strict=True):
+        assert_differs("inertial velocity", inertial, state.velocity_m_s)
 
 
-def assert_flight_is_measured(
-    given: DescentMeasurements, true: ScoredFlight, camera: CameraModel, altitudes_m: list[float]
+def assert_flight_inputs_differ(
+    inputs: DescentMeasurements, true: ScoredFlight, camera: CameraModel, altitudes_m: list[float]
 ) -> None:
-    """Cameras, attitudes and altitudes."""
+    """Assert that cameras, attitudes and altitudes differ from the truth."""
     names = {"images", "attitudes", "altitudes", "interval_velocities_m_s", "sun_direction", "inertial_velocities_m_s"}
-    assert_all_are_looked_at(DescentMeasurements, names)
+    assert_all_fields_are_compared(DescentMeasurements, names)
     for image, attitude, altitude, state, altitude_m in zip(
-        given.images, given.attitudes, given.altitudes, true.states, altitudes_m, strict=True
+        inputs.images, inputs.attitudes, inputs.altitudes, true.states, altitudes_m, strict=True
     ):
-        assert_cameras_apart("camera", image.camera, camera)
-        assert_rotations_apart("attitude", attitude.world_from_body, state.attitude)
-        assert_apart("altitude", altitude.altitude_m, altitude_m)
+        assert_cameras_differ("camera", image.camera, camera)
+        assert_rotations_differ("attitude", attitude.world_from_body, state.attitude)
+        assert_differs("altitude", altitude.altitude_m, altitude_m)
 
 
 @pytest.mark.parametrize("case", range(3))
-def test_triples_of_the_field_test_are_measured(case: int) -> None:
-    """Their time tags are a virtual interval apart by the paper's method (III.D), whenever they were taken."""
-    from tests.scenarios.test_fieldtest import stated
+def test_field_test_inputs_differ_from_truth(case: int) -> None:
+    """The time tags are one virtual interval apart, as in the paper (III.D)."""
+    from tests.scenarios.test_fieldtest import make_parameters
 
-    runs = [stated().runs[4].model_dump() | {"same_direction": 0, "opposite_direction": 0}]
-    p = stated(runs=runs, algorithm="tests.scenarios.spies:VelocitySpy", **SPIES)
+    runs = [make_parameters().runs[4].model_dump() | {"same_direction": 0, "opposite_direction": 0}]
+    p = make_parameters(runs=runs, algorithm="tests.scenarios.spies:VelocitySpy", **SPIES)
     row = FieldTestScenario().run(p, Streams(5, "test", case)).row
-    (given,), (true,) = spies.GIVEN, spies.TRUE
-    camera = field_camera().binned(columns=1, rows=p.detector.rows_summed)
-    assert_flight_is_measured(given, true, camera, [float(row[f"altitude_{k}_m"]) for k in (1, 2, 3)])
-    moved = np.diff([state.position_m for state in true.states], axis=0)
-    assert_apart("interval velocities", given.interval_velocities_m_s, moved / p.triples.virtual_interval_s)
+    (inputs,), (true,) = spies.GIVEN, spies.TRUE
+    camera = field_camera().bin(columns=1, rows=p.detector.rows_summed)
+    assert_flight_inputs_differ(inputs, true, camera, [float(row[f"altitude_{k}_m"]) for k in (1, 2, 3)])
+    transformed = np.diff([state.position_m for state in true.states], axis=0)
+    assert_differs("interval velocities", inputs.interval_velocities_m_s, transformed / p.triples.virtual_interval_s)
 
 
 @pytest.mark.parametrize("helicopter", [None, {}])
 @pytest.mark.parametrize("case", range(3))
-def test_landings_are_measured(case: int, helicopter: dict[str, Any] | None) -> None:
-    """Time tags are exact by assumption: what a clock's error does is in the errors of the poses."""
+def test_landing_inputs_differ_from_truth(case: int, helicopter: dict[str, Any] | None) -> None:
+    """Time tags are exact by assumption: pose errors include the clock error."""
     p = LandingScenarioParameters.model_validate(
         {
             "site": "heli-benign",
@@ -151,23 +149,25 @@ def test_landings_are_measured(case: int, helicopter: dict[str, Any] | None) -> 
         }
     )
     row: dict[str, Scalar] = dict(LandingScenario().run(p, Streams(1, "truth", case)).row)
-    (given,), (true,) = spies.GIVEN, spies.TRUE
-    assert_all_are_looked_at(LandingMeasurements, {"images", "poses", "slant_range_m", "up_body", "apriori_site_world"})
-    for image, pose, state in zip(given.images, given.poses, true.states, strict=True):
-        assert_cameras_apart("camera", image.camera, p.optics.binned(columns=1, rows=p.detector.rows_summed))
-        assert_poses_apart("pose", pose.world_from_body, rigid(state.attitude, state.position_m))
+    (inputs,), (true,) = spies.GIVEN, spies.TRUE
+    assert_all_fields_are_compared(
+        LandingMeasurements, {"images", "poses", "slant_range_m", "up_body", "apriori_site_world"}
+    )
+    for image, pose, state in zip(inputs.images, inputs.poses, true.states, strict=True):
+        assert_cameras_differ("camera", image.camera, p.optics.bin(columns=1, rows=p.detector.rows_summed))
+        assert_poses_differ("pose", pose.world_from_body, rigid(state.attitude, state.position_m))
     first, range_m = true.states[0], float(row["range_m"])
-    assert_apart("slant range", given.slant_range_m, range_m)
-    assert_apart("vertical", given.up_body, first.attitude.inv().apply([0.0, 0.0, 1.0]))
-    site = given.apriori_site_world
-    assert_apart("a-priori site", site, first.world_from_body.apply(range_m * np.array(p.optics.a)))
-    for pose in (given.poses[0].world_from_body, first.world_from_body):
-        assert_apart("distance of the a-priori site", np.linalg.norm(site - pose.translation), range_m)
+    assert_differs("slant range", inputs.slant_range_m, range_m)
+    assert_differs("vertical", inputs.up_body, first.attitude.inv().apply([0.0, 0.0, 1.0]))
+    site = inputs.apriori_site_world
+    assert_differs("a-priori site", site, first.world_from_body.apply(range_m * np.array(p.optics.a)))
+    for pose in (inputs.poses[0].world_from_body, first.world_from_body):
+        assert_differs("distance of the a-priori site", np.linalg.norm(site - pose.translation), range_m)
 
 
 @pytest.mark.parametrize("case", range(2))
-def test_stops_of_a_rover_are_measured(case: int) -> None:
-    """The estimated pose is right at the start by definition, and from then on never again."""
+def test_rover_inputs_differ_from_truth(case: int) -> None:
+    """The estimated pose is exact by definition at the start only."""
     from tests.scenarios.rover.short_run import SHORT
 
     p = RoverScenarioParameters.model_validate({**SHORT, "algorithm": "tests.scenarios.spies:TrackerSpy"})
@@ -175,17 +175,17 @@ def test_stops_of_a_rover_are_measured(case: int) -> None:
     aims = [one for one in spies.GIVEN if isinstance(one, tuple)]
     updates = [one for one in spies.GIVEN if isinstance(one, RoverMeasurements)]
     assert len(aims) == len(updates) == len(run.stops) >= 3
-    assert_all_are_looked_at(
+    assert_all_fields_are_compared(
         RoverMeasurements, {"left", "right", "mast", "azimuth_rad", "elevation_rad", "world_from_rover"}
     )
-    assert_all_are_looked_at(MastCalibration, {"geometry", "left", "right"})
-    for stop, (aim_pose, aim_mast), given in zip(run.stops, aims, updates, strict=True):
-        for mast in (aim_mast, given.mast):
-            assert_cameras_apart("left camera", mast.left, run.rig.left)
-            assert_cameras_apart("right camera", mast.right, run.rig.right)
+    assert_all_fields_are_compared(MastCalibration, {"geometry", "left", "right"})
+    for stop, (aim_pose, aim_mast), inputs in zip(run.stops, aims, updates, strict=True):
+        for mast in (aim_mast, inputs.mast):
+            assert_cameras_differ("left camera", mast.left, run.rig.left)
+            assert_cameras_differ("right camera", mast.right, run.rig.right)
         true = stop.stance.world_from_rover
-        head = mast.geometry.rover_from_head(given.azimuth_rad, given.elevation_rad)
-        assert_rotations_apart("mast's angles", head.rotation, (true.inv() * stop.world_from_head).rotation)
+        head = mast.geometry.rover_from_head(inputs.azimuth_rad, inputs.elevation_rad)
+        assert_rotations_differ("mast's angles", head.rotation, (true.inv() * stop.world_from_head).rotation)
         if stop is not run.stops[0]:
-            assert_poses_apart("pose", given.world_from_rover, true)
-            assert_poses_apart("pose of an aim", aim_pose, true)
+            assert_poses_differ("pose", inputs.world_from_rover, true)
+            assert_poses_differ("pose of an aim", aim_pose, true)

@@ -1,3 +1,5 @@
+"""Tests of reference frames and rigid transforms."""
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -20,20 +22,20 @@ def test_site_axes_are_north_east_down() -> None:
     assert np.linalg.det(SITE_FROM_WORLD.as_matrix()) == pytest.approx(1.0)
 
 
-def test_rigid_rotates_then_translates() -> None:
+def test_rigid_transform_rotates_then_translates() -> None:
     quarter_turn = Rotation.from_euler("z", 90, degrees=True)
     moved = rigid(quarter_turn, np.array([10.0, 0.0, 0.0])).apply([1.0, 0.0, 0.0])
     np.testing.assert_allclose(moved, [10.0, 1.0, 0.0], atol=1e-15)
 
 
-def test_transforms_made_without_checks_are_scipys() -> None:
-    turns, places = Rotation.random(20, rng=1), np.random.default_rng(1).normal(size=(20, 3))
-    for turn, place in zip(turns, places, strict=True):
-        checked = RigidTransform.from_components(place, turn)
+def test_unchecked_transforms_match_scipy() -> None:
+    turns, positions = Rotation.random(20, rng=1), np.random.default_rng(1).normal(size=(20, 3))
+    for turn, position in zip(turns, positions, strict=True):
+        checked = RigidTransform.from_components(position, turn)
         np.testing.assert_allclose(
-            rigid_from_axes(turn.as_matrix(), place).as_matrix(), checked.as_matrix(), atol=1e-15
+            rigid_from_axes(turn.as_matrix(), position).as_matrix(), checked.as_matrix(), atol=1e-15
         )
-        twice = compose(checked, rigid(turns[0], places[0]))
+        twice = compose(checked, rigid(turns[0], positions[0]))
         np.testing.assert_allclose(
-            twice.as_matrix(), (checked * rigid(turns[0], places[0])).as_matrix(), rtol=0.0, atol=4e-15
+            twice.as_matrix(), (checked * rigid(turns[0], positions[0])).as_matrix(), rtol=0.0, atol=4e-15
         )

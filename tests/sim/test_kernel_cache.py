@@ -1,3 +1,5 @@
+"""Tests of the cache of compiled kernels."""
+
 import os
 import shutil
 import subprocess
@@ -11,12 +13,12 @@ from marsyard.sim.kernel_cache import kernels_are_ready, mark_ready
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def _folder(sources: Path, cache: Path, **environment: str) -> str:
-    kept = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+def _print_cache_folder(sources: Path, cache: Path, **environment: str) -> str:
+    stored = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
     done = subprocess.run(
         [sys.executable, "-c", "import os, marsyard.sim; print(os.environ['NUMBA_CACHE_DIR'])"],
         cwd=sources,
-        env=kept | {"MARSYARD_CACHE": str(cache), "PYTHONPATH": str(sources)} | environment,
+        env=stored | {"MARSYARD_CACHE": str(cache), "PYTHONPATH": str(sources)} | environment,
         capture_output=True,
         text=True,
         check=True,
@@ -26,23 +28,21 @@ def _folder(sources: Path, cache: Path, **environment: str) -> str:
 
 
 @pytest.mark.parametrize("kernels", ["sim/terrain/kernels.py", "algorithms/hda/kernels/motion.py"])
-def test_a_changed_kernel_is_compiled_again_with_all_that_call_it(kernels: str, tmp_path: Path) -> None:
+def test_changed_kernel_recompiles_its_callers(kernels: str, tmp_path: Path) -> None:
     sources = tmp_path / "sources"
     shutil.copytree(ROOT / "marsyard", sources / "marsyard", ignore=shutil.ignore_patterns("__pycache__"))
-    before = _folder(sources, tmp_path / "cache")
-    assert _folder(sources, tmp_path / "cache") == before
+    before = _print_cache_folder(sources, tmp_path / "cache")
+    assert _print_cache_folder(sources, tmp_path / "cache") == before
     changed = sources / "marsyard" / kernels
     changed.write_text(changed.read_text() + "\n# changed\n")
-    assert _folder(sources, tmp_path / "cache") != before
+    assert _print_cache_folder(sources, tmp_path / "cache") != before
 
 
-def test_the_users_own_choice_stands(tmp_path: Path) -> None:
-    assert _folder(ROOT, tmp_path, NUMBA_CACHE_DIR="/somewhere") == "/somewhere"
+def test_user_cache_folder_is_kept(tmp_path: Path) -> None:
+    assert _print_cache_folder(ROOT, tmp_path, NUMBA_CACHE_DIR="/somewhere") == "/somewhere"
 
 
-def test_who_has_run_with_the_kernels_is_noted_until_they_change(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_completed_runs_are_recorded_until_kernels_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "one"))
     assert not kernels_are_ready("descent")
     mark_ready("descent")
@@ -52,7 +52,7 @@ def test_who_has_run_with_the_kernels_is_noted_until_they_change(
     assert not kernels_are_ready("descent")
 
 
-def test_where_nothing_can_be_kept_nobody_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unwritable_cache_records_no_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NUMBA_CACHE_DIR")
     mark_ready("descent")
     assert not kernels_are_ready("descent")

@@ -1,3 +1,5 @@
+"""Tests of random number streams and their keys."""
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -6,17 +8,17 @@ from benchmarks.validation.sampling_checks import all_seeds, collisions, seeds, 
 from marsyard.sim.streams import Streams, stream_key
 
 
-def _first(streams: Streams, name: str) -> tuple[int, ...]:
+def _draw_first(streams: Streams, name: str) -> tuple[int, ...]:
     return tuple(streams.generator(name).integers(0, 2**63, 2))
 
 
-def test_a_stream_depends_on_its_key_alone() -> None:
+def test_stream_depends_only_on_its_key() -> None:
     one = Streams(7, "campaign", 3)
-    alone = _first(one, "wind")
-    _first(one, "sun")
+    alone = _draw_first(one, "wind")
+    _draw_first(one, "sun")
     one.generator("wind").standard_normal(100)
-    assert _first(one, "wind") == alone
-    assert _first(Streams(7, "campaign", 3), "wind") == alone
+    assert _draw_first(one, "wind") == alone
+    assert _draw_first(Streams(7, "campaign", 3), "wind") == alone
 
 
 @given(
@@ -25,11 +27,11 @@ def test_a_stream_depends_on_its_key_alone() -> None:
     cases=st.sets(st.integers(0, 2**31), min_size=2, max_size=2),
     names=st.sets(st.text(max_size=5), min_size=2, max_size=2),
 )
-def test_every_part_of_the_key_selects_another_stream(
+def test_each_key_part_selects_another_stream(
     seeds: set[int], campaigns: set[str], cases: set[int], names: set[str]
 ) -> None:
     firsts = {
-        _first(Streams(seed, campaign, case), name)
+        _draw_first(Streams(seed, campaign, case), name)
         for seed in seeds
         for campaign in campaigns
         for case in cases
@@ -38,33 +40,33 @@ def test_every_part_of_the_key_selects_another_stream(
     assert len(firsts) == 16
 
 
-def test_parts_of_the_key_do_not_run_together() -> None:
-    """Names are hashed whole: no two keys share words by shifting letters between their parts."""
-    assert _first(Streams(0, "ab", 0), "c") != _first(Streams(0, "a", 0), "bc")
-    assert _first(Streams(1, "a", 0), "b") != _first(Streams(0, "a", 1), "b")
+def test_key_parts_are_hashed_separately() -> None:
+    """Names are hashed completely: moving letters between parts gives another key."""
+    assert _draw_first(Streams(0, "ab", 0), "c") != _draw_first(Streams(0, "a", 0), "bc")
+    assert _draw_first(Streams(1, "a", 0), "b") != _draw_first(Streams(0, "a", 1), "b")
 
 
 def test_streams_of_neighbouring_cases_are_uncorrelated() -> None:
     draws = np.stack([Streams(1, "c", case).generator("x").standard_normal(1000) for case in range(20)])
     correlation = np.corrcoef(draws) - np.eye(20)
-    # 190 pairs of 1,000 draws: the largest of them stays below 4.5 standard errors
+    # 190 pairs of 1,000 draws: the largest correlation is below 4.5 standard errors.
     assert np.abs(correlation).max() < 4.5 / np.sqrt(1000)
 
 
 @given(
     seed=st.integers(0, 2**63 - 1), campaign=st.text(max_size=5), case=st.integers(0, 2**31), name=st.text(max_size=5)
 )
-def test_seeds_are_worked_out_as_numpy_does(seed: int, campaign: str, case: int, name: str) -> None:
-    ours = seeds(stream_words(seed, campaign, np.array([case]), name))[0]
+def test_seeds_match_numpy(seed: int, campaign: str, case: int, name: str) -> None:
+    actual = seeds(stream_words(seed, campaign, np.array([case]), name))[0]
     numpys = np.random.SeedSequence(seed, spawn_key=stream_key(campaign, case, name)).pool
-    assert ours.tolist() == numpys.view(np.uint64).tolist()
+    assert actual.tolist() == numpys.view(np.uint64).tolist()
 
 
 def test_no_two_of_four_hundred_thousand_streams_share_a_seed() -> None:
-    """By chance that is one in 4e27; `make validate` does it with ten million."""
+    """The probability of a collision is 1 in 4e27; `make validate` tests ten million."""
     names = [*(f"dispersion:{letter}" for letter in "abcdefghijklmnop"), "gusts", "landing", "altimeter", "clock"]
-    found = all_seeds(campaigns=10, cases=2000, names=names)
-    assert len(found) == 400_000
-    assert collisions(found) == 0
-    # and it would be seen
-    assert collisions(np.concatenate([found, found[7:9]])) == 2
+    result = all_seeds(campaigns=10, cases=2000, names=names)
+    assert len(result) == 400_000
+    assert collisions(result) == 0
+    # A duplicate would be detected.
+    assert collisions(np.concatenate([result, result[7:9]])) == 2

@@ -1,4 +1,4 @@
-"""A rendered descent campaign as a user runs it: the command line, worker processes, files, replay."""
+"""System test of a rendered descent campaign: command line, worker processes, files and replay."""
 
 import json
 import subprocess
@@ -16,7 +16,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
 ]
 
-#: The smoke campaign over a small world, with fewer dispersions.
+#: The smoke campaign on small terrain with fewer dispersions.
 CAMPAIGN = """
 name = "small-descents"
 scenario = "descent"
@@ -48,104 +48,103 @@ population = "valid"
 """
 
 
-def _marsyard(*words: str, cwd: Path) -> Result:
+def _run_marsyard(*words: str, cwd: Path) -> Result:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(cwd)
-        patch.setattr(sys, "path", [*sys.path])  # commands add their folder, which holds misleading modules here
+        patch.setattr(sys, "path", [*sys.path])  # restores the path: commands add the folder
         return CliRunner().invoke(app, words)
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the campaign's file and its runs A (one worker) and B (two workers)."""
+    """Run the campaign with one worker (folder A) and with two workers (folder B)."""
     folder = tmp_path_factory.mktemp("runs")
     (folder / "small.toml").write_text(CAMPAIGN)
-    # a user's own files by the names of Marsyard's folders are no part of it
+    # modules of the user with the names of Marsyard's packages must not be imported
     (folder / "sim.py").write_text("raise ImportError('the wrong module')\n")
     for name in ("reports", "tests"):
         (folder / name).mkdir()
         (folder / name / "__init__.py").write_text("raise ImportError('the wrong module')\n")
     words = [sys.executable, "-m", "marsyard", "run", "small.toml", "--jobs", "1", "--out", "A"]
-    alone = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=300)
-    assert alone.returncode == 3, alone.stdout + alone.stderr
-    in_process = _marsyard("run", "small.toml", "--jobs", "2", "--out", "B", cwd=folder)
-    assert in_process.exit_code == 3, in_process.output
-    for output in (alone.stdout, in_process.stdout):
+    subprocess_run = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=300)
+    assert subprocess_run.returncode == 3, subprocess_run.stdout + subprocess_run.stderr
+    in_process_run = _run_marsyard("run", "small.toml", "--jobs", "2", "--out", "B", cwd=folder)
+    assert in_process_run.exit_code == 3, in_process_run.output
+    for output in (subprocess_run.stdout, in_process_run.stdout):
         assert "INSUFFICIENT" in output
         assert "report.html" in output
     return folder
 
 
-def _rows(folder: Path) -> pd.DataFrame:
+def _read_rows(folder: Path) -> pd.DataFrame:
     rows = pd.read_parquet(folder / "cases.parquet")
     return rows[[name for name in rows.columns if "time" not in name]]
 
 
 def test_rows_do_not_depend_on_the_number_of_workers(runs: Path) -> None:
-    one, two = _rows(runs / "A"), _rows(runs / "B")
-    pd.testing.assert_frame_equal(one, two, check_exact=True)
-    assert one["case"].tolist() == [0, 1, 2, 3, 4]
-    assert one["image_hash"].nunique() == 5
+    rows_of_one_worker, rows_of_two_workers = _read_rows(runs / "A"), _read_rows(runs / "B")
+    pd.testing.assert_frame_equal(rows_of_one_worker, rows_of_two_workers, check_exact=True)
+    assert rows_of_one_worker["case"].tolist() == [0, 1, 2, 3, 4]
+    assert rows_of_one_worker["image_hash"].nunique() == 5
 
 
 def test_velocities_are_scored_against_truth(runs: Path) -> None:
-    rows = _rows(runs / "A")
+    rows = _read_rows(runs / "A")
     valid = rows[rows["outcome"] == "VALID"]
     assert len(valid) >= 4
-    # ten times what instruments of this class leave: a frame or a sign wrong gives tens of metres per second
+    # 10 times the expected error; a wrong frame or sign gives tens of metres per second
     assert (valid["velocity_error_m_s"] < 3.0).all()
     assert valid["velocity_true_x_m_s"].abs().max() > 5.0
 
 
-def test_drawn_values_were_applied(runs: Path) -> None:
-    """The dispersed values show in what was simulated."""
-    rows = _rows(runs / "A")
+def test_dispersed_values_are_simulated(runs: Path) -> None:
+    rows = _read_rows(runs / "A")
     assert set(rows["terrain"]) == {0, 1}
     assert rows["location_east_m"].between(0.0, 3000.0).all()
     assert rows["location_east_m"].nunique() == 5
     assert rows["attitude_rate_max_deg_s"].nunique() == 5
 
 
-def test_a_replayed_case_is_the_stored_one(runs: Path) -> None:
-    done = _marsyard("replay", "A", "3", "--out", "replayed", cwd=runs)
-    assert done.exit_code == 0, done.output
+def test_replayed_case_equals_the_stored_row(runs: Path) -> None:
+    result = _run_marsyard("replay", "A", "3", "--out", "replayed", cwd=runs)
+    assert result.exit_code == 0, result.output
     assert any((runs / "replayed").iterdir())
 
 
-def test_a_row_that_differs_is_named(runs: Path, tmp_path: Path) -> None:
+def test_differing_row_is_reported(runs: Path, tmp_path: Path) -> None:
     changed = tmp_path / "changed"
     changed.mkdir()
     (changed / "campaign.json").write_text((runs / "A" / "campaign.json").read_text())
     rows = pd.read_parquet(runs / "A" / "cases.parquet")
     rows["velocity_true_x_m_s"] += 1e-9 * (rows.index == 2)
     rows.to_parquet(changed / "cases.parquet")
-    done = _marsyard("replay", str(changed), "2", "--out", str(tmp_path / "again"), cwd=tmp_path)
-    assert done.exit_code == 1
-    assert "velocity_true_x_m_s" in done.output
+    result = _run_marsyard("replay", str(changed), "2", "--out", str(tmp_path / "again"), cwd=tmp_path)
+    assert result.exit_code == 1
+    assert "velocity_true_x_m_s" in result.output
 
 
-def test_the_run_says_what_it_was(runs: Path) -> None:
+def test_record_describes_the_run(runs: Path) -> None:
     record = json.loads((runs / "A" / "campaign.json").read_text())
     text = json.dumps(record)
     assert record["state"] == "finished"
-    for needed in ("small-descents", "numpy", "pyrender2", "descent.wind_east_m_s"):
-        assert needed in text
+    for text_part in ("small-descents", "numpy", "pyrender2", "descent.wind_east_m_s"):
+        assert text_part in text
     rows = pd.read_parquet(runs / "A" / "cases.parquet")
     assert {"gl_backend", "gl_version", "processor_features"} <= set(rows.columns)
     assert rows["gl_version"].str.contains("Mesa|NVIDIA").all()
     assert "changed its worker process" not in (runs / "A" / "run.log").read_text()
 
 
-def test_an_existing_campaign_is_not_overwritten(runs: Path) -> None:
+def test_existing_campaign_is_not_overwritten(runs: Path) -> None:
     before = (runs / "A" / "cases.parquet").read_bytes()
-    done = _marsyard("run", "small.toml", "--out", "A", cwd=runs)
-    assert done.exit_code == 2
-    assert "A" in done.stderr
+    result = _run_marsyard("run", "small.toml", "--out", "A", cwd=runs)
+    assert result.exit_code == 2
+    assert "A" in result.stderr
     assert (runs / "A" / "cases.parquet").read_bytes() == before
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
         (("run", "small.toml", "--set", "descent.altitud_first_m=1500"), "altitud_first_m"),
         (("run", "small.toml", "--set", "descent.altitude_first_m=-5"), "altitude_first_m"),
@@ -157,8 +156,8 @@ def test_an_existing_campaign_is_not_overwritten(runs: Path) -> None:
         (("report", "nowhere"), "nowhere"),
     ],
 )
-def test_bad_input_is_named_with_exit_code_2(runs: Path, words: tuple[str, ...], says: str) -> None:
-    done = _marsyard(*words, cwd=runs)
-    assert done.exit_code == 2, done.output
-    assert says in done.stderr
-    assert "Traceback" not in done.output
+def test_invalid_input_is_reported_with_exit_code_2(runs: Path, words: tuple[str, ...], message: str) -> None:
+    result = _run_marsyard(*words, cwd=runs)
+    assert result.exit_code == 2, result.output
+    assert message in result.stderr
+    assert "Traceback" not in result.output

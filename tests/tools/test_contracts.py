@@ -9,9 +9,9 @@ ROOT = Path(__file__).resolve().parents[2]
 #: All that an algorithm may know of the simulated world (docs/architecture.md).
 OPEN_TO_ALGORITHMS = {"marsyard.sim.frames", "marsyard.sim.camera", "marsyard.sim.measurements"}
 #: What `marsyard.sim.camera` reads files with: checks of files, which hold no truth.
-BELOW_THE_CAMERAS = {"marsyard.sim.files"}
+BELOW_THE_CAMERAS = {"marsyard.sim.cache"}
 #: The base class of parameters and its types of fields: no world, and no truth.
-BASE_OF_PARAMETERS = {"marsyard.sim.parameters", "marsyard.sim.renamed"}
+BASE_OF_PARAMETERS = {"marsyard.sim.parameters"}
 
 
 def test_all_of_sim_but_the_flight_interface_is_closed_to_algorithms() -> None:

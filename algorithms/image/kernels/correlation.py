@@ -21,7 +21,7 @@ FLAT_ENERGY = 1e-12
 
 
 @njit(cache=True)
-def centred(image: Image) -> tuple[Image, float]:
+def subtract_mean(image: Image) -> tuple[Image, float]:
     """The image less its mean; and its largest absolute value before."""
     total, largest = 0.0, 0.0
     for i in range(image.shape[0]):

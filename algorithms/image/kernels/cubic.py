@@ -28,9 +28,9 @@ def sample(coefficients: Array, pixels: Array, row: int, column: int, values: Ar
             inside = r >= 0 and c >= 0 and r + 3 < rows and c + 3 < columns
             total = 0.0
             for a in range(4):
-                line = coefficients[r + a if inside else _mirrored(r + a, rows)]
+                line = coefficients[r + a if inside else _mirror_index(r + a, rows)]
                 for b in range(4):
-                    total += line[c + b if inside else _mirrored(c + b, columns)] * down[a] * across[b]
+                    total += line[c + b if inside else _mirror_index(c + b, columns)] * down[a] * across[b]
             values[i, j] = total
 
 
@@ -45,7 +45,7 @@ def _weights(fraction: float, weights: Array) -> None:
 
 
 @njit(cache=True)
-def _mirrored(index: int, size: int) -> int:
+def _mirror_index(index: int, size: int) -> int:
     """The index within 0 .. size - 1 that one beyond stands for."""
     if size == 1:
         return 0

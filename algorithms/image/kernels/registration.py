@@ -59,7 +59,7 @@ def products(rows: Array) -> Array:
 
 
 @njit(cache=True)
-def projected(rows: Array, values: Array, sums: Array) -> None:
+def project(rows: Array, values: Array, sums: Array) -> None:
     """``rows^T values``."""
     sums[:] = 0.0
     for k in range(rows.shape[0]):
@@ -172,7 +172,7 @@ def register(
         if not inside:
             return failed
         values -= values.mean()
-        projected(rows, values, solution)
+        project(rows, values, solution)
         spread = math.sqrt(np.sum(values * values))
         if not (solution[0] > 0.0 and spread > 0.0):
             return failed

@@ -45,7 +45,7 @@ class Chain(NamedTuple):
 
 
 class WindField(NamedTuple):
-    """Mean wind and gusts as functions of height: see `marsyard.sim.dynamics.wind`.
+    """Mean wind and gusts as functions of height: see `marsyard.sim.dynamics.trajectory`.
 
     A row of `waves`: wavenumber, rad/m; amplitudes east, north and up of its cosine, then of its sine.
     """

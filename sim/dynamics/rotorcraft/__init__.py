@@ -27,7 +27,7 @@ from pydantic import Field
 
 from marsyard.sim.dynamics.rotorcraft import kernels
 from marsyard.sim.dynamics.trajectory import Motion, Trajectory, attitudes_and_body_rates, check_times
-from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded
+from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded_field
 
 Gain = Annotated[float, Field(gt=0.0, le=10.0)]
 
@@ -49,8 +49,8 @@ class VibrationParameters(Parameters):
 class AirParameters(Parameters):
     """Wind at the helicopter: a mean, and gusts correlated in time (first-order, as Dryden's along the flow)."""
 
-    east_m_s: Annotated[float, bounded(-15.0, 15.0, "mean wind to the east")] = 1.0
-    north_m_s: Annotated[float, bounded(-15.0, 15.0, "mean wind to the north")] = 1.0
+    east_m_s: Annotated[float, bounded_field(-15.0, 15.0, "mean wind to the east")] = 1.0
+    north_m_s: Annotated[float, bounded_field(-15.0, 15.0, "mean wind to the north")] = 1.0
     gust_m_s: Annotated[NonNegative, Field(le=5.0, description="RMS of the gusts per horizontal axis")] = 0.7
     vertical_gust_m_s: Annotated[NonNegative, Field(le=5.0, description="RMS of the vertical gusts")] = 0.2
     correlation_s: Annotated[Positive, Field(le=60.0, description="correlation time of the gusts")] = 2.0
@@ -106,7 +106,7 @@ class TransitParameters(Parameters):
     acceleration_m_s2: Annotated[Positive, Field(le=3.0, description="to that speed (assumed)")] = 1.0
     hover_s: Annotated[NonNegative, Field(le=600.0, description="duration of the hover before, s (assumed)")] = 15.0
     settle_s: Annotated[NonNegative, Field(le=60.0, description="at speed before the first picture (assumed)")] = 1.5
-    pictures: Annotated[int, bounded(2, 1000, "pictures taken")] = 40
+    pictures: Annotated[int, bounded_field(2, 1000, "pictures taken")] = 40
     pictures_s: Annotated[Positive, Field(le=120.0, description="from the first to the last picture, s")] = 5.0
 
     @property

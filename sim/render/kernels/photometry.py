@@ -148,9 +148,9 @@ def _add_octave(
     for k in range(x.size):
         ratio = footprint[k] / cell
         fade = max(1.0 - FADING * ratio * ratio, 0.0)
-        seen = strength[k] * amplitude * (fade * fade)
-        noise = gradient_noise(x[k] / cell, y[k] / cell, z[k] / cell, number)
-        change[k] += seen * noise - 0.5 * NOISE_VARIANCE * seen**2
+        faded = strength[k] * amplitude * (fade * fade)
+        noise = gradient_noise(x[k] / cell, y[k] / cell, z[k] / cell, octave)
+        change[k] += faded * noise - 0.5 * NOISE_VARIANCE * faded**2
 
 
 @njit(cache=True)

@@ -21,18 +21,7 @@ from marsyard.sim.render.kernels.strips import (
     spline,
     unpack_matrix,
 )
-from marsyard.sim.render.kernels.structs import (
-    Array32,
-    Ground,
-    GroundLevel,
-    Hits,
-    Ints,
-    Longs,
-    Pose,
-    Ray,
-    Rays,
-    Views,
-)
+from marsyard.sim.render.kernels.structs import Array32, Ground, GroundLevel, Hits, Ints, Longs, Pose, Ray, Rays, Views
 from marsyard.sim.terrain.kernels import Array, Level
 
 #: Smallest sine of the angle between ray and ground by which a footprint is elongated.
@@ -94,11 +83,11 @@ def _hit_object(ids: Ints, face: int, i: int, j: int, tree: Hierarchy, ray: Ray,
     best = TriangleHit(math.inf, -1, 0.0, 0.0)
     last = 0
     for k in range(4):
-        one = ids[face, i + k // 2, j + k % 2]
-        if one <= 0 or one == last:
+        identifier = ids[face, i + k // 2, j + k % 2]
+        if identifier <= 0 or identifier == last:
             continue
-        last = one
-        best = nearer_hit(best, tree[0], one - 1, ray, SLACK)
+        last = identifier
+        best = nearer_hit(best, tree[0], identifier - 1, ray, SLACK)
     if last > 0 and best.triangle < 0:
         best = nearest_hit(tree, ray, farthest)
     return best
@@ -153,8 +142,8 @@ def _interpolate_guesses(pixel_angles: Array32, width: int, work: Array) -> None
         largest = max(max(a, b), max(c, d))
         above = (1.0 - fu) / a + fu / b
         below = (1.0 - fu) / c + fu / d
-        seen = 1.0 / ((1.0 - fv) * above + fv * below)
-        t = seen / work[FORWARD + k] if smallest > 0.0 and largest < 1.1 * smallest else 0.0
+        depth = 1.0 / ((1.0 - fv) * above + fv * below)
+        t = depth / work[FORWARD + k] if smallest > 0.0 and largest < 1.1 * smallest else 0.0
         work[GUESS + k] = t
         work[STRETCHED + k] = t * pixel_angles[k] / max(-work[DZ + k], FLATTEST)
 
@@ -262,8 +251,8 @@ def _select_levels(
     for k in range(width):
         if shown[k] != 0 or work[GUESS + k] == 0.0:
             face = view_of_pixel[first + k]
-            seen = _nearest_depth(depth, ids, shown[k], face, row[k], column[k], work[U + k], work[V + k])
-            work[GUESS + k] = seen / work[FORWARD + k]
+            nearest = _nearest_depth(depth, ids, shown[k], face, row[k], column[k], work[U + k], work[V + k])
+            work[GUESS + k] = nearest / work[FORWARD + k]
             work[STRETCHED + k] = work[GUESS + k] * pixel_angles[k] / max(-work[DZ + k], FLATTEST)
         level_of[k] = 0
         if work[GUESS + k] == 0.0:

@@ -44,11 +44,7 @@ def unpack_matrix(matrix: Array) -> Matrix:
 @njit(cache=True, inline="always")
 def rotate(m: Matrix, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Multiply a matrix by a vector."""
-    return (
-        m[0] * x + m[1] * y + m[2] * z,
-        m[3] * x + m[4] * y + m[5] * z,
-        m[6] * x + m[7] * y + m[8] * z,
-    )
+    return (m[0] * x + m[1] * y + m[2] * z, m[3] * x + m[4] * y + m[5] * z, m[6] * x + m[7] * y + m[8] * z)
 
 
 @njit(cache=True, error_model="numpy")

@@ -205,14 +205,14 @@ class NavigationFilter:
         )
         arrivals = s.times_s + self.rtk.latency_s
         rows = np.column_stack([s.times_s, arrivals, s.positions_m, s.velocities_m_s, wanders, noises, s.fixed])
-        rows[_stuck(s.positions_m, self.parameters.max_repeated_fixes), kernels.GPS_POSITION] = np.nan
+        rows[_is_stuck(s.positions_m, self.parameters.max_repeated_fixes), kernels.GPS_POSITION] = np.nan
         return rows
 
     def _tilt_rows(self, r: TiltCompassReadings) -> Float64[np.ndarray, "n 5"]:
         """Readings in the kernels' columns."""
         rows = np.column_stack([r.times_s, r.up_body, 0.5 * np.pi - r.headings_rad])
         for column, values in ((kernels.UP, r.up_body), (kernels.YAW, r.headings_rad[:, None])):
-            rows[_stuck(values, self.parameters.max_repeated_fixes), column] = np.nan
+            rows[_is_stuck(values, self.parameters.max_repeated_fixes), column] = np.nan
         return rows
 
     def _tuning(self, step_s: float) -> kernels.Tuning:
@@ -249,7 +249,7 @@ def _fraction(errors: SolutionErrors, part: str) -> Float64[np.ndarray, "3"]:
     return np.asarray(np.array(getattr(errors, part)) / np.maximum(errors.total_m, np.finfo(float).tiny))
 
 
-def _stuck(values: Float64[np.ndarray, "n columns"], max_repeats: int) -> Bool[np.ndarray, "n"]:
+def _is_stuck(values: Float64[np.ndarray, "n columns"], max_repeats: int) -> Bool[np.ndarray, "n"]:
     """Whether each reading ends a run of more than `max_repeats` equal ones."""
     same = np.concatenate([[False], np.all(values[1:] == values[:-1], axis=1)])[: len(values)]
     numbers = np.arange(len(values))

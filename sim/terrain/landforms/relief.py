@@ -11,7 +11,7 @@ from numpy.random import Generator
 from pydantic import Field
 from scipy.signal import lfilter
 
-from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded
+from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import Ground, draw_smooth_fields, refine, resample
 from marsyard.sim.terrain.landforms.kernels import (
     Bedforms,
@@ -59,18 +59,18 @@ class Dunes(Parameters):
     repose_deg: Annotated[float, Field(ge=10.0, le=36.0, description="slope of the faces away from the wind")] = 32.0
     crest_length: Annotated[float, Field(ge=0.5, le=50.0, description="length of crests, wavelengths")] = 4.0
     regularity: Annotated[float, Field(ge=0.3, le=20.0, description="wavelengths over which spacing persists")] = 1.5
-    albedo_contrast: Annotated[float, bounded(-1.0, 1.0, "logarithm of crests' albedo over troughs'")] = 0.05
+    albedo_contrast: Annotated[float, bounded_field(-1.0, 1.0, "logarithm of crests' albedo over troughs'")] = 0.05
 
     def apply(self, ground: Ground, rng: Generator) -> None:
         """Add the dunes. The wave is the nearest one, in length and direction, that fits into the period."""
         # the wave travels downwind; azimuth is clockwise from north, x is east
         downwind = np.radians(90.0 - (self.wind_from_deg + 180.0))
         waves = ground.period_m / self.wavelength_m * np.array([np.cos(downwind), np.sin(downwind)])
-        whole = np.round(waves)
-        if not whole.any():
+        cycles = np.round(waves)
+        if not cycles.any():
             side = f"{ground.period_m:g} m"
             raise ValueError(f"dunes.wavelength_m is {self.wavelength_m:g}; the terrain's side is {side}")
-        wave = 2.0 * np.pi * whole / ground.period_m
+        wave = 2.0 * np.pi * cycles / ground.period_m
         across, along = (length * self.wavelength_m / np.sqrt(2.0) for length in (self.crest_length, self.regularity))
         modulation = draw_smooth_fields(ground.period_m, across, along, float(downwind), rng)
         step = max(modulation.shape[0] // ground.side, 1)
@@ -260,7 +260,7 @@ class Gullies(Parameters):
     length_m: Annotated[Positive, Field(description="mean length of a trunk, m")] = 90.0
     tributaries: Annotated[int, Field(ge=0, le=50, description="tributaries of a trunk")] = 4
     downhill_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth they run to")] = 90.0
-    contrast: Annotated[float, bounded(-1.0, 1.0, "log albedo of their floors over the ground's")] = -0.1
+    contrast: Annotated[float, bounded_field(-1.0, 1.0, "log albedo of their floors over the ground's")] = -0.1
 
     def apply(self, ground: Ground, rng: Generator) -> None:
         """Cut the gullies."""

@@ -15,7 +15,7 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
 from marsyard.sim.cache import cache_directory, evict_files, load_array, save_array, touch
-from marsyard.sim.processor import processor_features
+from marsyard.sim.kernel_cache import processor_features
 
 SHAPES_OF_FORM = 16  #: Shapes of each form; the first blocks are angular, the last rounded.
 #: Forms in the order of their shapes' numbers: blocks, and the rough clinker of a'a.
@@ -58,7 +58,7 @@ class ShapeSet:
 def rock_shapes(detail: int) -> ShapeSet:
     """Return the shapes at a level of detail, 0 (`COARSE`) to 3 (`FINEST`); coarser ones are fitted to the finest."""
     directions, faces = _icosphere(detail)
-    normals = _stored(f"normals-{detail}", lambda: np.stack([block.normals(directions) for block in _blocks()]))
+    normals = _load_or_build(f"normals-{detail}", lambda: np.stack([block.normals(directions) for block in _blocks()]))
     return ShapeSet(_vertices(detail), normals, faces, _reach())
 
 
@@ -68,7 +68,7 @@ def max_pixels(bound_px: float = DEVIATION_PX) -> Float64[np.ndarray, "shapes le
 
     The deviation is the distance from the finest shape along its normals, RMS over the part above the ground.
     """
-    return bound_px * _stored("pixels", _max_pixels_per_deviation)
+    return bound_px * _load_or_build("pixels", _max_pixels_per_deviation)
 
 
 def _max_pixels_per_deviation() -> Float64[np.ndarray, "shapes levels"]:
@@ -86,7 +86,6 @@ def _max_pixels_per_deviation() -> Float64[np.ndarray, "shapes levels"]:
 
 @cache
 def _icosphere(detail: int) -> tuple[Float64[np.ndarray, "n 3"], Int32[np.ndarray, "faces 3"]]:
-    """Unit vectors and triangles of the subdivided icosahedron."""
     import trimesh  # here, as it is slow to import
 
     sphere = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS[detail])
@@ -94,7 +93,7 @@ def _icosphere(detail: int) -> tuple[Float64[np.ndarray, "n 3"], Int32[np.ndarra
     return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), np.ascontiguousarray(sphere.faces, np.int32)
 
 
-def _stored(name: str, build: Callable[[], Float64[np.ndarray, "..."]]) -> Float64[np.ndarray, "..."]:
+def _load_or_build(name: str, build: Callable[[], Float64[np.ndarray, "..."]]) -> Float64[np.ndarray, "..."]:
     """An array from the cache of terrains, built where it is missing: all shapes take seconds in every process."""
     identity = f"{Path(__file__).read_text()} {np.__version__} {processor_features()}"
     version = hashlib.sha256(identity.encode()).hexdigest()[:16]
@@ -114,10 +113,10 @@ def _stored(name: str, build: Callable[[], Float64[np.ndarray, "..."]]) -> Float
 
 @cache
 def _vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
-    return _stored(f"vertices-{detail}", lambda: _built_vertices(detail))
+    return _load_or_build(f"vertices-{detail}", lambda: _build_vertices(detail))
 
 
-def _built_vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
+def _build_vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
     directions, _ = _icosphere(detail)
     vertices: Float64[np.ndarray, "shapes vertices 3"] = np.empty((SHAPES, *directions.shape))
     for number, block in enumerate(_blocks()):

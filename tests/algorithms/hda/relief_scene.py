@@ -1,6 +1,5 @@
-"""Textured relief seen through CAHVOR cameras, evaluated exactly: every pixel's ray is followed to the ground.
-
-Independent of what it tests: it goes from pixels to ground by the relief's own formula, never by epipolar geometry.
+"""Textured relief seen through CAHVOR cameras: the ray of each pixel is intersected with the ground. The formula of
+the relief gives the ground; no epipolar geometry is used.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ TEXELS = 2048
 
 @cache
 def camera(columns: int = 320) -> Cahvor:
-    """Looks straight down from 0.3 m before the body's origin, the picture's right to the body's right (-y)."""
+    """Camera 0.3 m in front of the origin of the body that looks straight down; image right is body right (-y)."""
     size = (columns, columns * 3 // 4)
     linear = Cahv.from_focal_length(
         0.006, 7.4e-6 * 640 / columns, size, axis=(0.0, 0.0, -1.0), right=(0.0, -1.0, 0.0), centre=(0.3, 0.0, -0.1)
@@ -46,15 +45,15 @@ def texture() -> np.ndarray:
 
 
 def brightness(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    places = np.stack([y.ravel(), x.ravel()]) / TEXEL_M
-    return ndimage.map_coordinates(texture(), places, order=3, mode="grid-wrap", prefilter=False).reshape(x.shape)
+    positions = np.stack([y.ravel(), x.ravel()]) / TEXEL_M
+    return ndimage.map_coordinates(texture(), positions, order=3, mode="grid-wrap", prefilter=False).reshape(x.shape)
 
 
 def plane(slope_x: float = 0.0, slope_y: float = 0.0) -> Height:
     return lambda x, y: slope_x * x + slope_y * y
 
 
-def bumps(*each: tuple[float, float, float, float], base: Height | None = None) -> Height:
+def make_bumps(*each: tuple[float, float, float, float], base: Height | None = None) -> Height:
     """Smooth bumps (x, y, height, radius) on a base: Gaussians of this standard deviation."""
     under = plane() if base is None else base
 
@@ -68,19 +67,19 @@ def bumps(*each: tuple[float, float, float, float], base: Height | None = None) 
 
 
 def ground_along(height: Height, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Points where rays meet the relief: marched to within a step of it, then bisected; shape of the rays."""
+    """Intersections of rays with the relief, by marching to within one step and bisection; shape of the rays."""
     far = (origin[2] + 2.0) / -rays[..., 2]
     near = np.maximum((origin[2] - 3.0) / -rays[..., 2], 0.0)
     steps = 24
     low, high = near.copy(), far.copy()
-    found = np.zeros(near.shape, dtype=bool)
+    result = np.zeros(near.shape, dtype=bool)
     for n in range(1, steps + 1):
         s = near + (far - near) * n / steps
         p = origin + s[..., None] * rays
-        under = ~found & (p[..., 2] <= height(p[..., 0], p[..., 1]))
+        under = ~result & (p[..., 2] <= height(p[..., 0], p[..., 1]))
         low = np.where(under, s - (far - near) / steps, low)
         high = np.where(under, s, high)
-        found |= under
+        result |= under
     # Regula falsi converges fast on smooth relief; bisection guards it.
     for n in range(30):
         a = origin + low[..., None] * rays
@@ -109,24 +108,24 @@ class Pass:
 
     def camera(self, which: int) -> Cahvor:
         """The camera in the world."""
-        return camera(self.columns).moved(self.poses[which])
+        return camera(self.columns).transform(self.poses[which])
 
     def ground(self, which: int, pixels: np.ndarray) -> np.ndarray:
-        """Points of the relief that pixels see."""
+        """Points of the relief at pixels."""
         one = self.camera(which)
         _, rays = one.rays(pixels)
         return ground_along(self.height, np.array(one.c), rays)
 
     @property
     def slant_range_m(self) -> float:
-        """From the first camera along its optical axis."""
+        """Distance to the ground from the first camera along its optical axis."""
         one = self.camera(0)
         point = ground_along(self.height, np.array(one.c), np.array(one.a)[None])[0]
         return float(np.linalg.norm(point - one.c))
 
     @property
     def second_from_first(self) -> RigidTransform:
-        """The true motion between the camera frames (z along A, x along columns)."""
+        """True motion between the camera frames (z along A, x along columns)."""
         first, second = (rigid(_axes(self.camera(i)), np.array(self.camera(i).c)) for i in (0, 1))
         return second.inv() * first
 
@@ -136,11 +135,11 @@ def _axes(one: Cahvor) -> Rotation:
 
 
 def pose(x: float, y: float, z: float, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> RigidTransform:
-    """A body's pose, angles in degrees."""
+    """Pose of a body, angles in degrees."""
     return rigid(Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True), np.array([x, y, z]))
 
 
-def picture(
+def render_image(
     flown: Pass, which: int, noise: np.random.Generator | None = None, paint: Callable[..., np.ndarray] = brightness
 ) -> DetectorImage:
     """A 12-bit picture, 1500 counts for brightness 1; noise of 8 counts."""
@@ -153,12 +152,12 @@ def picture(
     return DetectorImage(delivered, float(which), camera(flown.columns), known)
 
 
-def measured(flown: Pass, noise: np.random.Generator | None = None) -> LandingMeasurements:
+def measure_pass(flown: Pass, noise: np.random.Generator | None = None) -> LandingMeasurements:
     """Exact measurements of a pass; the a-priori site is the ground below the first pose."""
     below = np.array(flown.poses[0].translation)
     below[2] = float(flown.height(below[0], below[1]))
     return LandingMeasurements(
-        images=(picture(flown, 0, noise), picture(flown, 1, noise)),
+        images=(render_image(flown, 0, noise), render_image(flown, 1, noise)),
         poses=(PoseMeasurement(flown.poses[0], 0.0), PoseMeasurement(flown.poses[1], 1.0)),
         slant_range_m=flown.slant_range_m,
         up_body=flown.poses[0].rotation.inv().apply([0.0, 0.0, 1.0]),

@@ -1,4 +1,4 @@
-"""Elevation maps of known points, and the surface frame."""
+"""Tests of elevation maps from known points, and of the surface frame."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import ElevationMap, HdaOptions, SurfaceFrame
+from marsyard.algorithms.hda.estimator import plane_normal, surface_from_camera, up_direction, world_from_surface
 from marsyard.algorithms.hda.hazards import elevation_map
-from marsyard.algorithms.hda.landing import plane_normal, surface_from_camera, up_direction, world_from_surface
-from marsyard.algorithms.hda.view import View, camera_pose
+from marsyard.algorithms.hda.motion import View, camera_pose
 from tests.algorithms.hda.relief_scene import camera, pose
 
 
-def cloud(count: int, rng: np.random.Generator, slopes: tuple[float, float] = (0.2, -0.1)) -> np.ndarray:
+def draw_points(count: int, rng: np.random.Generator, slopes: tuple[float, float] = (0.2, -0.1)) -> np.ndarray:
     x, y = rng.uniform([-4.0, -3.0], [4.0, 3.0], (count, 2)).T
     return np.column_stack([x, y, -10.0 + slopes[0] * x + slopes[1] * y])
 
 
-def test_cells_hold_about_a_point_each() -> None:
-    points = cloud(600, np.random.default_rng(1))
+def test_cell_size_gives_one_point_per_cell() -> None:
+    points = draw_points(600, np.random.default_rng(1))
     ground = elevation_map(points)
     assert ground is not None
     extent = np.ptp(points[:, :2], axis=0)
-    # s = sqrt(A / N), the paper's; as many whole cells as cover the box.
+    # The paper's cell size s = sqrt(A / N), and the number of whole cells that cover the box.
     assert ground.cell_m == pytest.approx(np.sqrt(extent[0] * extent[1] / 600))
     assert ground.elevation_m.shape == tuple(int(np.ceil(e / ground.cell_m)) for e in extent[::-1])
 
 
-def test_places_of_cells_and_back() -> None:
+def test_cell_positions_invert_to_indices() -> None:
     ground = ElevationMap(np.zeros((4, 6)), np.array([-1.0, 2.0]), 0.5)
     # Rows run along -y, columns along x.
     np.testing.assert_allclose(
@@ -38,8 +38,8 @@ def test_places_of_cells_and_back() -> None:
     np.testing.assert_allclose(ground.cells(ground.places(cells)), cells)
 
 
-def test_points_are_spread_by_bilinear_weights() -> None:
-    # Four corners of a box of 2 x 2 cells and one point in its first cell; by hand.
+def test_points_are_distributed_by_bilinear_weights() -> None:
+    # A box of 2 x 2 cells with four corner points and one point in its first cell, computed by hand.
     points = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 3.0, 4.0], [3.0, 3.0, 0.0], [0.9, 2.1, 8.0]])
     ground = elevation_map(points)
     assert ground is not None
@@ -56,51 +56,49 @@ def test_points_are_spread_by_bilinear_weights() -> None:
     np.testing.assert_allclose(ground.elevation_m, expected)
 
 
-def test_a_plane_comes_out_as_a_plane_where_points_lie_evenly() -> None:
+def test_plane_is_reconstructed_from_even_points() -> None:
     x, y = np.meshgrid(np.arange(40) * 0.25, np.arange(30) * 0.25)
     points = np.column_stack([x.ravel(), y.ravel(), 0.2 * x.ravel() - 0.1 * y.ravel() - 9.0])
     ground = elevation_map(points)
     assert ground is not None
-    places = ground.places(np.moveaxis(np.indices(ground.elevation_m.shape).astype(np.float64), 0, -1))
-    plane = 0.2 * places[..., 0] - 0.1 * places[..., 1] - 9.0
-    # A cell's points lie up to half a cell off its middle to one side: half a cell's rise at most.
+    positions = ground.places(np.moveaxis(np.indices(ground.elevation_m.shape).astype(np.float64), 0, -1))
+    plane = 0.2 * positions[..., 0] - 0.1 * positions[..., 1] - 9.0
+    # Points lie up to half a cell from the cell centre: the error is at most the rise over half a cell.
     assert np.nanmax(np.abs(ground.elevation_m - plane)) < 0.5 * 0.3 * ground.cell_m
     assert not np.any(np.isnan(ground.elevation_m))
 
 
-def test_where_no_points_are_nothing_is_known() -> None:
-    points = cloud(4000, np.random.default_rng(3))
+def test_cells_without_points_are_unknown() -> None:
+    points = draw_points(4000, np.random.default_rng(3))
     points = points[np.hypot(points[:, 0] - 1.0, points[:, 1]) > 1.0]
     ground = elevation_map(points)
     assert ground is not None
-    places = ground.places(np.moveaxis(np.indices(ground.elevation_m.shape).astype(np.float64), 0, -1))
-    distance = np.hypot(places[..., 0] - 1.0, places[..., 1])
+    positions = ground.places(np.moveaxis(np.indices(ground.elevation_m.shape).astype(np.float64), 0, -1))
+    distance = np.hypot(positions[..., 0] - 1.0, positions[..., 1])
     assert np.all(np.isnan(ground.elevation_m[distance < 1.0 - ground.cell_m]))
     assert np.isnan(ground.elevation_m[distance > 1.3]).mean() < 0.05
 
 
-def test_points_in_line_cover_no_area() -> None:
+def test_collinear_points_are_rejected() -> None:
     assert elevation_map(np.column_stack([np.arange(50.0), np.zeros(50), np.zeros(50)])) is None
     assert elevation_map(np.zeros((50, 3))) is None
 
 
-def views(yaw: float, pitch: float, roll: float) -> View:
+def make_view(yaw: float, pitch: float, roll: float) -> View:
     body_from_camera = camera_pose(camera())
     counts = np.zeros((240, 320), dtype=np.uint16)
     return View(
-        counts, camera().moved(body_from_camera.inv()), pose(3.0, 4.0, 10.0, yaw, pitch, roll) * body_from_camera
+        counts, camera().transform(body_from_camera.inv()), pose(3.0, 4.0, 10.0, yaw, pitch, roll) * body_from_camera
     )
 
 
 @pytest.mark.parametrize("attitude", [(0.0, 0.0, 0.0), (40.0, 10.0, -15.0), (190.0, -20.0, 5.0)])
-def test_the_surface_frame_is_level_and_the_world_is_a_turn_about_the_vertical(
-    attitude: tuple[float, float, float],
-) -> None:
-    first = views(*attitude)
+def test_surface_frame_is_level_and_differs_from_world_by_yaw(attitude: tuple[float, float, float]) -> None:
+    first = make_view(*attitude)
     up = first.world_from_camera.rotation.inv().apply(np.array([0.0, 0.0, 1.0]))
     to_surface = surface_from_camera(up)
     np.testing.assert_allclose(to_surface.apply(up), [0.0, 0.0, 1.0], atol=1e-12)
-    # The picture's columns run along x: nothing of them along y.
+    # The columns of the image run along x without a component along y.
     assert abs(to_surface.apply(np.array([1.0, 0.0, 0.0]))[1]) < 1e-12
     to_world = world_from_surface(first.world_from_camera.rotation, to_surface)
     np.testing.assert_allclose(
@@ -108,23 +106,24 @@ def test_the_surface_frame_is_level_and_the_world_is_a_turn_about_the_vertical(
     )
 
 
-def test_gravity_comes_from_where_the_options_say() -> None:
-    first = views(30.0, 5.0, -5.0)
+def test_gravity_source_follows_the_options() -> None:
+    first = make_view(30.0, 5.0, -5.0)
     state = first.world_from_camera.rotation.inv().apply(np.array([0.0, 0.0, 1.0]))
     leaning = Rotation.from_rotvec([0.02, 0.0, 0.0]).apply(state)
     rng = np.random.default_rng(4)
-    flat = cloud(500, rng, (0.0, 0.0)) + np.array([0.0, 0.0, 1.0]) * rng.normal(0.0, 0.01, (500, 1))
+    flat = draw_points(500, rng, (0.0, 0.0)) + np.array([0.0, 0.0, 1.0]) * rng.normal(0.0, 0.01, (500, 1))
     flat[:150, 2] += rng.uniform(0.5, 2.0, 150)
     points = surface_from_camera(state).inv().apply(flat)
-    found = {frame: up_direction(first, leaning, points, HdaOptions(surface_frame=frame)) for frame in SurfaceFrame}
-    np.testing.assert_allclose(found[SurfaceFrame.INCLINOMETER], leaning)
-    np.testing.assert_allclose(found[SurfaceFrame.STATE], state)
-    # 350 points with 1 cm of noise over 8 m: 0.01 / (sqrt(350) 2.3 m) = 2e-4 rad; a third of them far off.
-    assert np.arccos(min(float(found[SurfaceFrame.PLANE] @ state), 1.0)) < 2e-3
+    result = {frame: up_direction(first, leaning, points, HdaOptions(surface_frame=frame)) for frame in SurfaceFrame}
+    np.testing.assert_allclose(result[SurfaceFrame.INCLINOMETER], leaning)
+    np.testing.assert_allclose(result[SurfaceFrame.STATE], state)
+    # The fit error is 0.01 / (sqrt(350) 2.3 m) = 2e-4 rad: 350 points with 1 cm of noise over 8 m. One third are
+    # outliers.
+    assert np.arccos(min(float(result[SurfaceFrame.PLANE] @ state), 1.0)) < 2e-3
 
 
-def test_the_robust_normal_points_to_the_camera() -> None:
-    points = cloud(200, np.random.default_rng(5))
+def test_robust_normal_points_to_the_camera() -> None:
+    points = draw_points(200, np.random.default_rng(5))
     expected = np.array([-0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0])
     np.testing.assert_allclose(plane_normal(points, 0), expected, atol=1e-9)
     np.testing.assert_allclose(plane_normal(-points, 0), -expected, atol=1e-9)

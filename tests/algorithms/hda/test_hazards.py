@@ -1,4 +1,4 @@
-"""Slope, roughness and safe landing maps of grounds whose answers are known by formula."""
+"""Tests of slope, roughness and safe landing maps on grounds with analytic solutions."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ CELL_M = 0.1
 OPTIONS = HdaOptions(lander_diameter_m=1.0, max_roughness_m=0.2, max_slope_rad=float(np.deg2rad(15.0)))
 
 
-def ground(rows: int = 80, columns: int = 100, by_x: float = 0.0, by_y: float = 0.0) -> ElevationMap:
+def make_ground(rows: int = 80, columns: int = 100, by_x: float = 0.0, by_y: float = 0.0) -> ElevationMap:
     empty = ElevationMap(np.zeros((rows, columns)), np.array([-2.0, 5.0]), CELL_M)
     x, y = np.moveaxis(empty.places(np.moveaxis(np.indices((rows, columns)).astype(np.float64), 0, -1)), -1, 0)
     return replace(empty, elevation_m=by_x * x + by_y * y)
 
 
-def with_bump(flat: ElevationMap, row: int, column: int, radius: float, height: float) -> ElevationMap:
-    """A cylinder of this height, radius in cells."""
+def add_bump(flat: ElevationMap, row: int, column: int, radius: float, height: float) -> ElevationMap:
+    """Add a cylinder with this height and a radius in cells."""
     rows, columns = np.indices(flat.elevation_m.shape)
     inside = np.hypot(rows - row, columns - column) <= radius
     return replace(flat, elevation_m=flat.elevation_m + height * inside)
@@ -40,51 +40,51 @@ def with_bump(flat: ElevationMap, row: int, column: int, radius: float, height: 
 
 @pytest.mark.parametrize("refine", [False, True])
 @pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.2, 0.0), (0.1, -0.25)])
-def test_a_plane_has_its_slope_and_no_roughness(slopes: tuple[float, float], refine: bool) -> None:
-    maps = hazard_maps(ground(by_x=slopes[0], by_y=slopes[1]), replace(OPTIONS, refine_planes=refine))
+def test_plane_has_exact_slope_and_no_roughness(slopes: tuple[float, float], refine: bool) -> None:
+    maps = hazard_maps(make_ground(by_x=slopes[0], by_y=slopes[1]), replace(OPTIONS, refine_planes=refine))
     np.testing.assert_allclose(maps.roughness_m, 0.0, atol=1e-10)
     np.testing.assert_allclose(maps.slope_rad, np.arctan(np.hypot(*slopes)), atol=1e-10)
 
 
 @pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.15, -0.1)])
 @pytest.mark.parametrize("height", [0.3, -0.3])
-def test_a_boulder_on_a_slope_is_as_rough_as_it_is_high(slopes: tuple[float, float], height: float) -> None:
-    # Radius 2.5 cells: 21 of a footprint's 100 cells, wherever it lies; the median does not see them.
-    flat = ground(by_x=slopes[0], by_y=slopes[1])
+def test_boulder_height_equals_roughness_on_a_slope(slopes: tuple[float, float], height: float) -> None:
+    # A radius of 2.5 cells covers 21 of the 100 cells of a footprint: no effect on the median.
+    flat = make_ground(by_x=slopes[0], by_y=slopes[1])
     for row, column in ((40, 50), (45, 55), (12, 33)):
-        maps = hazard_maps(with_bump(flat, row, column, 2.5, height), OPTIONS)
+        maps = hazard_maps(add_bump(flat, row, column, 2.5, height), OPTIONS)
         assert maps.roughness_m[row, column] == pytest.approx(abs(height), abs=1e-9)
         np.testing.assert_allclose(maps.slope_rad, np.arctan(np.hypot(*slopes)), atol=1e-9)
         assert maps.safety[row, column] == Safety.HAZARD
 
 
-def test_half_of_the_points_may_be_anything() -> None:
-    # The breakdown point: 45 of 100 points far above, in a heap. 300 trials find a good triple but for 1 in 1e24.
+def test_robust_fit_tolerates_almost_half_outliers() -> None:
+    # Breakdown point: 45 of 100 points are outliers. The probability that 300 trials contain no inlier triple is 1e-24.
     rng = np.random.default_rng(1)
     x, y = (a.astype(np.float64).ravel() for a in np.meshgrid(np.arange(10), np.arange(10)))
     z = 3.0 + 0.2 * x - 0.1 * y + rng.normal(0.0, 0.01, 100)
     z[rng.permutation(100)[:45]] += rng.uniform(1.0, 5.0, 45)
     triples = rng.uniform(size=(300, 3))
     value, by_x, by_y = robust_plane(x, y, z, triples, True)
-    # 55 points of 0.01 noise: slopes to 0.01 / (sqrt(55) 2.9) = 5e-4; four times that.
+    # The slope error of 55 points with 0.01 of noise is 0.01 / (sqrt(55) 2.9) = 5e-4; the tolerance is four times that.
     assert by_x == pytest.approx(0.2, abs=2e-3)
     assert by_y == pytest.approx(-0.1, abs=2e-3)
     assert value == pytest.approx(3.0, abs=0.02)
-    # Least squares is off by tenths.
+    # Least squares has errors of some tenths.
     plain = np.linalg.lstsq(np.column_stack([np.ones(100), x, y]), z, rcond=None)[0]
     assert abs(plain[0] - 3.0) > 0.3
 
 
-def test_the_plane_is_that_of_the_least_median_over_all_triples_tried() -> None:
+def test_robust_fit_has_least_median_of_tested_triples() -> None:
     rng = np.random.default_rng(2)
     x, y = (a.astype(np.float64).ravel() for a in np.meshgrid(np.arange(5), np.arange(5)))
     z = rng.normal(size=25)
     triples = rng.uniform(size=(40, 3))
-    found = robust_plane(x, y, z, triples, False)
+    result = robust_plane(x, y, z, triples, False)
     best = np.inf
     expected = None
     for u in triples:
-        # Without repetition: the second of the 24 left, the third of the 23 left.
+        # Sampling without replacement: the second of 24 indices, then the third of 23.
         left = list(range(25))
         i, j, k = left.pop(int(u[0] * 25)), left.pop(int(u[1] * 24)), left.pop(int(u[2] * 23))
         design = np.array([[1.0, x[n], y[n]] for n in (i, j, k)])
@@ -95,10 +95,10 @@ def test_the_plane_is_that_of_the_least_median_over_all_triples_tried() -> None:
         if median < best:
             best, expected = median, plane
     assert expected is not None
-    np.testing.assert_allclose(found, expected, atol=1e-9)
+    np.testing.assert_allclose(result, expected, atol=1e-9)
 
 
-def test_refined_planes_are_less_noisy() -> None:
+def test_refinement_reduces_noise() -> None:
     rng = np.random.default_rng(3)
     x, y = (a.astype(np.float64).ravel() for a in np.meshgrid(np.arange(10), np.arange(10)))
     errors = []
@@ -107,35 +107,35 @@ def test_refined_planes_are_less_noisy() -> None:
         triples = rng.uniform(size=(30, 3))
         errors.append([robust_plane(x, y, z, triples, refine)[1] for refine in (False, True)])
     raw, refined = np.std(errors, axis=0)
-    # Least squares over all 100 points: 1 / (sqrt(100) 2.87) = 0.035; the inliers are nearly all.
+    # Least squares over all 100 points has 1 / (sqrt(100) 2.87) = 0.035; almost all points are inliers.
     assert refined < 0.045 < raw
 
 
-def test_the_smooth_surface_is_bilinear_between_footprints() -> None:
-    # Elevation x y / 10 is bilinear itself: between the middles nothing is lost, however coarse the footprints.
-    flat = ground(60, 60)
+def test_smooth_surface_is_bilinear_between_footprints() -> None:
+    # The elevation x y / 10 is bilinear: interpolation between footprint centres is exact.
+    flat = make_ground(60, 60)
     rows, columns = np.indices((60, 60))
     saddle = replace(flat, elevation_m=1e-4 * (rows - 29.5) * (columns - 29.5))
     planes, smooth, _ = smooth_surface(saddle, replace(OPTIONS, refine_planes=True, plane_trials=200))
     assert planes.shape == (6, 6, 3)
-    # Each footprint's robust plane is off the saddle's middle by less than the saddle's departure from a plane.
+    # The robust plane of a footprint is closer to the saddle centre than the saddle deviates from a plane.
     assert np.max(np.abs(smooth - saddle.elevation_m)) < 1e-4 * 5.0 * 5.0
 
 
 @pytest.mark.parametrize("shape", [(80, 14), (14, 80), (12, 13)])
-def test_a_strip_with_a_single_footprint_across_is_still_a_plane(shape: tuple[int, int]) -> None:
-    maps = hazard_maps(ground(*shape, by_x=0.1, by_y=0.2), OPTIONS)
+def test_strip_of_one_footprint_width_is_a_plane(shape: tuple[int, int]) -> None:
+    maps = hazard_maps(make_ground(*shape, by_x=0.1, by_y=0.2), OPTIONS)
     np.testing.assert_allclose(maps.roughness_m, 0.0, atol=1e-10)
 
 
-def test_a_map_smaller_than_the_lander_is_unknown() -> None:
-    maps = hazard_maps(ground(8, 40), OPTIONS)
+def test_map_smaller_than_the_lander_is_unknown() -> None:
+    maps = hazard_maps(make_ground(8, 40), OPTIONS)
     assert np.all(maps.safety == Safety.UNKNOWN)
     assert safe_site(maps.safety, np.zeros(2)) is None
 
 
 def test_steep_ground_is_a_hazard_next_to_level_ground() -> None:
-    flat = ground(80, 100)
+    flat = make_ground(80, 100)
     ramp = np.maximum(np.arange(100) - 50, 0) * CELL_M * np.tan(np.deg2rad(20.0))
     maps = hazard_maps(replace(flat, elevation_m=flat.elevation_m + ramp), OPTIONS)
     assert np.rad2deg(maps.slope_rad[40, 85]) == pytest.approx(20.0, abs=0.01)
@@ -148,7 +148,7 @@ def test_steep_ground_is_a_hazard_next_to_level_ground() -> None:
 
 
 @given(st.integers(5, 74), st.integers(5, 94), st.floats(0.5, 2.0))
-def test_hazards_grow_by_discs_of_the_landers_diameter(row: int, column: int, growth: float) -> None:
+def test_hazards_are_dilated_by_lander_disc(row: int, column: int, growth: float) -> None:
     rough = np.zeros((80, 100))
     rough[row, column] = 1.0
     options = replace(OPTIONS, hazard_growth=growth, unknown_growth=0.0)
@@ -156,22 +156,22 @@ def test_hazards_grow_by_discs_of_the_landers_diameter(row: int, column: int, gr
     rows, columns = np.indices((80, 100))
     distance = CELL_M * np.hypot(rows - row, columns - column)
     expected = distance <= growth * OPTIONS.lander_diameter_m
-    sure = np.abs(distance - growth * OPTIONS.lander_diameter_m) > 1e-5
-    np.testing.assert_array_equal((safety == Safety.HAZARD)[sure], expected[sure])
+    unambiguous = np.abs(distance - growth * OPTIONS.lander_diameter_m) > 1e-5
+    np.testing.assert_array_equal((safety == Safety.HAZARD)[unambiguous], expected[unambiguous])
 
 
-def test_near_borders_and_holes_nothing_is_known() -> None:
+def test_cells_near_borders_and_holes_are_unknown() -> None:
     slope = np.zeros((80, 100))
     slope[40, 50] = np.nan
     safety = safe_landing_map(slope, np.zeros((80, 100)), CELL_M, OPTIONS)
     rows, columns = np.indices((80, 100))
-    # Half a diameter, 5 cells; the cells around the map are the first that are not known.
+    # Half a diameter is 5 cells; the cells around the map are unknown.
     from_border = np.minimum.reduce([rows + 1, columns + 1, 80 - rows, 100 - columns])
     unknown = (from_border <= 5) | (np.hypot(rows - 40, columns - 50) <= 5.0)
     np.testing.assert_array_equal(safety, np.where(unknown, Safety.UNKNOWN, Safety.SAFE))
 
 
-def test_unknown_ground_grows_with_the_lander() -> None:
+def test_unknown_region_grows_with_lander_diameter() -> None:
     slope = np.zeros((80, 100))
     slope[40, 50] = np.nan
     options = replace(OPTIONS, lander_diameter_m=1.5, unknown_growth=0.6)
@@ -179,11 +179,11 @@ def test_unknown_ground_grows_with_the_lander() -> None:
     rows, columns = np.indices((80, 100))
     distance = np.hypot(rows - 40, columns - 50)
     inner = (slice(15, 65), slice(15, 85))
-    sure = (np.abs(distance - 9.0) > 1e-6)[inner]  # 0.6 of 1.5 m are 9 cells
-    np.testing.assert_array_equal((safety == Safety.UNKNOWN)[inner][sure], (distance < 9.0)[inner][sure])
+    unambiguous = (np.abs(distance - 9.0) > 1e-6)[inner]  # 0.6 of 1.5 m are 9 cells
+    np.testing.assert_array_equal((safety == Safety.UNKNOWN)[inner][unambiguous], (distance < 9.0)[inner][unambiguous])
 
 
-def test_what_is_hazard_and_unknown_is_hazard() -> None:
+def test_hazard_takes_precedence_over_unknown() -> None:
     slope = np.zeros((80, 100))
     slope[:, 0] = 1.0
     safety = safe_landing_map(slope, np.zeros((80, 100)), CELL_M, OPTIONS)
@@ -191,7 +191,7 @@ def test_what_is_hazard_and_unknown_is_hazard() -> None:
     assert np.all(safety[10:70, 11:90] == Safety.SAFE)
 
 
-def test_hazards_of_either_map_count() -> None:
+def test_slope_and_roughness_hazards_are_combined() -> None:
     nothing = np.zeros((80, 100))
     rough, steep = nothing.copy(), nothing.copy()
     rough[40, 30], steep[40, 70] = 1.0, 1.0
@@ -200,7 +200,7 @@ def test_hazards_of_either_map_count() -> None:
     assert safety[40, 50] == Safety.SAFE
 
 
-def test_grassfire_is_the_distance_to_the_nearest_fire() -> None:
+def test_grassfire_equals_nearest_seed_distance() -> None:
     rng = np.random.default_rng(4)
     burning = rng.random((40, 50)) < 0.01
     fires = np.argwhere(burning)
@@ -210,7 +210,7 @@ def test_grassfire_is_the_distance_to_the_nearest_fire() -> None:
     assert np.all(np.isinf(grassfire(np.zeros((3, 3), dtype=bool))))
 
 
-def test_the_site_is_farthest_from_all_that_is_not_safe() -> None:
+def test_site_is_farthest_from_unsafe_cells() -> None:
     safety = np.full((60, 60), Safety.SAFE, dtype=np.uint8)
     safety[10, 10] = Safety.HAZARD
     safety[50, 20] = Safety.UNKNOWN
@@ -224,22 +224,22 @@ def test_the_site_is_farthest_from_all_that_is_not_safe() -> None:
 
 
 @pytest.mark.parametrize("apriori", [(0.0, 0.0), (29.0, 8.0), (5.0, 90.0)])
-def test_of_equal_sites_the_nearest_to_the_a_priori_one_is_taken(apriori: tuple[float, float]) -> None:
-    # A strip of 11 rows: its middle row is 6 cells from both sides all along.
+def test_ties_are_resolved_by_distance_to_apriori_site(apriori: tuple[float, float]) -> None:
+    # A strip of 11 rows: each cell of the middle row is 6 cells from both sides.
     safety = np.full((11, 60), Safety.SAFE, dtype=np.uint8)
     site = safe_site(safety, np.array(apriori))
     assert site == (5, int(np.clip(apriori[1], 5, 54)))
 
 
-def test_no_safe_cell_is_no_site() -> None:
+def test_map_without_safe_cells_has_no_site() -> None:
     assert safe_site(np.full((20, 20), Safety.HAZARD, dtype=np.uint8), np.zeros(2)) is None
-    rough = ground()
+    rough = make_ground()
     noise = np.random.default_rng(5).normal(0.0, 1.0, rough.elevation_m.shape)
     assert safe_site(hazard_maps(replace(rough, elevation_m=noise), OPTIONS).safety, np.zeros(2)) is None
 
 
-def test_holes_in_the_map_are_not_bridged() -> None:
-    flat = ground(100, 100)
+def test_map_holes_are_not_interpolated() -> None:
+    flat = make_ground(100, 100)
     elevation = flat.elevation_m.copy()
     elevation[30:70, 30:70] = np.nan
     maps = hazard_maps(replace(flat, elevation_m=elevation), OPTIONS)
@@ -247,7 +247,7 @@ def test_holes_in_the_map_are_not_bridged() -> None:
     assert np.any(maps.safety == Safety.SAFE)
 
 
-def test_options_out_of_range_are_named() -> None:
+def test_out_of_range_options_are_reported() -> None:
     with pytest.raises(ValueError, match="template_half_px is 1; it must be at least 2"):
         HdaOptions(template_half_px=1)
     with pytest.raises(ValueError, match="lander_diameter_m is 0"):
@@ -264,8 +264,8 @@ def test_options_out_of_range_are_named() -> None:
 SHARP = Resolution(window_m=0.0, noise_m=0.0)
 
 
-def test_the_limit_is_what_the_window_leaves_of_a_paraboloid() -> None:
-    """The mean of 1 - 4 r^2 / D^2 over a window of side w about its top, worked out on a grid."""
+def test_curvature_limit_follows_window_mean_of_paraboloid() -> None:
+    """The mean of 1 - 4 r^2 / D^2 over a centred window with side w, computed on a grid."""
     options = HdaOptions(max_roughness_m=0.2, narrowest_hazard=2.0)
     x = np.linspace(-0.05, 0.05, 401)
     mean = float(np.mean(1.0 - 4.0 * (x[:, None] ** 2 + x**2) / 0.4**2))
@@ -274,24 +274,24 @@ def test_the_limit_is_what_the_window_leaves_of_a_paraboloid() -> None:
     assert noisy == pytest.approx(0.2 - options.margin_deviations * 0.01)
 
 
-def test_a_curved_place_that_interpolated_planes_call_safe_is_a_hazard() -> None:
-    """A ridge 0.3 m over its feet 1 m away: no plane over 2 m comes within 0.1 m of all of it."""
+def test_curved_ground_is_a_hazard_despite_smooth_planes() -> None:
+    """A ridge is 0.3 m high and 1 m wide on each side: no plane over 2 m fits it within 0.1 m."""
     x = 0.05 * (np.arange(121) - 60)
     ground = ElevationMap(np.tile(-0.3 * np.abs(x), (121, 1)), np.zeros(2), 0.05)
     all_safe = np.full((121, 121), Safety.SAFE, dtype=np.uint8)
     options = HdaOptions(max_roughness_m=0.1, narrowest_hazard=100.0, max_slope_rad=float(np.radians(20.0)))
     result = check_footprints(all_safe, ground, SHARP, options)
     assert np.all(result[40:80, 58:63] == Safety.HAZARD)
-    # where the footprint lies on one flank the ground is a plane
+    # A footprint on one flank is on a plane.
     assert np.all(result[40:80, 85:95] == Safety.SAFE)
 
 
-def test_a_map_that_cannot_tell_calls_nothing_safe() -> None:
+def test_coarse_map_has_no_safe_cells() -> None:
     ground = ElevationMap(np.zeros((60, 60)), np.zeros(2), 0.1)
     all_safe = np.full((60, 60), Safety.SAFE, dtype=np.uint8)
     options = HdaOptions(max_roughness_m=0.2, narrowest_hazard=2.0)
     coarse = Resolution(window_m=1.0, noise_m=0.0)
-    # in the corners most of a footprint is off the map
+    # At the corners most of a footprint is outside the map.
     inside = (slice(10, 50), slice(10, 50))
     assert np.all(check_footprints(all_safe, ground, SHARP, options)[inside] == Safety.SAFE)
     assert np.all(check_footprints(all_safe, ground, coarse, options) == Safety.HAZARD)

@@ -1,4 +1,4 @@
-"""Epipolar segments, matches along them, triangulation and scale, against the exact scene."""
+"""Tests of epipolar search segments, dense matches, triangulation and scale on an exact scene."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import Fate, HdaDetails, HdaEstimator, HdaOptions
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.motion import Motion
+from marsyard.algorithms.hda.motion import LandingScene, Motion, build_scene, undistort
 from marsyard.algorithms.hda.structure import (
     clip_to_image,
     dense_structure,
@@ -22,12 +22,11 @@ from marsyard.algorithms.hda.structure import (
     scale_factor,
     triangulate,
 )
-from marsyard.algorithms.hda.view import LandingScene, build_scene, undistort
 from marsyard.sim.frames import rigid
-from tests.algorithms.hda.relief_scene import Pass, bumps, measured, plane, pose
+from tests.algorithms.hda.relief_scene import Pass, make_bumps, measure_pass, plane, pose
 
 OPTIONS = HdaOptions(block_px=32, grid_px=8)
-RELIEF = bumps((1.2, 0.8, 0.4, 0.3), (-1.5, -1.0, 0.3, 0.2), base=plane(0.05, 0.02))
+RELIEF = make_bumps((1.2, 0.8, 0.4, 0.3), (-1.5, -1.0, 0.3, 0.2), base=plane(0.05, 0.02))
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +35,8 @@ def scene() -> Pass:
 
 
 @pytest.fixture(scope="module")
-def seen(scene: Pass) -> LandingScene:
-    return build_scene(measured(scene))
+def landing_scene(scene: Pass) -> LandingScene:
+    return build_scene(measure_pass(scene))
 
 
 def true_depths(scene: Pass, pixels: np.ndarray) -> np.ndarray:
@@ -45,124 +44,127 @@ def true_depths(scene: Pass, pixels: np.ndarray) -> np.ndarray:
     return np.asarray((scene.ground(0, pixels) - one.c) @ one.a)
 
 
-def test_the_poses_motion_is_the_cameras(scene: Pass, seen: LandingScene) -> None:
-    np.testing.assert_allclose(seen.second_from_first.as_matrix(), scene.second_from_first.as_matrix(), atol=1e-12)
+def test_motion_from_poses_equals_camera_motion(scene: Pass, landing_scene: LandingScene) -> None:
+    np.testing.assert_allclose(
+        landing_scene.second_from_first.as_matrix(), scene.second_from_first.as_matrix(), atol=1e-12
+    )
 
 
-def test_segments_hold_the_exact_match(scene: Pass, seen: LandingScene) -> None:
+def test_segments_contain_the_exact_match(scene: Pass, landing_scene: LandingScene) -> None:
     pixels = pixel_lattice((320, 240), 16, 10)
     true = scene.camera(1).project(scene.ground(0, pixels))[0]
-    places = undistort(seen.views[0].camera, pixels)
-    starts, ends, room = epipolar_segments(seen.views[1], scene.second_from_first, places, (7.0, 13.0), 6)
+    positions = undistort(landing_scene.views[0].camera, pixels)
+    starts, ends, room = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (7.0, 13.0), 6)
     assert room.sum() > 100
     along = (ends - starts)[room]
     length = np.linalg.norm(along, axis=1)
     offset = (true - starts)[room]
-    share = np.sum(offset * along, axis=1) / length**2
-    assert np.all((share > 0.0) & (share < 1.0))
-    # The lens bends the line; over 25 px by a few hundredths of a pixel.
+    fraction = np.sum(offset * along, axis=1) / length**2
+    assert np.all((fraction > 0.0) & (fraction < 1.0))
+    # Lens distortion bends the epipolar line by a few hundredths of a pixel over 25 px.
     across = np.abs(offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0]) / length
     assert across.max() < 0.1
 
 
-def test_depth_is_where_on_the_segment(scene: Pass, seen: LandingScene) -> None:
-    # At bounds that are the true depth both ends are the true match: Eqs. 6-8 through the lens are exact.
+def test_segment_position_determines_depth(scene: Pass, landing_scene: LandingScene) -> None:
+    # With both depth bounds at the true depth, both ends are the true match: Eqs. 6-8 are exact through the lens.
     pixels = np.array([[100.0, 80.0]])
     depth = float(true_depths(scene, pixels)[0])
     true = scene.camera(1).project(scene.ground(0, pixels))[0]
-    places = undistort(seen.views[0].camera, pixels)
-    starts, ends, _ = epipolar_segments(seen.views[1], scene.second_from_first, places, (depth, depth), 6)
+    positions = undistort(landing_scene.views[0].camera, pixels)
+    starts, ends, _ = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (depth, depth), 6)
     np.testing.assert_allclose(starts, true, atol=1e-6)
     np.testing.assert_allclose(ends, true, atol=1e-6)
 
 
-def test_pixels_whose_segment_leaves_the_picture_are_dropped(scene: Pass, seen: LandingScene) -> None:
+def test_segments_outside_the_image_are_rejected(scene: Pass, landing_scene: LandingScene) -> None:
     pixels = pixel_lattice((320, 240), 8, 6)
-    places = undistort(seen.views[0].camera, pixels)
-    starts, ends, room = epipolar_segments(seen.views[1], scene.second_from_first, places, (7.0, 13.0), 6)
+    positions = undistort(landing_scene.views[0].camera, pixels)
+    starts, ends, room = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (7.0, 13.0), 6)
     both = np.concatenate([starts, ends], axis=1)
     inside = np.all((both >= 6.0) & (both <= np.array([313.0, 233.0, 313.0, 233.0])), axis=1)
     np.testing.assert_array_equal(room, inside)
     assert 0 < room.sum() < len(pixels)
-    matches = match_pixels(seen.views, scene.second_from_first, pixels, (7.0, 13.0), OPTIONS)
+    matches = match_pixels(landing_scene.views, scene.second_from_first, pixels, (7.0, 13.0), OPTIONS)
     np.testing.assert_array_equal(matches.first, pixels[room])
 
 
-def test_the_least_sum_of_differences_is_found() -> None:
+def test_best_match_has_minimum_absolute_difference() -> None:
     rng = np.random.default_rng(1)
     first = rng.integers(0, 4096, (60, 90)).astype(np.uint16)
     second = np.roll(first, (3, 9), axis=(0, 1))
     pixels = np.array([[30, 25], [50, 40]])
     starts, ends = pixels + np.array([-2.0, -0.7]), pixels + np.array([18.0, 6.7])
-    found = matching.search_segments(first, second, pixels, starts, ends, 5)
-    np.testing.assert_array_equal(found, pixels + np.array([9, 3]))
+    result = matching.search_segments(first, second, pixels, starts, ends, 5)
+    np.testing.assert_array_equal(result, pixels + np.array([9, 3]))
     total = int(np.abs(first[20:31, 25:36].astype(int) - second[20:31, 28:39].astype(int)).sum())
     assert matching.absolute_differences(first, second, 25, 30, 25, 33, 5, 2**62) == total
 
 
-def test_matches_and_depths_are_those_of_the_exact_scene(scene: Pass, seen: LandingScene) -> None:
+def test_matches_and_depths_equal_exact_scene(scene: Pass, landing_scene: LandingScene) -> None:
     depths = true_depths(scene, pixel_lattice((320, 240), 16, 6))
-    matches = dense_structure(seen.views, scene.second_from_first, (depths.min(), depths.max()), OPTIONS)
+    matches = dense_structure(landing_scene.views, scene.second_from_first, (depths.min(), depths.max()), OPTIONS)
     true = scene.camera(1).project(scene.ground(0, matches.first))[0]
     assert matches.accepted.mean() > 0.98
     error = np.linalg.norm(matches.second - true, axis=1)[matches.accepted]
-    # The biquadratic's lean to whole pixels, up to 0.09 px along each axis, and relief within a window.
+    # Sources of error: the bias of the biquadratic fit (up to 0.09 px on each axis) and relief within a window.
     assert np.sqrt(np.mean(error**2)) < 0.15
     misses = (matches.depths - true_depths(scene, matches.first))[matches.accepted]
-    # That over a parallax of 32 px: half a percent of the height (issue 6, bar 1).
+    # This error over a parallax of 32 px is half a percent of the height.
     assert np.sqrt(np.mean(misses**2)) < 0.005 * 10.0
 
 
-def test_the_grid_keeps_search_windows_inside_the_picture(scene: Pass, seen: LandingScene) -> None:
-    matches = dense_structure(seen.views, scene.second_from_first, (9.0, 11.0), replace(OPTIONS, grid_px=1))
+def test_grid_keeps_search_windows_inside_the_image(scene: Pass, landing_scene: LandingScene) -> None:
+    matches = dense_structure(landing_scene.views, scene.second_from_first, (9.0, 11.0), replace(OPTIONS, grid_px=1))
     border = OPTIONS.search_half_px + 1
     assert matches.first.min() >= border
     assert np.all(matches.first <= np.array([320, 240]) - 1 - border)
 
 
-def test_without_matches_at_the_spot_the_features_plane_gives_the_scale(scene: Pass, seen: LandingScene) -> None:
+def test_plane_of_features_gives_scale_without_local_matches(scene: Pass, landing_scene: LandingScene) -> None:
     rng = np.random.default_rng(8)
-    places = rng.uniform(-0.3, 0.3, (30, 2))
-    depths = 1.0 / (0.1 + places @ np.array([0.02, -0.03]))  # a plane, 10 m away on the axis
+    positions = rng.uniform(-0.3, 0.3, (30, 2))
+    depths = 1.0 / (0.1 + positions @ np.array([0.02, -0.03]))  # a plane at 10 m on the axis
     inliers = np.arange(30) != 4
     depths[4] = 3.0
     motion = Motion(scene.second_from_first, depths, np.zeros(30), inliers, 20.0, converged=True)
     blank = np.full((240, 320), 1000, dtype=np.uint16)
-    views = (replace(seen.views[0], counts=blank), replace(seen.views[1], counts=blank))
-    assert scale_factor(views, motion, places, 12.0, OPTIONS) == pytest.approx(1.2, rel=1e-9)
+    views = (replace(landing_scene.views[0], counts=blank), replace(landing_scene.views[1], counts=blank))
+    assert scale_factor(views, motion, positions, 12.0, OPTIONS) == pytest.approx(1.2, rel=1e-9)
 
 
-def test_a_wrong_picture_gives_few_matches(scene: Pass, seen: LandingScene) -> None:
+def test_unrelated_image_gives_few_matches(scene: Pass, landing_scene: LandingScene) -> None:
     noise = np.random.default_rng(2).integers(500, 2500, (240, 320)).astype(np.uint16)
-    views = (seen.views[0], replace(seen.views[1], counts=noise))
+    views = (landing_scene.views[0], replace(landing_scene.views[1], counts=noise))
     matches = dense_structure(views, scene.second_from_first, (9.0, 11.0), OPTIONS)
     assert matches.accepted.mean() < 0.01
 
 
-def test_triangulation_is_exact_and_as_precise_as_the_parallax() -> None:
+def test_triangulation_is_exact_and_precision_follows_parallax() -> None:
     rng = np.random.default_rng(3)
-    places = rng.uniform(-0.3, 0.3, (2000, 2))
+    positions = rng.uniform(-0.3, 0.3, (2000, 2))
     depths = rng.uniform(9.0, 11.0, 2000)
-    moved = rigid(Rotation.from_rotvec([0.02, -0.03, 0.05]), np.array([1.0, 0.0, 0.0]))
-    points = moved.apply(np.column_stack([places, np.ones(2000)]) * depths[:, None])
+    true_motion = rigid(Rotation.from_rotvec([0.02, -0.03, 0.05]), np.array([1.0, 0.0, 0.0]))
+    points = true_motion.apply(np.column_stack([positions, np.ones(2000)]) * depths[:, None])
     second = points[:, :2] / points[:, 2:]
-    np.testing.assert_allclose(triangulate(places, second, moved), depths, rtol=1e-10)
+    np.testing.assert_allclose(triangulate(positions, second, true_motion), depths, rtol=1e-10)
     noise = 1e-4
-    noisy = triangulate(places, second + rng.normal(0.0, noise, second.shape), moved)
-    # dz = z^2 / baseline times the error along the epipolar line; rotation and view change that by some percent.
+    noisy = triangulate(positions, second + rng.normal(0.0, noise, second.shape), true_motion)
+    # dz = z^2 / baseline times the error along the epipolar line; rotation and field of view change this by some
+    # percent.
     assert np.std((noisy - depths) / depths**2) == pytest.approx(noise, rel=0.1)
 
 
-def test_lines_of_sight_that_do_not_meet_have_no_depth() -> None:
-    places = np.array([[0.1, 0.2]])
-    assert np.isnan(triangulate(places, places, rigid(Rotation.identity(), np.array([1.0, 0.0, 0.0])))[0])
+def test_diverging_lines_of_sight_have_no_depth() -> None:
+    positions = np.array([[0.1, 0.2]])
+    assert np.isnan(triangulate(positions, positions, rigid(Rotation.identity(), np.array([1.0, 0.0, 0.0])))[0])
 
 
-def test_bounds_of_depth_are_widened_both_ways() -> None:
+def test_depth_bounds_are_widened_on_both_sides() -> None:
     assert depth_bounds((8.0, 12.0), 0.25) == (6.0, 15.0)
 
 
-def test_the_grid_lies_in_the_middle_and_keeps_from_the_border() -> None:
+def test_grid_is_centred_with_a_border() -> None:
     pixels = pixel_lattice((320, 240), 8, 6)
     assert pixels.min() >= 6.0
     assert np.all(pixels.max(axis=0) <= [313.0, 233.0])
@@ -170,22 +172,22 @@ def test_the_grid_lies_in_the_middle_and_keeps_from_the_border() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 4.0])
-def test_all_lengths_follow_the_altimeter(factor: float, scene: Pass) -> None:
-    exact = measured(scene)
+def test_all_lengths_scale_with_the_altimeter(factor: float, scene: Pass) -> None:
+    exact = measure_pass(scene)
     answer = HdaEstimator(OPTIONS).estimate(replace(exact, slant_range_m=factor * exact.slant_range_m))
     assert isinstance(answer.details, HdaDetails)
     motion = answer.details.motion
     assert motion is not None
-    # Issue 6, bar 1: 1 % of the baseline, the scale by the altimeter exact.
+    # Required accuracy: 1 % of the baseline; the scale from the altimeter is exact.
     expected = factor * scene.second_from_first.translation
     assert np.linalg.norm(motion.second_from_first.translation - expected) < 0.01 * np.linalg.norm(expected)
 
 
-def test_matches_that_do_not_find_their_way_back_are_dropped_and_counted(scene: Pass, seen: LandingScene) -> None:
-    # Half of the second picture shows something else, and no correlation is too low: what is found there is chance.
-    counts = seen.views[1].counts.copy()
+def test_matches_failing_the_reverse_check_are_counted(scene: Pass, landing_scene: LandingScene) -> None:
+    # Half of the second image is unrelated and no correlation threshold applies: matches there are random.
+    counts = landing_scene.views[1].counts.copy()
     counts[:, 160:] = np.random.default_rng(2).integers(500, 2500, (240, 160))
-    views = (seen.views[0], replace(seen.views[1], counts=counts))
+    views = (landing_scene.views[0], replace(landing_scene.views[1], counts=counts))
     plain, checked = (
         dense_structure(
             views,
@@ -196,12 +198,12 @@ def test_matches_that_do_not_find_their_way_back_are_dropped_and_counted(scene: 
         for tolerance in (None, 1.5)
     )
     true = scene.camera(1).project(scene.ground(0, plain.first))[0]
-    wrong = np.linalg.norm(plain.second - true, axis=1) > 1.5
-    assert np.sum(plain.accepted & wrong) > 100
-    # Segments are some 25 px long: of matches by chance an eighth comes back by chance.
-    assert np.sum(checked.accepted & wrong) < 0.3 * np.sum(plain.accepted & wrong)
-    assert np.sum(checked.accepted & ~wrong) > 0.95 * np.sum(plain.accepted & ~wrong)
-    # All else stays as it was, and each match has one fate.
+    is_wrong = np.linalg.norm(plain.second - true, axis=1) > 1.5
+    assert np.sum(plain.accepted & is_wrong) > 100
+    # Segments are about 25 px long: one in eight random matches passes the reverse check.
+    assert np.sum(checked.accepted & is_wrong) < 0.3 * np.sum(plain.accepted & is_wrong)
+    assert np.sum(checked.accepted & ~is_wrong) > 0.95 * np.sum(plain.accepted & ~is_wrong)
+    # Other matches are unchanged, and each match has one outcome.
     np.testing.assert_array_equal(checked.second, plain.second)
     dropped = checked.fates == Fate.NOT_RETURNED
     np.testing.assert_array_equal(checked.accepted | dropped, plain.accepted)
@@ -209,18 +211,18 @@ def test_matches_that_do_not_find_their_way_back_are_dropped_and_counted(scene: 
     assert len(checked.points) == checked.accepted.sum()
 
 
-def test_right_matches_find_their_way_back(scene: Pass, seen: LandingScene) -> None:
+def test_correct_matches_pass_the_reverse_check(scene: Pass, landing_scene: LandingScene) -> None:
     pixels = pixel_lattice((320, 240), 16, 6)
-    places = undistort(seen.views[0].camera, pixels)
-    _, _, room = epipolar_segments(seen.views[1], scene.second_from_first, places, (7.0, 13.0), 6)
-    pixels, places = pixels[room].astype(np.int64), places[room]
+    positions = undistort(landing_scene.views[0].camera, pixels)
+    _, _, room = epipolar_segments(landing_scene.views[1], scene.second_from_first, positions, (7.0, 13.0), 6)
+    pixels, positions = pixels[room].astype(np.int64), positions[room]
     true = np.rint(scene.camera(1).project(scene.ground(0, pixels.astype(np.float64)))[0]).astype(np.int64)
-    off = return_distance(seen.views, scene.second_from_first, pixels, true, places, (7.0, 13.0), 5)
-    # Both searches go by whole pixels: 0.7 px each, and what relief within a window adds.
+    off = return_distance(landing_scene.views, scene.second_from_first, pixels, true, positions, (7.0, 13.0), 5)
+    # Both searches use whole pixels: 0.7 px each, plus the effect of relief within a window.
     assert np.mean(off <= 1.5) > 0.98
 
 
-def test_ends_of_segments_are_cut_at_the_border() -> None:
+def test_segments_are_clipped_at_the_image_border() -> None:
     inside = np.array([[50.0, 50.0], [50.0, 50.0], [10.0, 10.0], [50.0, 50.0]])
     ends = np.array([[60.0, 40.0], [110.0, 80.0], [0.0, 20.0], [np.nan, 10.0]])
     cut = clip_to_image((100, 80), inside, ends, 10.0)

@@ -1,4 +1,4 @@
-"""Features and tracks: Eqs. 1-5 against plain arithmetic, tracks against the exact scene."""
+"""Tests of features and tracks: Eqs. 1-5 against direct computation, tracks against the exact scene."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from marsyard.algorithms.hda.tracking import (
     track_features,
 )
 from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak, pseudo_normalized_correlation
-from tests.algorithms.hda.relief_scene import Pass, bumps, camera, picture, plane, pose
+from tests.algorithms.hda.relief_scene import Pass, camera, make_bumps, plane, pose, render_image
 
 OPTIONS = HdaOptions(block_px=32)
 
@@ -29,10 +29,10 @@ def noise() -> np.ndarray:
     return np.random.default_rng(1).integers(0, 256, (120, 160)).astype(np.uint16)
 
 
-def test_interest_is_the_product_of_what_the_eigenvalues_exceed_the_minimum_by(noise: np.ndarray) -> None:
+def test_interest_is_product_of_eigenvalue_excesses(noise: np.ndarray) -> None:
     image = noise.astype(np.float32)
     p = eigenvalue_test(image, 11, 300.0)
-    # Independent: gradients and sums by loops over one template.
+    # Independent computation: loops over one template for gradients and sums.
     for row, column in ((20, 30), (60, 81), (100, 140)):
         part = image[row - 6 : row + 7, column - 6 : column + 7].astype(np.float64)
         smooth_rows = part[:-2] + 2.0 * part[1:-1] + part[2:]
@@ -45,19 +45,20 @@ def test_interest_is_the_product_of_what_the_eigenvalues_exceed_the_minimum_by(n
         assert p[row, column] == pytest.approx(expected, rel=1e-3)
 
 
-def test_both_eigenvalues_below_the_minimum_are_no_feature() -> None:
-    # The product of two negative excesses is positive: only a > l tells them from two large eigenvalues.
+def test_two_small_eigenvalues_are_not_a_feature() -> None:
+    # The product of two negative excesses is positive; only the condition a > l distinguishes it from two large
+    # eigenvalues.
     faint = np.random.default_rng(2).integers(0, 3, (60, 60)).astype(np.float32)
     assert not np.any(np.isfinite(eigenvalue_test(faint, 11, 50.0)))
 
 
-def test_straight_edges_and_flat_pictures_have_no_features() -> None:
+def test_straight_edges_and_uniform_images_have_no_features() -> None:
     edge = np.tile((np.arange(160) // 20 % 2 * 200).astype(np.uint16), (120, 1))
     assert len(select_features(edge, OPTIONS)) == 0
     assert len(select_features(np.full((120, 160), 77, dtype=np.uint16), OPTIONS)) == 0
 
 
-def test_one_feature_a_block_its_best_within_the_border() -> None:
+def test_each_block_gives_its_best_feature_within_border() -> None:
     counts = np.random.default_rng(3).integers(0, 256, (150, 200)).astype(np.uint16)
     options = HdaOptions(block_px=40, window_half_px=8)
     features = select_features(counts, options)
@@ -75,10 +76,10 @@ def test_one_feature_a_block_its_best_within_the_border() -> None:
     np.testing.assert_array_equal(features, expected)
 
 
-def test_levels_of_the_papers_window() -> None:
+def test_pyramid_levels_of_the_papers_window() -> None:
     # Table I: t = 5, w = 40. Eq. 4: log2(40) - 2 = 3.3; Eq. 5: 5 / 8 + 0.5 < 2, 40 / 8 + 0.5 = 5.5.
     assert level_sizes(5, 40) == (LevelSize(5, 2), LevelSize(3, 2), LevelSize(2, 2), LevelSize(2, 5))
-    # A window that one level holds is searched at the full resolution.
+    # A window that fits on one level is searched at full resolution.
     assert level_sizes(5, 6) == (LevelSize(5, 6),)
 
 
@@ -87,30 +88,30 @@ def test_pyramid_levels_are_block_means(noise: np.ndarray) -> None:
     np.testing.assert_allclose(levels[2], noise.reshape(30, 4, 40, 4).mean(axis=(1, 3)), rtol=1e-6)
 
 
-def test_correlation_and_its_top_are_those_of_the_shared_operators(noise: np.ndarray) -> None:
+def test_correlation_peak_matches_shared_operators(noise: np.ndarray) -> None:
     first = noise.astype(np.float32)
     second = 0.8 * np.roll(first, (2, -3), axis=(0, 1)) + 31.0
     template, window = first[40:51, 60:71], second[32:63, 50:77]
     surface = pseudo_normalized_correlation(template, window)
-    ours = [
+    actual = [
         [matching.correlation(first, second, 45, 65, 37 + i, 55 + j, 5) for j in range(surface.shape[1])]
         for i in range(surface.shape[0])
     ]
-    np.testing.assert_allclose(ours, surface, atol=1e-6)
+    np.testing.assert_allclose(actual, surface, atol=1e-6)
     peak = highest_peak(surface)
     z = surface[peak.row - 1 : peak.row + 2, peak.column - 1 : peak.column + 2]
     np.testing.assert_allclose(matching.biquadratic_top(z)[:2], biquadratic_offset(surface, peak), atol=1e-12)
 
 
-def test_the_biquadratics_top_is_exact_for_a_quadric() -> None:
+def test_biquadratic_peak_is_exact_for_a_quadric() -> None:
     r, c = np.mgrid[-1.0:2.0, -1.0:2.0]
     z = 0.9 - 0.3 * (r - 0.2) ** 2 - 0.2 * (c + 0.35) ** 2 - 0.1 * (r - 0.2) * (c + 0.35)
     np.testing.assert_allclose(matching.biquadratic_top(z), (0.2, -0.35, 0.9), atol=1e-12)
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (7, -4), (-38, 33), (40, 40)])
-def test_whole_shifts_up_to_the_window_are_found(shift: tuple[int, int]) -> None:
-    # Detail at all scales, or the coarse levels have nothing to find.
+def test_integer_shifts_within_the_window_are_found(shift: tuple[int, int]) -> None:
+    # Coarse levels need image content at all scales.
     rng = np.random.default_rng(4)
     spectrum = np.fft.rfft2(rng.standard_normal((240, 320)))
     frequency = np.hypot(np.fft.fftfreq(240)[:, None], np.fft.rfftfreq(320)[None])
@@ -119,34 +120,35 @@ def test_whole_shifts_up_to_the_window_are_found(shift: tuple[int, int]) -> None
     first = np.rint(500.0 + 100.0 * values / values.std()).clip(0, 4095).astype(np.uint16)
     second = np.roll(first, shift[::-1], axis=(0, 1))
     features = select_features(first, OPTIONS)
-    # Those that the wrap-around does not touch.
+    # Features that are not affected by the periodic border.
     features = features[np.all((features > 60) & (features < np.array([260, 180])), axis=1)]
     tracks = track_features(first, second, features, features, replace(OPTIONS, align=False))
     assert len(features) > 10
-    # The biquadratic leans on texture as fine as pixels.
-    right = np.all(np.abs(tracks.second - features - shift) < 0.3, axis=1)
-    assert right.mean() > 0.9
-    assert np.all(tracks.correlations[right] > 0.98)
+    # The biquadratic fit is biased on texture as fine as pixels.
+    is_correct = np.all(np.abs(tracks.second - features - shift) < 0.3, axis=1)
+    assert is_correct.mean() > 0.9
+    assert np.all(tracks.correlations[is_correct] > 0.98)
 
 
-def flown(second: tuple[float, ...] = (0.2, -0.6, 10.05, 21.5, 0.5, -0.8)) -> Pass:
-    return Pass(bumps((1.2, 0.8, 0.4, 0.3), base=plane(0.05, 0.02)), (pose(0.0, 0.0, 10.0, 20.0), pose(*second)))
+def make_pass(second: tuple[float, ...] = (0.2, -0.6, 10.05, 21.5, 0.5, -0.8)) -> Pass:
+    return Pass(make_bumps((1.2, 0.8, 0.4, 0.3), base=plane(0.05, 0.02)), (pose(0.0, 0.0, 10.0, 20.0), pose(*second)))
 
 
-def test_tracks_over_relief_end_where_the_exact_scene_has_them() -> None:
-    scene = flown()
-    first, second = (picture(scene, i).counts for i in (0, 1))
+def test_tracks_over_relief_match_exact_scene() -> None:
+    scene = make_pass()
+    first, second = (render_image(scene, i).counts for i in (0, 1))
     features = select_features(first, OPTIONS)
     true = scene.camera(1).project(scene.ground(0, features))[0]
     plain, fine = (
         track_features(first, second, features, features, replace(OPTIONS, align=align)) for align in (False, True)
     )
     assert fine.accepted.sum() >= 40
-    right = fine.accepted & (np.hypot(*(plain.second - true).T) < 1.0)
-    assert right.sum() >= 0.95 * fine.accepted.sum()
-    # The biquadratic's lean to whole pixels is up to 0.09 px; aligned, what is left is rounding to counts and relief.
-    assert np.sqrt(np.mean((plain.second - true)[right] ** 2)) < 0.1
-    assert np.sqrt(np.mean((fine.second - true)[right] ** 2)) < 0.015
+    is_correct = fine.accepted & (np.hypot(*(plain.second - true).T) < 1.0)
+    assert is_correct.sum() >= 0.95 * fine.accepted.sum()
+    # The biquadratic fit is biased by up to 0.09 px. After alignment the error comes from rounding to counts and
+    # relief.
+    assert np.sqrt(np.mean((plain.second - true)[is_correct] ** 2)) < 0.1
+    assert np.sqrt(np.mean((fine.second - true)[is_correct] ** 2)) < 0.015
 
 
 @pytest.mark.parametrize(
@@ -160,26 +162,26 @@ def test_tracks_over_relief_end_where_the_exact_scene_has_them() -> None:
     ],
     ids=["lower by 23 %", "higher by 20 %", "rolled by 10 deg", "pitched by 20 deg", "yawed by 20 deg"],
 )
-def test_the_papers_largest_changes_are_tracked(second: tuple[float, ...]) -> None:
-    """Section II.A, and a little lower: nine in ten of the features that the second picture shows."""
+def test_largest_changes_of_the_paper_are_tracked(second: tuple[float, ...]) -> None:
+    """Section II.A and slightly lower: at least 90 % of the features visible in the second image are tracked."""
     rng = np.random.default_rng(5)
     boulders = [(*rng.uniform(-3.0, 3.0, 2), rng.uniform(0.1, 0.3), rng.uniform(0.1, 0.3)) for _ in range(30)]
-    scene = Pass(bumps(*boulders), (pose(0.0, 0.0, 10.0, 20.0), pose(*second)))
-    one, other = (picture(scene, i).counts for i in (0, 1))
+    scene = Pass(make_bumps(*boulders), (pose(0.0, 0.0, 10.0, 20.0), pose(*second)))
+    one, other = (render_image(scene, i).counts for i in (0, 1))
     features = select_features(one, OPTIONS)
     true = scene.camera(1).project(scene.ground(0, features))[0]
     shown = np.all((true >= 12.0) & (true <= np.array([307.0, 227.0])), axis=1)
     tracks = track_features(one, other, features, true + 3.0, OPTIONS)
-    right = tracks.accepted & (np.hypot(*(tracks.second - true).T) < 1.0)
+    is_correct = tracks.accepted & (np.hypot(*(tracks.second - true).T) < 1.0)
     assert shown.sum() >= 15
-    assert np.mean(right[shown]) >= 0.9
-    # Of those that left the picture one or two find ground that looks alike.
-    assert np.sum(tracks.accepted & ~right) <= 2
+    assert np.mean(is_correct[shown]) >= 0.9
+    # One or two features that left the image may match similar ground.
+    assert np.sum(tracks.accepted & ~is_correct) <= 2
 
 
-def test_features_that_leave_the_picture_are_no_tracks() -> None:
-    scene = flown((0.0, -1.0, 10.0, 20.0))
-    first, second = (picture(scene, i).counts for i in (0, 1))
+def test_features_leaving_the_image_are_rejected() -> None:
+    scene = make_pass((0.0, -1.0, 10.0, 20.0))
+    first, second = (render_image(scene, i).counts for i in (0, 1))
     features = select_features(first, replace(OPTIONS, window_half_px=60))
     true = scene.camera(1).project(scene.ground(0, features))[0]
     tracks = track_features(first, second, features, features, replace(OPTIONS, window_half_px=60))
@@ -188,31 +190,31 @@ def test_features_that_leave_the_picture_are_no_tracks() -> None:
     assert not np.any(tracks.accepted & outside)
 
 
-def test_the_search_begins_where_it_is_reported() -> None:
-    scene = flown((0.0, -1.8, 10.0, 20.0))
-    first, second = (picture(scene, i).counts for i in (0, 1))
+def test_search_starts_at_predicted_positions() -> None:
+    scene = make_pass((0.0, -1.8, 10.0, 20.0))
+    first, second = (render_image(scene, i).counts for i in (0, 1))
     features = select_features(first, OPTIONS)
     true = scene.camera(1).project(scene.ground(0, features))[0]
     inside = np.all((true > 30) & (true < np.array([290, 210])), axis=1)
-    # 70 px and more: beyond the window, unless the search is told where to begin.
+    # At least 70 px: outside the window without a prediction.
     lost = track_features(first, second, features, features, OPTIONS)
-    found = track_features(first, second, features, true + 9.0, OPTIONS)
+    result = track_features(first, second, features, true + 9.0, OPTIONS)
     assert np.mean(np.hypot(*(lost.second - true).T)[inside] < 1.0) < 0.1
-    assert np.mean(np.hypot(*(found.second - true).T)[inside] < 1.0) > 0.9
+    assert np.mean(np.hypot(*(result.second - true).T)[inside] < 1.0) > 0.9
 
 
-def test_tracks_among_boulders_are_right_or_none() -> None:
+def test_tracks_near_boulders_are_correct_or_rejected() -> None:
     rng = np.random.default_rng(5)
     boulders = [(*rng.uniform(-3.0, 3.0, 2), rng.uniform(0.2, 0.5), rng.uniform(0.1, 0.3)) for _ in range(20)]
-    scene = Pass(bumps(*boulders), (pose(0.0, 0.0, 10.0, 20.0), pose(0.1, -0.7, 10.1, 21.0, 1.0, 1.0)))
-    first, second = (picture(scene, i).counts for i in (0, 1))
+    scene = Pass(make_bumps(*boulders), (pose(0.0, 0.0, 10.0, 20.0), pose(0.1, -0.7, 10.1, 21.0, 1.0, 1.0)))
+    first, second = (render_image(scene, i).counts for i in (0, 1))
     features = select_features(first, OPTIONS)
     true = scene.camera(1).project(scene.ground(0, features))[0]
     plain, fine = (
         track_features(first, second, features, features, replace(OPTIONS, align=align)) for align in (False, True)
     )
-    wrong = np.hypot(*(fine.second - true).T) > 0.5
-    # What correlation alone would have accepted: features that left the picture, and edges that hide ground.
-    assert np.sum(plain.accepted & wrong) >= 3
-    assert np.sum(fine.accepted & wrong) <= 1
+    is_wrong = np.hypot(*(fine.second - true).T) > 0.5
+    # Correlation alone would accept features that left the image and occluding edges.
+    assert np.sum(plain.accepted & is_wrong) >= 3
+    assert np.sum(fine.accepted & is_wrong) <= 1
     assert np.sum(fine.accepted) > 40

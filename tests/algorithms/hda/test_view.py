@@ -1,19 +1,19 @@
-"""Pictures as the algorithm sees them: what the camera adds to the ground is taken off."""
+"""Tests of radiometric corrections: camera effects are removed from the images."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from marsyard.algorithms.hda.view import flat_fielded
+from marsyard.algorithms.hda.motion import flat_fielded
 from marsyard.sim.measurements import DetectorImage
 from marsyard.sim.sensor import Detector, DetectorParameters, natural_fall_off
 from marsyard.sim.sensor.optics import OpticsParameters
 from tests.algorithms.hda.relief_scene import camera
 
 
-def delivered(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, DetectorImage]:
-    """A scene, brighter towards one side, and its picture without noise to speak of at 4 ms."""
+def render_detector_image(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, DetectorImage]:
+    """A scene with a brightness gradient, and its image at 4 ms with negligible noise."""
     optics = camera(320)
     rows, columns = optics.size[1], optics.size[0]
     rng = np.random.default_rng(3)
@@ -29,18 +29,18 @@ def delivered(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, De
         calibration_error=0.0,
         optics=OpticsParameters(diffraction_px=0.0, diffusion_px=0.0, pixel_aperture=False),
     )
-    detector = Detector.drawn(natural_fall_off(optics), parameters, rng)
+    detector = Detector.draw(natural_fall_off(optics), parameters, rng)
     return scene, DetectorImage(detector.expose(scene, rng), 0.0, optics, detector.calibration)
 
 
 @pytest.mark.parametrize("times", [(0.0, 0.0), (5e-6, 0.0), (5e-6, 1e-6)])
-def test_counts_are_those_of_the_pixels_own_ground(times: tuple[float, float]) -> None:
-    scene, image = delivered(*times)
+def test_corrected_counts_match_ideal_image(times: tuple[float, float]) -> None:
+    scene, image = render_detector_image(*times)
     counts = flat_fielded(image).astype(np.float64)
-    # Exposure times counts per second; each count is rounded twice, and the response divides by 0.65 at least.
+    # The exposure time is counts per second. Each count is rounded twice, and the response is at least 0.65.
     expected = 0.004 * 4e9 / 4000.0 * scene
     assert np.abs(counts - expected).max() < 0.01 * expected.mean()
     smeared = (image.counts - image.calibration.offset_dn) / image.calibration.flat_field
     ramp = np.abs(smeared - expected).max() / expected.mean()
-    # 240 rows of 5 us over 4 ms, behind a lens that is brighter in the middle.
+    # 240 rows of 5 us over 4 ms, with lens fall-off.
     assert (ramp > 0.2) == (times[0] > 0.0)

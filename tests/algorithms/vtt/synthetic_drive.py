@@ -1,7 +1,6 @@
-"""A rover among textured bodies, its pictures exact: each pixel's ray is cast to a plane or a sphere, no renderer.
-
-The texture fills space: a sum of plane waves with amplitudes falling as 1/frequency, as on natural surfaces. What a
-pixel's extent averages away is taken out wave by wave in closed form, so that far pictures do not alias.
+"""A rover among textured bodies: the ray of each pixel is intersected with a plane or sphere. The solid texture is a
+sum of plane waves with amplitudes proportional to 1/frequency. The average over the pixel extent is taken per wave
+in closed form: no aliasing.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from marsyard.sim.camera import Cahv, Cahvor, CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastCalibration, MastGeometry, MastImage, RoverMeasurements, RoverTarget
 
-#: The mast of a MER: axes 1.4 m above the ground the rover's frame stands on; elbow and head are off their axes.
+#: The MER mast: the axes intersect 1.4 m above the rover frame; elbow and head are offset from the axes.
 MAST = MastGeometry(
     base_m=np.array([0.35, 0.05, 1.1]), elbow_m=np.array([0.02, 0.01, 0.3]), head_m=np.array([0.06, 0.0, 0.08])
 )
@@ -29,7 +28,7 @@ MAST = MastGeometry(
 def stereo_pair(
     focal_px: float, size: tuple[int, int], baseline_m: float, toe_in_rad: float = 0.0
 ) -> tuple[CameraModel, CameraModel]:
-    """Cameras on the head, with the lens distortion of Opportunity's navcam, its axis off the middle."""
+    """Head cameras with the lens distortion of Opportunity's navcam and an off-centre axis."""
     cameras = []
     for side in (1.0, -1.0):
         turn = Rotation.from_rotvec([0.0, 0.0, -side * toe_in_rad])
@@ -47,19 +46,19 @@ def stereo_pair(
 
 @cache
 def navcam() -> MastCalibration:
-    """MER's: 0.82 mrad pixels, 20 cm."""
+    """MER navcam: 0.82 mrad pixels, 20 cm baseline."""
     return MastCalibration(MAST, *stereo_pair(1222.5, (1024, 1024), 0.20))
 
 
 @cache
 def pancam() -> MastCalibration:
-    """The research rover's: 0.29 mrad pixels, 30 cm, looking straight ahead: 516 px of disparity at 2 m."""
+    """Pancam of the research rover: 0.29 mrad pixels, 30 cm baseline, 516 px of disparity at 2 m."""
     return MastCalibration(MAST, *stereo_pair(3440.9, (1024, 768), 0.30))
 
 
 @dataclass(frozen=True)
 class Waves:
-    """A texture that fills space: wave vectors (n, 3) in rad/m, amplitudes of a total variance of 1, phases."""
+    """A solid texture: wave vectors (n, 3) in rad/m, amplitudes with a total variance of 1, and phases."""
 
     vectors: np.ndarray
     amplitudes: np.ndarray
@@ -67,7 +66,7 @@ class Waves:
 
 
 def waves(seed: int, longest_m: float = 0.6, shortest_m: float = 0.003, count: int = 160) -> Waves:
-    """Waves of all directions, their lengths spread evenly over octaves: the variance of each octave is the same."""
+    """Waves in all directions, their lengths spread evenly over octaves: each octave has the same variance."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -87,7 +86,7 @@ class Plane:
     normal: np.ndarray
 
     def ranges(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Distance along each ray; NaN where it does not meet the front."""
+        """Distance along each ray; NaN where the ray misses the front side."""
         slope = directions @ self.normal
         with np.errstate(divide="ignore", invalid="ignore"):
             t = ((self.point - origins) @ self.normal) / slope
@@ -102,7 +101,7 @@ class Sphere:
     radius: float
 
     def ranges(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Distance along each ray; NaN where it passes by."""
+        """Distance along each ray; NaN where the ray misses."""
         offset = origins - self.centre
         b = np.sum(offset * directions, axis=-1)
         gap = b * b - np.sum(offset * offset, axis=-1) + self.radius**2
@@ -112,7 +111,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Scene:
-    """Bodies with one texture; the nearest hides the others. Waves' phases count from `origin`."""
+    """Bodies with one texture; the nearest occludes the others. Wave phases are relative to `origin`."""
 
     bodies: tuple[Plane | Sphere, ...]
     texture: Waves
@@ -121,7 +120,7 @@ class Scene:
     level_dn: float = 1500.0
 
     def hit(self, camera: CameraModel, pixels: np.ndarray) -> np.ndarray:
-        """World points that pixels of a camera in the world see; NaN for the sky."""
+        """World points at pixels of a camera in the world; NaN for the sky."""
         origins, directions = camera.rays(pixels)
         ranges = np.stack([body.ranges(origins, directions) for body in self.bodies])
         nearest = np.where(np.isnan(ranges), np.inf, ranges).min(axis=0)
@@ -130,7 +129,7 @@ class Scene:
     def picture(
         self, camera: CameraModel, box: PixelBox, noise: np.random.Generator | None = None, noise_dn: float = 8.0
     ) -> MastImage:
-        """Counts of a part of the frame, the pixels' extent taken from the middle of the part."""
+        """Counts of a part of the frame; the pixel extent is that of the part's centre."""
         u = box.corner[0] + np.arange(box.size[0], dtype=np.float64)
         v = box.corner[1] + np.arange(box.size[1], dtype=np.float64)
         points = self.hit(camera, np.stack(np.meshgrid(u, v), axis=-1))
@@ -155,17 +154,15 @@ class Scene:
 
 
 def pose(x: float, y: float, heading_rad: float = 0.0, tilt: Rotation | None = None) -> RigidTransform:
-    """The rover at a place on level ground, heading counted to the left from +x, tilted in its own axes."""
+    """Pose of the rover on level ground, heading counter-clockwise from +x, tilted in its own axes."""
     turn = Rotation.from_rotvec([0.0, 0.0, heading_rad])
     return rigid(turn if tilt is None else turn * tilt, np.array([x, y, 0.0]))
 
 
 @dataclass
 class Drive:
-    """A rover that looks with a tracker at what a scene shows, stop by stop.
-
-    `mast` is the true one, `calibrated` what the rover believes of it; `pointing_error_rad` is how far the mast's true
-    angles are from those commanded and read.
+    """A rover that observes a scene with a tracker, stop by stop. `mast` is the true mast and `calibrated` the rover's
+    model. `pointing_error_rad` is the difference between true and commanded mast angles.
     """
 
     scene: Scene
@@ -179,13 +176,13 @@ class Drive:
     def camera(self, world_from_rover: RigidTransform, angles: tuple[float, float], right: bool = False) -> CameraModel:
         """A camera in the world at mast angles."""
         chosen = self.mast.right if right else self.mast.left
-        return chosen.moved(world_from_rover * self.mast.geometry.rover_from_head(*angles))
+        return chosen.transform(world_from_rover * self.mast.geometry.rover_from_head(*angles))
 
     def stop(self, true: RigidTransform, estimated: RigidTransform | None = None) -> TargetUpdate | None:
-        """Aims, takes pictures and updates; None where the tracker finds no aim."""
-        believed = true if estimated is None else estimated
-        known = self.mast if self.calibrated is None else self.calibrated
-        aim = self.tracker.aim(believed, known)
+        """Aim, capture images and update; return None where the tracker has no aim."""
+        estimated_x = true if estimated is None else estimated
+        is_known = self.mast if self.calibrated is None else self.calibrated
+        aim = self.tracker.aim(estimated_x, is_known)
         if aim is None:
             return None
         angles = (aim.azimuth_rad, aim.elevation_rad)
@@ -194,35 +191,35 @@ class Drive:
             RoverMeasurements(
                 left=self.scene.picture(self.camera(true, actual), aim.left, self.noise),
                 right=self.scene.picture(self.camera(true, actual, right=True), aim.right, self.noise),
-                mast=known,
+                mast=is_known,
                 azimuth_rad=angles[0],
                 elevation_rad=angles[1],
-                world_from_rover=believed,
+                world_from_rover=estimated_x,
             )
         )
         return self.tracker.update(self.measurements[-1])
 
     def true_pixel(self, true: RigidTransform, point_world: np.ndarray) -> np.ndarray:
-        """Where the left picture of the last stop truly shows a point of the world."""
+        """True pixel of a world point in the left image of the last stop."""
         last, error = self.measurements[-1], self.pointing_error_rad
         return self.camera(true, (last.azimuth_rad + error[0], last.elevation_rad + error[1])).project(point_world)[0]
 
 
-#: A smaller window than the paper's keeps the pictures that must be computed small.
+#: A smaller window than the paper's reduces the computed image parts.
 SMALL = VttOptions(search_px=101)
 
 Body = Callable[[int, np.ndarray], Plane | Sphere]
 
 
 def slanted(seed: int, target: np.ndarray) -> Plane:
-    """A face through the target, turned and tilted at random, towards a rover at the origin."""
+    """A face through the target with a random tilt, visible to a rover at the origin."""
     rng = np.random.default_rng(seed)
     normal = np.array([-1.0, rng.uniform(-0.5, 0.5), rng.uniform(0.0, 1.0)])
     return Plane(target, normal / np.linalg.norm(normal))
 
 
 def boulder(seed: int, target: np.ndarray) -> Sphere:
-    """A sphere of 0.3 to 0.6 m whose front holds the target."""
+    """A sphere of 0.3 to 0.6 m with the target on its front."""
     rng = np.random.default_rng(seed)
     normal = np.array([-1.0, rng.uniform(-0.4, 0.4), rng.uniform(0.2, 0.8)])
     radius = rng.uniform(0.3, 0.6)
@@ -246,18 +243,18 @@ def pixel_of(update: TargetUpdate) -> np.ndarray:
 
 
 def approach(
-    drive: Drive, target: np.ndarray, share: float, goal_m: float = 2.0, slip: float = 0.0
+    drive: Drive, target: np.ndarray, fraction: float, goal_m: float = 2.0, slip: float = 0.0
 ) -> list[tuple[RigidTransform, TargetUpdate]]:
-    """Stops on the way to the target, each step a share of its distance, until it is near or lost."""
+    """Stops on the way to the target until it is near or lost; each step is a fraction of the distance."""
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    stops, x, believed = [], 0.0, 0.0
+    stops, x, estimated_x = [], 0.0, 0.0
     while True:
-        update = drive.stop(pose(x, 0.0), pose(believed, 0.0))
+        update = drive.stop(pose(x, 0.0), pose(estimated_x, 0.0))
         assert update is not None
         stops.append((pose(x, 0.0), update))
         distance = details(update).distance_m
         if not update.found or distance < goal_m + 0.02:
             return stops
-        step = min(share * distance, 1.3 * (distance - goal_m))
-        believed += step
+        step = min(fraction * distance, 1.3 * (distance - goal_m))
+        estimated_x += step
         x += step * (1.0 - slip)

@@ -1,4 +1,4 @@
-"""Table I of the tracking paper, to its printed digit."""
+"""Tests of the accuracy formulas of tracking against Table I of the tracking paper."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from marsyard.algorithms.vtt.accuracy import (
 )
 
 
-def test_table_1_to_the_printed_digit() -> None:
+def test_table_1_matches_printed_digits() -> None:
     pancam, navcam = table_1()
     assert (pancam.designation_cm, pancam.untracked_cm) == (9.7, 18.7)
     assert (navcam.designation_cm, navcam.untracked_cm) == (38.8, 42.0)
@@ -25,20 +25,20 @@ def test_table_1_to_the_printed_digit() -> None:
     assert navcam.tracked_formula == "sqrt(1.6^2 + (0.16 N)^2)"
 
 
-def test_an_extreme_drift_of_ten_pixels_as_in_the_text() -> None:
+def test_ten_pixel_drift_matches_the_paper() -> None:
     # "Even with an extreme 10-pixel drift, ... 0.7 cm for pancam and 2.3 cm with navcam."
     pancam, navcam = table_1()
     assert round_half_up(pancam.tracked_cm(10.0), 1) == 0.7
     assert round_half_up(navcam.tracked_cm(10.0), 1) == 2.3
 
 
-def test_the_digits_need_the_specified_pixel() -> None:
-    # The 4.69 um that the text derives from the sensor's size gives 9.8 and 39.1 cm.
+def test_table_1_requires_the_specified_pixel_pitch() -> None:
+    # The text derives 4.69 um from the sensor size, which gives 9.8 and 39.1 cm.
     wide = [StereoDesign(d.name, d.focal_length_m, 4.8e-3 / 1024, d.baseline_m) for d in (PANCAM, NAVCAM)]
     assert [accuracy_row(d).designation_cm for d in wide] == [9.8, 39.1]
 
 
-def test_laws_of_the_errors() -> None:
+def test_error_scaling_laws() -> None:
     assert stereo_range_error_m(6.0, 1000.0, 0.2) == pytest.approx(9.0 * stereo_range_error_m(2.0, 1000.0, 0.2))
     assert stereo_range_error_m(2.0, 1000.0, 0.2, 0.5) == pytest.approx(0.01)
     # A pixel at 2 m: 0.58 mm and 1.55 mm.
@@ -50,5 +50,5 @@ def test_laws_of_the_errors() -> None:
     ("value", "digits", "expected"),
     [(38.75, 1, 38.8), (38.749999999999993, 1, 38.8), (1.55, 1, 1.6), (0.155, 2, 0.16), (-0.25, 1, -0.3)],
 )
-def test_halves_are_printed_away_from_zero(value: float, digits: int, expected: float) -> None:
+def test_half_digits_are_rounded_away_from_zero(value: float, digits: int, expected: float) -> None:
     assert round_half_up(value, digits) == expected

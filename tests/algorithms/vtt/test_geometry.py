@@ -1,4 +1,4 @@
-"""Where the target is, where the mast must look and how the picture turns: closed forms and round trips."""
+"""Tests of target coordinates, mast pointing, image roll and stereo: closed forms and round trips."""
 
 from __future__ import annotations
 
@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.vtt.options import VttOptions
-from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position, mast_angles, middle
-from marsyard.algorithms.vtt.stereo import disparity_px_m, epipolar_pixels, search_ranges, triangulated
-from marsyard.algorithms.vtt.target import (
+from marsyard.algorithms.vtt.matching import (
     bearing_rad,
     designated_position_world,
     horizontal_axis,
@@ -20,6 +17,9 @@ from marsyard.algorithms.vtt.target import (
     predicted_position,
     roll_angle,
 )
+from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position, mast_angles, middle
+from marsyard.algorithms.vtt.stereo import disparity_px_m, epipolar_pixels, search_ranges, triangulate
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastCalibration, MastGeometry, PixelTarget, RoverTarget, SiteTarget
@@ -30,8 +30,8 @@ def random_pose(rng: np.random.Generator) -> RigidTransform:
     return rigid(Rotation.random(rng=rng), rng.normal(0.0, 5.0, 3))
 
 
-def targets(seed: int, count: int) -> np.ndarray:
-    """Points on the ground around the rover, 2 to 12 m away, in its frame."""
+def draw_targets(seed: int, count: int) -> np.ndarray:
+    """Points on the ground around the rover, 2 to 12 m away, in the rover frame."""
     rng = np.random.default_rng(seed)
     azimuth, distance = rng.uniform(-2.5, 2.5, count), rng.uniform(2.0, 12.0, count)
     return np.stack([distance * np.cos(azimuth), distance * np.sin(azimuth), rng.uniform(-0.3, 0.5, count)], axis=1)
@@ -40,17 +40,17 @@ def targets(seed: int, count: int) -> np.ndarray:
 # ----- the target -----
 
 
-def test_rover_and_site_coordinates_name_the_same_point() -> None:
-    # 3 m north, 4 m east, 1 m down of the origin.
+def test_rover_and_site_coordinates_agree() -> None:
+    # 3 m north, 4 m east and 1 m below the origin.
     site = designated_position_world(SiteTarget(np.array([3.0, 4.0, 1.0])), pose(9.0, 9.0, 1.0))
     np.testing.assert_allclose(site, [4.0, 3.0, -1.0], atol=1e-12)
-    # A rover at (4, 1) that faces north has it 2 m ahead and 1 m below.
+    # For a rover at (4, 1) that faces north, the target is 2 m ahead and 1 m below.
     rover = designated_position_world(RoverTarget(np.array([2.0, 0.0, -1.0])), pose(4.0, 1.0, np.pi / 2))
     np.testing.assert_allclose(rover, site, atol=1e-12)
 
 
-def test_a_target_stays_where_it_is_while_the_rover_moves() -> None:
-    # Ahead by 5 m; after a drive of 1 m and a turn of 90 deg to the left it is 4 m to the right.
+def test_target_is_fixed_while_the_rover_moves() -> None:
+    # 5 m ahead; after a drive of 1 m and a left turn of 90 deg the target is 4 m to the right.
     moved = predicted_position(np.array([5.0, 0.0, 0.2]), pose(0.0, 0.0), pose(1.0, 0.0, np.pi / 2))
     np.testing.assert_allclose(moved, [0.0, -4.0, 0.2], atol=1e-12)
     rng = np.random.default_rng(1)
@@ -61,7 +61,7 @@ def test_a_target_stays_where_it_is_while_the_rover_moves() -> None:
 @pytest.mark.parametrize(
     ("direction", "degrees"), [((0, 1, 0), 0), ((1, 0, 0), 90), ((0, -1, 5), 180), ((-1, 0, 0), -90)]
 )
-def test_bearings_count_from_north_clockwise(direction: tuple[int, int, int], degrees: int) -> None:
+def test_bearings_are_clockwise_from_north(direction: tuple[int, int, int], degrees: int) -> None:
     assert np.degrees(bearing_rad(np.array(direction, dtype=np.float64))) == pytest.approx(degrees)
 
 
@@ -72,35 +72,35 @@ def test_azimuth_turns_to_the_right_and_elevation_up() -> None:
     forward = np.array([1.0, 0.0, 0.0])
     np.testing.assert_allclose(MAST.rover_from_head(np.pi / 2, 0.0).rotation.apply(forward), [0, -1, 0], atol=1e-12)
     np.testing.assert_allclose(MAST.rover_from_head(0.3, np.pi / 2).rotation.apply(forward), [0, 0, 1], atol=1e-12)
-    # Turned by 90 deg to the right, what was ahead of the azimuth axis is to the right of it.
+    # After a right turn of 90 deg, points ahead of the azimuth axis are to its right.
     expected = MAST.base_m + np.array([0.01, -0.08, 0.38])
     np.testing.assert_allclose(MAST.rover_from_head(np.pi / 2, 0.0).translation, expected, atol=1e-12)
 
 
-def test_the_mast_turns_about_its_two_axes_one_after_the_other() -> None:
+def test_mast_rotates_about_both_axes_in_order() -> None:
     for azimuth, elevation in ((0.7, -0.4), (-2.1, 0.3)):
         pan = Rotation.from_rotvec([0.0, 0.0, -azimuth])
         turn = pan * Rotation.from_rotvec([0.0, -elevation, 0.0])
         head = MAST.rover_from_head(azimuth, elevation)
         np.testing.assert_allclose(head.rotation.as_matrix(), turn.as_matrix(), atol=1e-14)
-        place = MAST.base_m + pan.apply(MAST.elbow_m) + turn.apply(MAST.head_m)
-        np.testing.assert_allclose(head.translation, place, atol=1e-14)
+        position = MAST.base_m + pan.apply(MAST.elbow_m) + turn.apply(MAST.head_m)
+        np.testing.assert_allclose(head.translation, position, atol=1e-14)
 
 
-def test_rounding_does_not_move_the_borders_of_a_subframe() -> None:
-    # a target in the middle of the frame puts them on whole pixels, which the last bit would round either way
+def test_rounding_does_not_shift_subframe_borders() -> None:
+    # A centred target puts the borders on whole pixels, where the last bit decides the rounding.
     target, options = np.array([6.0, 0.5, 0.1]), VttOptions()
     aim = aim_at_position(target, navcam(), options)
     assert aim is not None
     for nudge in (-1e-13, 1e-13, -3e-12, 3e-12):
-        again = aim_at_position(target + nudge, navcam(), options)
-        assert again is not None
-        assert (again.left, again.right) == (aim.left, aim.right)
+        repeated = aim_at_position(target + nudge, navcam(), options)
+        assert repeated is not None
+        assert (repeated.left, repeated.right) == (aim.left, aim.right)
 
 
 @pytest.mark.parametrize("mast", [navcam(), pancam()])
-def test_pointing_brings_the_target_to_the_middle(mast: MastCalibration) -> None:
-    for target in targets(2, 20):
+def test_pointing_centres_the_target(mast: MastCalibration) -> None:
+    for target in draw_targets(2, 20):
         angles = mast_angles(target, mast)
         assert angles is not None
         head = mast.geometry.rover_from_head(*angles).inv().apply(target)
@@ -109,18 +109,18 @@ def test_pointing_brings_the_target_to_the_middle(mast: MastCalibration) -> None
 
 def test_pointing_a_pair_splits_the_disparity() -> None:
     mast = pancam()
-    for target in targets(3, 20):
+    for target in draw_targets(3, 20):
         angles = mast_angles(target, mast, pair=True)
         assert angles is not None
         head = mast.geometry.rover_from_head(*angles).inv().apply(target)
         left, right = (camera.project(head)[0] - middle(camera) for camera in (mast.left, mast.right))
         np.testing.assert_allclose(left + right, 0.0, atol=1e-4)
         distance = float(np.linalg.norm(head))
-        # f B / R of disparity, to the square of the small angles.
+        # The disparity is f B / R to second order in the small angles.
         assert left[0] - right[0] == pytest.approx(3440.9 * 0.3 / distance, rel=0.02)
 
 
-def test_near_targets_stay_in_both_pancams_only_if_the_pair_is_centred() -> None:
+def test_near_targets_need_pair_centred_pointing() -> None:
     # 516 px of disparity at 2 m: more than half of 1024.
     near = np.array([1.2, -0.1, 0.1])
     assert aim_at_position(near, pancam(), VttOptions()) is None
@@ -129,20 +129,20 @@ def test_near_targets_stay_in_both_pancams_only_if_the_pair_is_centred() -> None
     assert aim.left.corner[0] - aim.right.corner[0] > 400
 
 
-def test_limits_of_the_mast_hold() -> None:
+def test_mast_limits_are_enforced() -> None:
     bound = replace(navcam(), geometry=replace(MAST, azimuth_limits_rad=(-0.5, 0.5), elevation_limits_rad=(-0.6, 0.5)))
     assert mast_angles(np.array([8.0, 1.0, 0.0]), bound) is not None
     assert mast_angles(np.array([0.0, -8.0, 0.0]), bound) is None  # to the right
-    assert mast_angles(np.array([1.0, 0.0, 0.0]), bound) is None  # at its feet
+    assert mast_angles(np.array([1.0, 0.0, 0.0]), bound) is None  # at the foot of the mast
 
 
-def test_aims_read_out_what_the_searches_need() -> None:
+def test_aim_subframes_cover_the_search_windows() -> None:
     options = VttOptions()
     aim = aim_at_position(np.array([6.0, 0.5, 0.1]), navcam(), options)
     assert aim is not None
     angles = (aim.azimuth_rad, aim.elevation_rad)
     head = navcam().geometry.rover_from_head(*angles).inv().apply(np.array([6.0, 0.5, 0.1]))
-    # Half the window; to the right, disparities of half as much beside it and two rows off the epipolar curve.
+    # Half the window on each side. The right image adds half the disparity range and two rows of epipolar tolerance.
     for camera, box, reach in (
         (navcam().left, aim.left, np.array([80.0, 80.0])),
         (navcam().right, aim.right, np.array([120.0, 82.0])),
@@ -152,7 +152,7 @@ def test_aims_read_out_what_the_searches_need() -> None:
         assert np.all(pixel + reach <= np.add(box.corner, box.size) - 1)
 
 
-def test_a_pixel_is_looked_at_as_it_was_picked_with_all_its_ranges() -> None:
+def test_pixel_designation_keeps_pixel_and_covers_all_ranges() -> None:
     mast, options = navcam(), VttOptions(seed_range_m=(2.0, 30.0))
     aim = aim_at_pixel(PixelTarget(np.array([400.0, 700.0]), 0.3, -0.2), mast, options)
     assert aim is not None
@@ -174,7 +174,7 @@ def test_magnification_is_the_ratio_of_distances() -> None:
     assert magnification(np.array([2.0, 0.0, 0.0]), at, np.array([4.0, 0.0, 1.0]), np.array([0, 0, 1.0])) == 0.5
 
 
-def test_the_horizontal_axis_is_that_of_the_picture_even_if_skewed() -> None:
+def test_horizontal_axis_follows_skewed_image() -> None:
     h, v = np.array([500.0, -1200.0, 30.0]), np.array([400.0, 0.0, -1200.0])
     skewed = Cahv(np.zeros(3), np.array([1.0, 0.0, 0.0]), h, v, (1024, 1024))
     np.testing.assert_allclose(horizontal_axis(skewed), skewed.right, atol=1e-12)
@@ -182,23 +182,23 @@ def test_the_horizontal_axis_is_that_of_the_picture_even_if_skewed() -> None:
 
 
 @pytest.mark.parametrize("roll_deg", [-30.0, -3.0, 0.0, 12.0, 80.0])
-def test_a_camera_that_rolls_one_way_sees_the_picture_roll_the_other(roll_deg: float) -> None:
+def test_image_roll_is_opposite_to_camera_roll(roll_deg: float) -> None:
     camera = navcam().left
-    # The head turned about its line of sight, clockwise as the camera sees it (+x forward): the picture turns back.
+    # The head rolls clockwise about its line of sight (+x forward): the image rolls counter-clockwise.
     turn = rigid(Rotation.from_rotvec(np.deg2rad(roll_deg) * camera.a), np.zeros(3))
     target = camera.c + 5.0 * camera.rays(middle(camera))[1]
-    seen = lever_pixels(target, camera, camera, turn.inv(), 0.05)
-    assert seen is not None
-    roll = roll_angle(seen)
-    # The lens axis is 5 px off the middle, about which the head turned: it moves the target in the picture.
+    observed = lever_pixels(target, camera, camera, turn.inv(), 0.05)
+    assert observed is not None
+    roll = roll_angle(observed)
+    # The lens axis is 5 px from the rotation centre: the target moves in the image.
     assert np.degrees(roll) == pytest.approx(-roll_deg, abs=0.3)
 
 
-def test_passing_by_a_target_rolls_its_picture() -> None:
-    # Fig. 4: a level rover. What was horizontal at right angles to the line of sight is seen, after the direction has
-    # turned by t and looking down by d, at atan(tan t sin d) to the horizontal.
+def test_passing_a_target_rolls_its_image() -> None:
+    # Fig. 4: a level rover. A horizontal line perpendicular to the line of sight is seen at atan(tan t sin d). The
+    # direction has turned by t at a depression angle d.
     mast = replace(navcam(), geometry=MastGeometry(np.array([0.0, 0.0, 1.5]), np.zeros(3), np.zeros(3)))
-    mast = replace(mast, left=mast.left.moved(rigid(Rotation.identity(), np.array([0.0, -0.1, 0.0]))))
+    mast = replace(mast, left=mast.left.transform(rigid(Rotation.identity(), np.array([0.0, -0.1, 0.0]))))
     target, where = np.array([6.8, 0.0, 0.0]), [(0.0, 0.0), (5.6, 0.9)]
     heads = []
     for x, y in where:
@@ -207,18 +207,18 @@ def test_passing_by_a_target_rolls_its_picture() -> None:
         assert angles is not None
         heads.append(stop * mast.geometry.rover_from_head(*angles))
     new_from_old = heads[1].inv() * heads[0]
-    seen = lever_pixels(heads[0].inv().apply(target), mast.left, mast.left, new_from_old, 0.001)
-    assert seen is not None
-    roll = roll_angle(seen)
-    turned = np.arctan2(0.9, 1.2)  # to the right
+    observed = lever_pixels(heads[0].inv().apply(target), mast.left, mast.left, new_from_old, 0.001)
+    assert observed is not None
+    roll = roll_angle(observed)
+    rotated = np.arctan2(0.9, 1.2)  # to the right
     down = np.arctan2(1.5, np.hypot(0.9, 1.2))
-    assert abs(np.degrees(roll)) == pytest.approx(np.degrees(np.arctan(np.tan(turned) * np.sin(down))), abs=0.5)
+    assert abs(np.degrees(roll)) == pytest.approx(np.degrees(np.arctan(np.tan(rotated) * np.sin(down))), abs=0.5)
     assert abs(np.degrees(roll)) > 25.0
-    # The old right-hand side is now farther away than the target: higher up in the picture, counter-clockwise.
+    # The former right-hand side is now farther away and higher in the image: counter-clockwise roll.
     assert roll < 0.0
 
 
-def test_no_roll_is_given_for_what_the_camera_cannot_see() -> None:
+def test_roll_is_undefined_for_invisible_targets() -> None:
     camera = navcam().left
     behind = rigid(Rotation.from_rotvec([0.0, 0.0, np.pi]), np.zeros(3))
     assert lever_pixels(np.array([5.0, 0.0, 0.0]), camera, camera, behind, 0.05) is None
@@ -228,7 +228,7 @@ def test_no_roll_is_given_for_what_the_camera_cannot_see() -> None:
 
 
 @pytest.mark.parametrize("mast", [navcam(), pancam()])
-def test_the_epipolar_curve_goes_through_the_points_of_the_ray(mast: MastCalibration) -> None:
+def test_epipolar_curve_contains_points_of_the_ray(mast: MastCalibration) -> None:
     pixel = np.array([700.3, 250.8])
     curve = epipolar_pixels(mast.left.rays(pixel), mast.left, mast.right, (2.0, 20.0))
     _, direction = mast.left.rays(pixel)
@@ -238,35 +238,35 @@ def test_the_epipolar_curve_goes_through_the_points_of_the_ray(mast: MastCalibra
     assert np.abs(np.diff(curve[:, 0])).max() < 0.6
 
 
-def test_searched_ranges_are_disparities_apart() -> None:
+def test_search_ranges_follow_disparity_steps() -> None:
     left, right = navcam().left, navcam().right
     near, far = search_ranges(left, right, 5.0, 20.0)
     scale = disparity_px_m(left, right)
     assert scale == pytest.approx(1222.5 * 0.2)
     assert scale / near - scale / 5.0 == pytest.approx(20.0)
     assert scale / 5.0 - scale / far == pytest.approx(20.0)
-    assert search_ranges(left, right, 30.0, 20.0)[1] > 1e5  # to infinity and no further
+    assert search_ranges(left, right, 30.0, 20.0)[1] > 1e5  # to infinity and not beyond
 
 
 @pytest.mark.parametrize("mast", [navcam(), pancam()])
 def test_triangulation_inverts_projection(mast: MastCalibration) -> None:
     rng = np.random.default_rng(4)
     for point in rng.uniform([2.0, -0.15, -0.15], [12.0, 0.15, 0.15], (20, 3)):
-        found = triangulated(mast.left, mast.right, mast.left.project(point)[0], mast.right.project(point)[0])
-        assert found is not None
-        np.testing.assert_allclose(found, point, atol=1e-6)
+        result = triangulate(mast.left, mast.right, mast.left.project(point)[0], mast.right.project(point)[0])
+        assert result is not None
+        np.testing.assert_allclose(result, point, atol=1e-6)
 
 
-def test_lines_of_sight_that_do_not_meet_give_no_range() -> None:
+def test_diverging_lines_of_sight_give_no_range() -> None:
     left, right = navcam().left, navcam().right
     far = np.array([1e3, 0.0, 0.0])
     a, b = left.project(far)[0], right.project(far)[0]
-    assert triangulated(left, right, a, b) is not None
-    assert triangulated(left, right, a, b + np.array([3.0, 0.0])) is None  # they diverge
-    assert triangulated(left, left, a, a) is None
+    assert triangulate(left, right, a, b) is not None
+    assert triangulate(left, right, a, b + np.array([3.0, 0.0])) is None  # they diverge
+    assert triangulate(left, left, a, a) is None
 
 
-def test_points_of_the_epipolar_curve_are_half_a_pixel_apart() -> None:
+def test_epipolar_curve_points_are_half_a_pixel_apart() -> None:
     left, right = navcam().left, navcam().right
     pixels = epipolar_pixels(left.rays(np.array([500.0, 500.0])), left, right, (4.0, 8.0))
     steps = np.linalg.norm(np.diff(pixels, axis=0), axis=1)

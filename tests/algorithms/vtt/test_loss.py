@@ -1,4 +1,4 @@
-"""Criteria of loss, tolerances, states and the hand-off."""
+"""Tests of loss criteria, tolerances, tracking states and the hand-off to the arm."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from marsyard.algorithms.interface import TargetLoss, TargetUpdate, TrackingState
-from marsyard.algorithms.vtt.handoff import GoalReached, HandOffOutcome, hand_off
-from marsyard.algorithms.vtt.loss import Evidence, Journey, Tolerances, find_losses, next_state, tolerances
+from marsyard.algorithms.vtt.accuracy import GoalReached, HandOffOutcome, hand_off
 from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.algorithms.vtt.tracker import Evidence, Journey, Tolerances, find_losses, next_state, tolerances
 from marsyard.sim.measurements import MastCalibration
 from tests.algorithms.vtt.synthetic_drive import navcam, pancam
 
@@ -33,12 +33,12 @@ ALLOWED = Tolerances(distance_m=0.2, position_m=0.4)
         ("position_correction_m", 0.41, TargetLoss.POSITION_JUMP),
     ],
 )
-def test_each_criterion_stands_alone(changed: str, value: float, expected: TargetLoss | None) -> None:
-    found = find_losses(Evidence(**(GOOD | {changed: value})), ALLOWED, OPTIONS)
-    assert found == (() if expected is None else (expected,))
+def test_each_loss_criterion_is_independent(changed: str, value: float, expected: TargetLoss | None) -> None:
+    result = find_losses(Evidence(**(GOOD | {changed: value})), ALLOWED, OPTIONS)
+    assert result == (() if expected is None else (expected,))
 
 
-def test_all_criteria_are_reported() -> None:
+def test_all_violated_criteria_are_reported() -> None:
     assert find_losses(Evidence(0.1, 0.1, 9.0, 9.0), ALLOWED, OPTIONS) == (
         TargetLoss.LOW_MATCH_SCORE,
         TargetLoss.LOW_STEREO_SCORE,
@@ -47,14 +47,15 @@ def test_all_criteria_are_reported() -> None:
     )
 
 
-def test_tolerances_are_those_of_the_formula() -> None:
-    # Navcam of MER: dR = R^2 / 244.5 for 1 px: 0.409 m at 10 m, 0.331 at 9 m; a step of 1 m adds 0.2, direction 0.27.
-    found = tolerances(Journey(10.0, 10.0, 9.0, 1.0, 1.0), navcam().left, navcam().right, OPTIONS)
-    assert found.distance_m == pytest.approx(0.05 + np.sqrt(0.409**2 + 0.3313**2 + 0.2**2), abs=1e-3)
-    assert found.position_m == pytest.approx(0.05 + np.sqrt(0.409**2 + 0.3313**2 + 0.2**2 + 0.27**2), abs=1e-3)
+def test_tolerances_match_the_formula() -> None:
+    # MER navcam: dR = R^2 / 244.5 for 1 px: 0.409 m at 10 m, 0.331 m at 9 m. A step of 1 m adds 0.2 m, direction 0.27
+    # m.
+    result = tolerances(Journey(10.0, 10.0, 9.0, 1.0, 1.0), navcam().left, navcam().right, OPTIONS)
+    assert result.distance_m == pytest.approx(0.05 + np.sqrt(0.409**2 + 0.3313**2 + 0.2**2), abs=1e-3)
+    assert result.position_m == pytest.approx(0.05 + np.sqrt(0.409**2 + 0.3313**2 + 0.2**2 + 0.27**2), abs=1e-3)
 
 
-def test_tolerances_shrink_as_the_rover_comes_nearer() -> None:
+def test_tolerances_shrink_with_target_distance() -> None:
     distances = [10.0 * 0.9**i for i in range(16)]
     allowed = [
         tolerances(Journey(10.0, before, now, before - now, 10.0 - now), navcam().left, navcam().right, OPTIONS)
@@ -62,28 +63,28 @@ def test_tolerances_shrink_as_the_rover_comes_nearer() -> None:
     ]
     assert np.all(np.diff([a.distance_m for a in allowed]) < 0.0)
     assert allowed[-1].distance_m < 0.11
-    # The first designation was that uncertain, and the rover may have drifted: never below either.
+    # Initial designation uncertainty and rover drift remain: the tolerance is never below either.
     assert min(a.position_m for a in allowed) > 0.409
 
 
 @pytest.mark.parametrize("mast", [navcam(), pancam()])
 def test_stereo_noise_rarely_loses_a_target(mast: MastCalibration) -> None:
-    # 1 px of 3 sigma in two disparities, and 20 % of 3 sigma in a step of 1 m: of the 3 sigma that the root sum square
-    # stands for, before the floor is added, less than 0.3 % are beyond it.
+    # 1 px (3 sigma) in two disparities and 20 % (3 sigma) of a 1 m step. Less than 0.3 % exceed the root sum square
+    # before the floor is added.
     rng = np.random.default_rng(1)
     scale = mast.left.focal_lengths[0] * np.linalg.norm(mast.left.c - mast.right.c)
     old, new = (scale / (scale / r + rng.normal(0.0, 1.0 / 3.0, 100_000)) for r in (10.0, 9.0))
     correction = new - (old - 1.0 + rng.normal(0.0, 0.2 / 3.0, 100_000))
     allowed = tolerances(Journey(10.0, 10.0, 9.0, 1.0, 1.0), mast.left, mast.right, OPTIONS)
     assert np.mean(np.abs(correction) > allowed.distance_m) < 0.003
-    assert np.quantile(np.abs(correction), 0.99) > allowed.distance_m * 0.45  # and it is not loose by much
+    assert np.quantile(np.abs(correction), 0.99) > allowed.distance_m * 0.45  # the tolerance is not much too large
 
 
 NORMAL, LOST, FAILURE = TrackingState.NORMAL, TrackingState.LOST, TrackingState.FAILURE
 
 
 @pytest.mark.parametrize(
-    ("limit", "found", "expected"),
+    ("limit", "result", "expected"),
     [
         (2, [True, False, False, True, False], [NORMAL, LOST, LOST, NORMAL, LOST]),
         (2, [False, False, False, True], [LOST, LOST, FAILURE, FAILURE]),
@@ -92,27 +93,27 @@ NORMAL, LOST, FAILURE = TrackingState.NORMAL, TrackingState.LOST, TrackingState.
         (0, [True, False, True], [NORMAL, FAILURE, FAILURE]),
     ],
 )
-def test_states_follow_each_other_as_in_figure_6(limit: int, found: list[bool], expected: list[TrackingState]) -> None:
-    state, tries, seen = NORMAL, 0, []
-    for one in found:
+def test_state_transitions_match_figure_6(limit: int, result: list[bool], expected: list[TrackingState]) -> None:
+    state, tries, is_visible = NORMAL, 0, []
+    for one in result:
         state, tries = next_state(state, tries, one, limit)
-        seen.append(state)
-    assert seen == expected
+        is_visible.append(state)
+    assert is_visible == expected
 
 
-def test_without_a_target_nothing_happens() -> None:
+def test_state_without_target_is_unchanged() -> None:
     assert next_state(TrackingState.NO_TARGET, 0, True, 2) == (TrackingState.NO_TARGET, 0)
 
 
-def test_the_arm_gets_a_tracked_target_at_the_goal_only() -> None:
+def test_arm_receives_only_tracked_targets_at_the_goal() -> None:
     here, goal = np.array([1.5, 0.0, 0.1]), GoalReached(distance_m=1.5, tolerance_m=0.05)
     tracked = TargetUpdate(NORMAL, (), here)
-    given = hand_off(tracked, goal, navcam())
-    assert given.outcome is HandOffOutcome.HANDED_OVER
-    assert given.target is not None
-    np.testing.assert_array_equal(given.target.position_rover, here)
-    # Eq. 5 at 1.75 m (from the axis at 0.35, 1.4): 1.25 cm of stereo, 0.36 cm of drift.
-    assert given.target.error_m == pytest.approx(np.hypot(1.735**2 / 244.5, 2.5 * 1.735 / 1222.5), rel=0.01)
+    inputs = hand_off(tracked, goal, navcam())
+    assert inputs.outcome is HandOffOutcome.HANDED_OVER
+    assert inputs.target is not None
+    np.testing.assert_array_equal(inputs.target.position_rover, here)
+    # Eq. 5 at 1.75 m (from the axis at 0.35, 1.4): 1.25 cm of stereo error, 0.36 cm of drift.
+    assert inputs.target.error_m == pytest.approx(np.hypot(1.735**2 / 244.5, 2.5 * 1.735 / 1222.5), rel=0.01)
     lost = hand_off(TargetUpdate(LOST, (TargetLoss.LOW_MATCH_SCORE,), here), goal, navcam())
     assert (lost.outcome, lost.target) == (HandOffOutcome.NOT_TRACKED, None)
     far = hand_off(TargetUpdate(NORMAL, (), np.array([1.6, 0.0, 0.1])), goal, navcam())

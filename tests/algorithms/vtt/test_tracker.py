@@ -1,4 +1,4 @@
-"""The tracker in its loop, on pictures that are exact: planes and spheres seen through distorting cameras."""
+"""Tests of the closed-loop tracker on exact images of planes and spheres through distorting cameras."""
 
 from __future__ import annotations
 
@@ -37,21 +37,21 @@ from tests.algorithms.vtt.synthetic_drive import (
 
 
 @pytest.mark.parametrize(
-    ("share", "body", "seeds"), [(0.1, slanted, range(3)), (0.1, boulder, range(3)), (0.05, slanted, range(10, 11))]
+    ("fraction", "body", "seeds"), [(0.1, slanted, range(3)), (0.1, boulder, range(3)), (0.05, slanted, range(10, 11))]
 )
-def test_the_tracked_point_does_not_drift_from_10_m_to_2_m(share: float, body: Body, seeds: range) -> None:
-    # The requirement: 1 px rms, 2.5 px worst (the paper's own: a pixel at 10 m is 5 px at 2 m), noise-free.
+def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, body: Body, seeds: range) -> None:
+    # Requirement: 1 px rms, 2.5 px maximum without noise. A pixel at 10 m is 5 px at 2 m.
     drifts = []
     for seed in seeds:
         target = np.array([10.0, 0.2 - 0.1 * seed, 0.2])
         drive = Drive(scene_of(body(seed, target), target, seed), navcam(), VisualTargetTracker(SMALL))
-        stops = approach(drive, target, share)
+        stops = approach(drive, target, fraction)
         true, last = stops[-1]
         assert last.found
         assert details(last).distance_m < 2.05
         drifts.append(pixel_of(last) - drive.true_pixel(true, target))
         assert last.position_rover is not None
-        # Bar 5's 3 cm, with exact poses and cameras: a tenth of it.
+        # One tenth of the required 3 cm, with exact poses and cameras.
         assert np.linalg.norm(last.position_rover - true.inv().apply(target)) < 0.003
         for (_, before), (_, after) in pairwise(stops):
             change = details(after).change
@@ -63,8 +63,8 @@ def test_the_tracked_point_does_not_drift_from_10_m_to_2_m(share: float, body: B
     assert np.max(np.linalg.norm(drifts, axis=1)) < 2.5
 
 
-def test_whole_pixels_drift() -> None:
-    # An error of up to half a pixel in each of 32 steps, magnified by all later ones: 0.4 px rms times 15.
+def test_whole_pixel_matching_drifts() -> None:
+    # Each of 32 steps has an error of up to half a pixel, magnified by later steps: 0.4 px rms times 15.
     drifts = []
     for seed in (0, 3):
         target = np.array([10.0, 0.0, 0.2])
@@ -81,7 +81,7 @@ def test_whole_pixels_drift() -> None:
 # ----- appearance -----
 
 
-def test_scale_carries_through_large_steps_that_pure_ncc_does_not_survive() -> None:
+def test_scaling_allows_larger_steps_than_pure_ncc() -> None:
     target = np.array([10.0, 0.1, 0.2])
     scene = scene_of(slanted(2, target), target, 2)
     scaled = approach(Drive(scene, navcam(), VisualTargetTracker(SMALL)), target, 0.23)
@@ -93,12 +93,12 @@ def test_scale_carries_through_large_steps_that_pure_ncc_does_not_survive() -> N
 
 
 @pytest.mark.parametrize("roll", [True, False])
-def test_a_tilted_rover_needs_the_roll(roll: bool) -> None:
+def test_tilted_rover_requires_roll_correction(roll: bool) -> None:
     target = np.array([5.0, 0.1, 0.3])
     drive = Drive(scene_of(slanted(1, target), target, 1), navcam(), VisualTargetTracker(replace(SMALL, roll=roll)))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
-    # The body leans by 25 deg to its right: its picture turns counter-clockwise by about as much.
+    # The body tilts by 25 deg to its right: its image rolls counter-clockwise by about the same angle.
     leaning = pose(0.3, 0.0, tilt=Rotation.from_rotvec([np.deg2rad(25.0), 0.0, 0.0]))
     update = drive.stop(leaning)
     change = details(update).change
@@ -110,26 +110,26 @@ def test_a_tilted_rover_needs_the_roll(roll: bool) -> None:
         np.testing.assert_allclose(pixel_of(update), drive.true_pixel(leaning, target), atol=0.3)
 
 
-def test_turning_in_place_changes_the_mast_and_nothing_else() -> None:
+def test_turn_in_place_changes_only_mast_angles() -> None:
     target = np.array([6.0, 0.5, 0.2])
     drive = Drive(scene_of(slanted(4, target), target, 4), navcam(), VisualTargetTracker(SMALL))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
     update = drive.stop(pose(0.0, 0.0, np.deg2rad(45.0)))
-    found = details(update)
+    result = details(update)
     assert update is not None
     assert update.found
-    assert found.match is not None
-    assert found.match.score > 0.95
-    assert found.change is not None
-    # The mast stands 0.35 m ahead of the axis the rover turns about: 2.5 deg of direction, 0.1 m of 5.6 m.
-    assert abs(found.change.magnification - 1.0) < 0.03
-    assert abs(np.degrees(found.azimuth_change_rad)) < 4.0
-    assert np.degrees(found.azimuth_rad) == pytest.approx(45.0, abs=5.0)
+    assert result.match is not None
+    assert result.match.score > 0.95
+    assert result.change is not None
+    # The mast is 0.35 m ahead of the turn axis: 2.5 deg of direction, 0.1 m of 5.6 m.
+    assert abs(result.change.magnification - 1.0) < 0.03
+    assert abs(np.degrees(result.azimuth_change_rad)) < 4.0
+    assert np.degrees(result.azimuth_rad) == pytest.approx(45.0, abs=5.0)
 
 
-def test_circling_the_target_lowers_the_score_and_leaves_the_match() -> None:
-    # As in Table III, where 6 to 9 deg gave 0.85 to 0.88 and 15 deg 0.79; a flat face has no relief to show.
+def test_circling_lowers_score_but_keeps_match() -> None:
+    # Table III gives 0.85 to 0.88 at 6 to 9 deg and 0.79 at 15 deg; a flat face has no relief.
     target = np.array([4.0, 0.0, 0.3])
     scene = scene_of(Plane(target, np.array([-0.96, 0.0, 0.28])), target, 5)
     scores = {}
@@ -143,7 +143,7 @@ def test_circling_the_target_lowers_the_score_and_leaves_the_match() -> None:
         update = drive.stop(second)
         assert update is not None
         assert update.found
-        # The mast stands ahead of the rover's origin and to its left; the angle is that of the camera's line of sight.
+        # The mast is ahead and to the left of the rover origin; the angle is that of the line of sight.
         assert abs(np.degrees(details(update).azimuth_change_rad)) == pytest.approx(step, rel=0.02)
         np.testing.assert_allclose(pixel_of(update), drive.true_pixel(second, target), atol=0.2)
         match = details(update).match
@@ -152,7 +152,7 @@ def test_circling_the_target_lowers_the_score_and_leaves_the_match() -> None:
     assert 0.79 < scores[15.0] < scores[8.0] < scores[2.0]
 
 
-def test_backing_off_shrinks_the_template() -> None:
+def test_driving_backwards_shrinks_the_template() -> None:
     target = np.array([4.0, 0.1, 0.2])
     drive = Drive(scene_of(slanted(2, target), target, 2), navcam(), VisualTargetTracker(SMALL))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
@@ -170,12 +170,12 @@ def test_backing_off_shrinks_the_template() -> None:
 # ----- designation, stereo, poses -----
 
 
-def test_all_three_designations_seed_the_same_target() -> None:
+def test_all_three_designations_give_the_same_target() -> None:
     target = np.array([7.0, 0.3, 0.2])
     start = pose(0.0, 0.0)
     scene = scene_of(slanted(5, target), target, 5)
     north_east_down = np.array([target[1], target[0], -target[2]])
-    camera = navcam().left.moved(start * navcam().geometry.rover_from_head(0.02, -0.12))
+    camera = navcam().left.transform(start * navcam().geometry.rover_from_head(0.02, -0.12))
     picked: list[TargetDesignation] = [
         RoverTarget(target),
         SiteTarget(north_east_down),
@@ -196,7 +196,7 @@ def test_all_three_designations_seed_the_same_target() -> None:
         np.testing.assert_allclose(pixel_of(after), drive.true_pixel(pose(0.7, 0.0), target), atol=0.1)
 
 
-def test_a_near_target_is_ranged_by_a_pair_that_is_centred_on_it() -> None:
+def test_near_target_range_uses_pair_centred_pointing() -> None:
     target = np.array([2.2, -0.1, 0.3])
     options = replace(SMALL, aim_pair=True)
     drive = Drive(scene_of(slanted(6, target), target, 6), pancam(), VisualTargetTracker(options))
@@ -207,8 +207,8 @@ def test_a_near_target_is_ranged_by_a_pair_that_is_centred_on_it() -> None:
     np.testing.assert_allclose(update.position_rover, target, atol=0.001)
 
 
-def test_a_slanted_face_is_scored_as_the_other_camera_sees_it() -> None:
-    """At 66 deg and 3 m a baseline of 0.2 m makes the right picture of a face 15 % longer or shorter."""
+def test_slanted_face_score_includes_second_camera_view() -> None:
+    """At 66 deg and 3 m, a baseline of 0.2 m changes the face width by 15 % in the right image."""
     target, slant = np.array([3.0, 0.0, 0.5]), np.radians(66.0)
     face = Plane(target, np.array([-np.cos(slant), np.sin(slant), 0.0]))
     scores = {}
@@ -221,8 +221,8 @@ def test_a_slanted_face_is_scored_as_the_other_camera_sees_it() -> None:
     assert scores["shift"] < scores["bend"] - 0.1
 
 
-def test_slip_shows_as_a_correction_and_not_as_an_error() -> None:
-    # The rover drives 4 % less than it believes: 4 cm of the first metre, 5 px of the picture's middle row and less.
+def test_slip_appears_as_a_position_correction() -> None:
+    # The rover drives 4 % less than estimated: 4 cm of the first metre, at most 5 px at the image centre.
     target = np.array([8.0, 0.1, 0.2])
     drive = Drive(scene_of(slanted(7, target), target, 7), navcam(), VisualTargetTracker(SMALL))
     stops = approach(drive, target, 0.1, slip=0.04)
@@ -232,11 +232,11 @@ def test_slip_shows_as_a_correction_and_not_as_an_error() -> None:
     np.testing.assert_allclose(last.position_rover, true.inv().apply(target), atol=0.01)
     evidence = details(last).evidence
     assert evidence is not None
-    # It has driven 6 m: the target moved by 4 % of that in the world that it believes in.
+    # After 6 m the target has moved by 4 % of that in the estimated world frame.
     assert evidence.position_correction_m == pytest.approx(0.24, abs=0.05)
 
 
-def test_a_mast_that_points_wrong_moves_the_picture_and_not_the_match() -> None:
+def test_pointing_error_moves_image_but_not_match() -> None:
     target = np.array([6.0, 0.1, 0.2])
     drive = Drive(scene_of(slanted(5, target), target, 5), navcam(), VisualTargetTracker(SMALL))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
@@ -245,34 +245,34 @@ def test_a_mast_that_points_wrong_moves_the_picture_and_not_the_match() -> None:
     update = drive.stop(pose(0.5, 0.0))
     assert update is not None
     assert update.found
-    found = details(update)
-    assert found.predicted_pixel is not None
-    # 0.82 mrad a pixel: looking too far to the right and down moves the target to the left and up.
-    correction = pixel_of(update) - found.predicted_pixel
+    result = details(update)
+    assert result.predicted_pixel is not None
+    # 0.82 mrad per pixel: pointing too far right and down moves the target left and up.
+    correction = pixel_of(update) - result.predicted_pixel
     np.testing.assert_allclose(correction, [-1222.5 * np.deg2rad(0.5), -1222.5 * np.deg2rad(0.3)], atol=0.5)
     np.testing.assert_allclose(pixel_of(update), drive.true_pixel(pose(0.5, 0.0), target), atol=0.1)
 
 
-@pytest.mark.parametrize(("rows", "found"), [(1.4, True), (5.0, False)])
-def test_point_stereo_tolerates_two_pixels_of_misalignment(rows: float, found: bool) -> None:
+@pytest.mark.parametrize(("rows", "result"), [(1.4, True), (5.0, False)])
+def test_point_stereo_tolerates_two_pixel_misalignment(rows: float, result: bool) -> None:
     target = np.array([6.0, 0.1, 0.2])
     true = navcam()
     assert isinstance(true.right, Cahvor)
-    believed = replace(true, right=replace(true.right, v=true.right.v + rows * true.right.a))
-    drive = Drive(scene_of(slanted(5, target), target, 5), true, VisualTargetTracker(SMALL), calibrated=believed)
+    misaligned = replace(true, right=replace(true.right, v=true.right.v + rows * true.right.a))
+    drive = Drive(scene_of(slanted(5, target), target, 5), true, VisualTargetTracker(SMALL), calibrated=misaligned)
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     update = drive.stop(pose(0.0, 0.0))
     assert update is not None
-    assert update.found == found
-    if found:
-        # Rows hardly enter the range: a tenth of a pixel of disparity is 1.5 cm here.
+    assert update.found == result
+    if result:
+        # Row errors hardly affect the range: a tenth of a pixel of disparity is 1.5 cm here.
         assert np.linalg.norm(update.position_rover - target) < 0.03
     else:
         assert update.losses == (TargetLoss.LOW_STEREO_SCORE,)
 
 
-def test_wheels_that_spin_in_place_are_noticed() -> None:
-    # Believed to have driven 1.5 m of 8 m; the target is still 8 m away, its picture not magnified.
+def test_spinning_wheels_are_detected() -> None:
+    # The estimated drive is 1.5 m of 8 m. The target is still 8 m away, and its image is not magnified.
     target = np.array([8.0, 0.1, 0.2])
     drive = Drive(scene_of(slanted(8, target), target, 8), navcam(), VisualTargetTracker(replace(SMALL, search_px=161)))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
@@ -282,7 +282,7 @@ def test_wheels_that_spin_in_place_are_noticed() -> None:
     assert update.state is TrackingState.LOST
 
 
-def test_noise_of_a_detector_costs_little() -> None:
+def test_detector_noise_has_little_effect() -> None:
     target = np.array([6.0, 0.1, 0.2])
     scene = replace(scene_of(slanted(9, target), target, 9), contrast=0.08)
     drive = Drive(scene, navcam(), VisualTargetTracker(SMALL), noise=np.random.default_rng(1))
@@ -294,7 +294,7 @@ def test_noise_of_a_detector_costs_little() -> None:
 # ----- another tracker behind the same protocol -----
 
 
-def test_lucas_kanade_follows_in_the_same_loop() -> None:
+def test_lucas_kanade_tracks_in_the_same_loop() -> None:
     target = np.array([6.0, 0.1, 0.2])
     tracker: TargetTracker = lucas_kanade_tracker(SMALL)
     drive = Drive(scene_of(slanted(1, target), target, 1), navcam(), tracker)
@@ -306,7 +306,7 @@ def test_lucas_kanade_follows_in_the_same_loop() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "invalid",
     [
         {"template_px": 20},
         {"search_px": 22},
@@ -317,16 +317,16 @@ def test_lucas_kanade_follows_in_the_same_loop() -> None:
         {"epipolar_tolerance_px": 0.0},
     ],
 )
-def test_impossible_options_are_refused(wrong: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        VttOptions(**wrong)  # type: ignore[arg-type]
+def test_invalid_options_are_rejected(invalid: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match=next(iter(invalid))):
+        VttOptions(**invalid)  # type: ignore[arg-type]
 
 
 # ----- lost targets -----
 
 
-def hidden(scene: Scene) -> Scene:
-    """The scene behind a board of another texture, half-way to the target."""
+def hide_behind_board(scene: Scene) -> Scene:
+    """The scene behind a board with another texture, half-way to the target."""
     board = Plane(np.array([3.0, 0.0, 0.5]), np.array([-1.0, 0.0, 0.0]))
     return Scene((board,), waves(99, count=100), board.point)
 
@@ -338,9 +338,7 @@ def hidden(scene: Scene) -> Scene:
         ([1, 2, 3], [TrackingState.LOST, TrackingState.LOST, TrackingState.FAILURE]),
     ],
 )
-def test_an_occluded_target_is_lost_and_found_again_or_given_up(
-    behind: list[int], expected: list[TrackingState]
-) -> None:
+def test_occluded_target_is_recovered_or_abandoned(behind: list[int], expected: list[TrackingState]) -> None:
     target = np.array([6.0, 0.1, 0.2])
     clear = scene_of(slanted(3, target), target, 3)
     tracker = VisualTargetTracker(SMALL)
@@ -349,7 +347,7 @@ def test_an_occluded_target_is_lost_and_found_again_or_given_up(
     drive.stop(pose(0.0, 0.0))
     states = []
     for stop in (1, 2, 3):
-        drive.scene = hidden(clear) if stop in behind else clear
+        drive.scene = hide_behind_board(clear) if stop in behind else clear
         true = pose(0.25 * stop, 0.0)
         update = drive.stop(true)
         assert update is not None
@@ -357,49 +355,52 @@ def test_an_occluded_target_is_lost_and_found_again_or_given_up(
         if update.found:
             np.testing.assert_allclose(pixel_of(update), drive.true_pixel(true, target), atol=0.2)
         else:
-            # Where it should be is all that is known: exact here, as the poses are.
+            # The predicted position is exact, as the poses are.
             assert update.losses
             assert update.position_rover is not None
             np.testing.assert_allclose(update.position_rover, true.inv().apply(target), atol=0.03)
     assert states == expected
     if states[-1] is TrackingState.FAILURE:
         drive.scene = clear
-        again = drive.stop(pose(1.0, 0.0))
-        assert again is not None
-        assert (again.state, again.losses, again.found) == (TrackingState.FAILURE, (), False)
+        repeated = drive.stop(pose(1.0, 0.0))
+        assert repeated is not None
+        assert (repeated.state, repeated.losses, repeated.found) == (TrackingState.FAILURE, (), False)
     tracker.clear()
     assert tracker.state is TrackingState.NO_TARGET
     assert tracker.aim(pose(0.0, 0.0), navcam()) is None
     assert tracker.update(drive.measurements[-1]).state is TrackingState.NO_TARGET
 
 
-def test_a_picture_that_does_not_show_the_target_is_a_loss() -> None:
+def test_image_without_the_target_is_a_loss() -> None:
     target = np.array([6.0, 0.1, 0.2])
     scene = scene_of(slanted(3, target), target, 3)
     drive = Drive(scene, navcam(), VisualTargetTracker(SMALL))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
-    seen = drive.measurements[-1]
+    observed = drive.measurements[-1]
     blank = MastImage(np.full((40, 40), 1000, dtype=np.uint16), (0, 0))
-    for wrong, loss in (
-        (replace(seen, left=blank), TargetLoss.OUT_OF_VIEW),
-        (replace(seen, right=blank), TargetLoss.OUT_OF_VIEW),
-        (replace(seen, azimuth_rad=seen.azimuth_rad + 2.5), TargetLoss.OUT_OF_VIEW),
+    for invalid, loss in (
+        (replace(observed, left=blank), TargetLoss.OUT_OF_VIEW),
+        (replace(observed, right=blank), TargetLoss.OUT_OF_VIEW),
+        (replace(observed, azimuth_rad=observed.azimuth_rad + 2.5), TargetLoss.OUT_OF_VIEW),
         (
-            replace(seen, left=replace(seen.left, counts=np.full_like(seen.left.counts, 900))),
+            replace(observed, left=replace(observed.left, counts=np.full_like(observed.left.counts, 900))),
             TargetLoss.LOW_MATCH_SCORE,
         ),
-        (replace(seen, right=replace(seen.right, counts=seen.left.counts * 0)), TargetLoss.LOW_STEREO_SCORE),
+        (
+            replace(observed, right=replace(observed.right, counts=observed.left.counts * 0)),
+            TargetLoss.LOW_STEREO_SCORE,
+        ),
     ):
         drive.tracker.clear()
         drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-        assert drive.tracker.update(seen).found
-        update = drive.tracker.update(wrong)
+        assert drive.tracker.update(observed).found
+        update = drive.tracker.update(invalid)
         assert update.state is TrackingState.LOST
         assert loss in update.losses
 
 
-def test_a_target_that_cannot_be_seeded_is_given_up() -> None:
+def test_unseeded_target_is_abandoned() -> None:
     tracker = VisualTargetTracker(SMALL)
     target = np.array([6.0, 0.1, 0.2])
     drive = Drive(scene_of(slanted(3, target), target, 3), navcam(), tracker)

@@ -1,4 +1,4 @@
-"""All problems of a campaign are reported at once, by file or option, key and allowed values."""
+"""Tests of loading campaign files: every problem is reported with its file or option, key and allowed values."""
 
 from __future__ import annotations
 
@@ -11,21 +11,20 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from marsyard.campaigns.definition.catalogue import catalogue
-from marsyard.campaigns.definition.loading import find_campaign, load_campaign
+from marsyard.campaigns.definition.loading import catalogue, find_campaign, load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 
 CampaignFile = Callable[..., Path]
 FAKE = "tests.campaigns.fake_scenario"
 
 
-def refusal(path: Path | str, *overrides: str, cases: int | None = None, seed: int | None = None) -> str:
-    with pytest.raises(ConfigurationError) as caught:
+def load_and_expect_error(path: Path | str, *overrides: str, cases: int | None = None, seed: int | None = None) -> str:
+    with pytest.raises(ConfigurationError) as raised:
         load_campaign(str(path), overrides, cases, seed)
-    return str(caught.value)
+    return str(raised.value)
 
 
-def test_parameters_come_complete_with_their_defaults(campaign_file: CampaignFile) -> None:
+def test_omitted_parameters_get_their_defaults(campaign_file: CampaignFile) -> None:
     campaign = load_campaign(str(campaign_file("altitude_m = 1500")))
     assert campaign.configuration.parameters["altitude_m"] == 1500.0
     assert campaign.configuration.parameters["wind"] == {"east_m_s": 0.0, "north_m_s": 0.0}
@@ -35,10 +34,7 @@ def test_parameters_come_complete_with_their_defaults(campaign_file: CampaignFil
     ("parameters", "message"),
     [
         ("altitud_m = 3", "parameters.altitud_m: unknown key (did you mean 'altitude_m'?); allowed: aborting"),
-        (
-            "wind = {est_m_s = 3}",
-            "parameters.wind.est_m_s: unknown key (did you mean 'east_m_s'?); allowed: east",
-        ),
+        ("wind = {est_m_s = 3}", "parameters.wind.est_m_s: unknown key (did you mean 'east_m_s'?); allowed: east"),
         ("altitude_m = -10", "parameters.altitude_m: input should be greater than 0, got -10"),
         ("altitude_m = 'high'", "parameters.altitude_m: input should be a valid number"),
         ("heights_m = [1]", "parameters.heights_m[1]: required, but missing"),
@@ -46,9 +42,9 @@ def test_parameters_come_complete_with_their_defaults(campaign_file: CampaignFil
         ("wind = 3", "parameters.wind: input should be a valid dictionary"),
     ],
 )
-def test_parameters(campaign_file: CampaignFile, parameters: str, message: str) -> None:
+def test_invalid_parameters_are_reported(campaign_file: CampaignFile, parameters: str, message: str) -> None:
     path = campaign_file(parameters, dispersions="")
-    text = refusal(path)
+    text = load_and_expect_error(path)
     assert text.startswith(f"{path}: ")
     assert message in text
 
@@ -67,10 +63,7 @@ def test_parameters(campaign_file: CampaignFile, parameters: str, message: str) 
         ("altitude_m = {distribution='normal', mean=5, sd=0}", "altitude_m.sd: input should be greater than 0"),
         ("altitude_m = {distribution='normal', mean=5, sd=1, truncate=[9,8]}", "the first limit must be below"),
         ("altitude_m = {distribution='normal', mean=5, sd=1, truncate=[90,95]}", "no probability between the limits"),
-        (
-            "altitude_m = {distribution='normal', mean=500, sd=100}",
-            "which the parameter does not take: altitude_m",
-        ),
+        ("altitude_m = {distribution='normal', mean=500, sd=100}", "which the parameter does not take: altitude_m"),
         ("altitude_m = {distribution='cauchy', loc=2000}", "which the parameter does not take"),
         ("altitude_m = {distribution='gamma', scale=2}", "parameter 'a' is missing; gamma takes a, loc, scale"),
         ("altitude_m = {distribution='gamma', a=1, scal=2}", "unknown parameter 'scal' (did you mean 'scale'?)"),
@@ -94,67 +87,43 @@ def test_parameters(campaign_file: CampaignFile, parameters: str, message: str) 
         ("kind = {distribution='choice', values=['a', 'B']}", "reaches 'B', which the parameter does not take"),
         ("kind = {distribution='choice', values=['a'], weights=[1, 2]}", "2 weights for 1 values"),
         ("kind = {distribution='choice', values=[]}", "kind.values: list should have at least 1 item"),
-        (
-            "kind = {distribution='choice', values=['a'], weights=[0]}",
-            "kind.weights[0]: input should be greater",
-        ),
+        ("kind = {distribution='choice', values=['a'], weights=[0]}", "kind.weights[0]: input should be greater"),
     ],
 )
-def test_dispersions(campaign_file: CampaignFile, dispersion: str, message: str) -> None:
+def test_invalid_dispersions_are_reported(campaign_file: CampaignFile, dispersion: str, message: str) -> None:
     path = campaign_file(dispersions=f"[dispersions]\n{dispersion}")
-    text = refusal(path)
+    text = load_and_expect_error(path)
     assert text.startswith(f"{path}: dispersions.")
     assert message in text
 
 
-def test_draws_that_are_refused_only_together(campaign_file: CampaignFile) -> None:
+def test_draws_with_invalid_combinations_are_reported(campaign_file: CampaignFile) -> None:
     dispersions = """
     [dispersions]
     altitude_m = {distribution = "uniform", low = 1000, high = 2000}
     """
-    text = refusal(campaign_file("altitude_m = 2000\nlowest_altitude_m = 1500", dispersions=dispersions))
+    text = load_and_expect_error(campaign_file("altitude_m = 2000\nlowest_altitude_m = 1500", dispersions=dispersions))
     assert "altitude_m must be above lowest_altitude_m" in text
 
 
 @pytest.mark.parametrize(
     ("head", "message"),
     [
-        (
-            "name='a'\nscenario='descnt'\ncases=1",
-            "unknown scenario 'descnt' (did you mean 'descent'?)",
-        ),
+        ("name='a'\nscenario='descnt'\ncases=1", "unknown scenario 'descnt' (did you mean 'descent'?)"),
         ("name='a'\nscenario='no_such_module:X'\ncases=1", "scenario: no scenario at 'no_such_module:X': No module"),
-        (
-            f"name='a'\nscenario='{FAKE}:Wind'\ncases=1",
-            "is not a scenario: it has no parameters_type",
-        ),
-        (
-            f"name='a b'\nscenario='{FAKE}:FakeScenario'\ncases=1",
-            "name: string should match pattern",
-        ),
+        (f"name='a'\nscenario='{FAKE}:Wind'\ncases=1", "is not a scenario: it has no parameters_type"),
+        (f"name='a b'\nscenario='{FAKE}:FakeScenario'\ncases=1", "name: string should match pattern"),
         (f"scenario='{FAKE}:FakeScenario'\ncases=1", "name: required, but missing"),
-        (
-            f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=0",
-            "cases: input should be greater",
-        ),
-        (
-            f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=true",
-            "cases: input should be a valid integer",
-        ),
-        (
-            f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nseed=-1",
-            "seed: input should be greater than or",
-        ),
-        (
-            f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nsed=1",
-            "sed: unknown key (did you mean 'seed'?)",
-        ),
+        (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=0", "cases: input should be greater"),
+        (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=true", "cases: input should be a valid integer"),
+        (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nseed=-1", "seed: input should be greater than or"),
+        (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nsed=1", "sed: unknown key (did you mean 'seed'?)"),
         (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nx=", "not valid TOML"),
     ],
 )
-def test_the_campaign_itself(campaign_file: CampaignFile, head: str, message: str) -> None:
+def test_invalid_campaign_keys_are_reported(campaign_file: CampaignFile, head: str, message: str) -> None:
     path = campaign_file(head=head)
-    text = refusal(path)
+    text = load_and_expect_error(path)
     assert text.startswith(f"{path}: ")
     assert message in text
 
@@ -166,64 +135,61 @@ def test_the_campaign_itself(campaign_file: CampaignFile, head: str, message: st
         ("bound = inf", "requirements[0].bound: input should be a finite number"),
         ("probability = 1.0", "requirements[0].probability: input should be less than 1, got 1.0"),
         ("confidence = 90", "requirements[0].confidence: input should be less than 1, got 90"),
-        (
-            "population = 'valid or not'",
-            "requirements[0].population: string should match pattern",
-        ),
+        ("population = 'valid or not'", "requirements[0].population: string should match pattern"),
         ("decide_by = 'luck'", "requirements[0].decide_by: input should be 'confidence' or 'estimate', got 'luck'"),
         ("metrik = 'x'", "requirements[0].metrik: unknown key (did you mean 'metric'?); allowed: accept_rate, bound"),
         ("accept_rate = true", 'accept_rate needs decide_by = "estimate"'),
     ],
 )
-def test_requirements(campaign_file: CampaignFile, change: str, message: str) -> None:
+def test_invalid_requirements_are_reported(campaign_file: CampaignFile, change: str, message: str) -> None:
     key = change.split(" ")[0]
     base = {"id": "'a'", "metric": "'m'", "bound": "1", "probability": "0.9", "confidence": "0.9"}
     lines = [f"{name} = {value}" for name, value in base.items() if name != key]
     path = campaign_file(requirement="[[requirements]]\n" + "\n".join([*lines, change]))
-    assert message in refusal(path)
+    assert message in load_and_expect_error(path)
 
 
-def test_requirements_have_distinct_ids(campaign_file: CampaignFile) -> None:
-    one = "[[requirements]]\nid='a'\nmetric='m'\nbound=1\nprobability=0.9\nconfidence=0.9\n"
-    assert "requirements share an id: a" in refusal(campaign_file(requirement=one + one))
+def test_duplicate_requirement_ids_are_rejected(campaign_file: CampaignFile) -> None:
+    entry = "[[requirements]]\nid='a'\nmetric='m'\nbound=1\nprobability=0.9\nconfidence=0.9\n"
+    assert "requirements share an id: a" in load_and_expect_error(campaign_file(requirement=entry + entry))
 
 
-def test_every_problem_is_listed(campaign_file: CampaignFile) -> None:
+def test_all_problems_are_listed_together(campaign_file: CampaignFile) -> None:
     path = campaign_file(
         "altitude_m = -1\nwnd = 3", more="[retain]\nshowcase = 'best'", dispersions="[dispersions]\nkind = 3"
     )
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as raised:
         load_campaign(str(path), [], cases=0)
-    keys = {problem.key for problem in caught.value.problems}
+    keys = {problem.key for problem in raised.value.problems}
     assert keys == {"cases", "parameters.altitude_m", "parameters.wnd", "retain.showcase", "dispersions.kind"}
 
 
 def test_missing_files_are_reported(tmp_path: Path) -> None:
-    assert refusal(tmp_path / "no.toml") == f"{tmp_path / 'no.toml'}: no such file"
-    assert refusal(tmp_path) == f"{tmp_path}: is a folder"
+    assert load_and_expect_error(tmp_path / "no.toml") == f"{tmp_path / 'no.toml'}: no such file"
+    assert load_and_expect_error(tmp_path) == f"{tmp_path}: is a folder"
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
-    assert "not valid TOML" in refusal(tmp_path / "bytes.toml")
+    assert "not valid TOML" in load_and_expect_error(tmp_path / "bytes.toml")
     (tmp_path / "deep.toml").write_text("x = " + "[" * 100_000)
-    assert "not valid TOML" in refusal(tmp_path / "deep.toml")
+    assert "not valid TOML" in load_and_expect_error(tmp_path / "deep.toml")
 
 
-def test_unknown_campaigns_are_reported_with_the_known_ones() -> None:
-    text = refusal("dimes-smok")
+def test_unknown_campaign_error_lists_known_campaigns() -> None:
+    text = load_and_expect_error("dimes-smok")
     assert "unknown campaign 'dimes-smok'" in text
     assert "path of a TOML file" in text
     for name in catalogue():
         assert name in text
 
 
-def test_the_catalogue_is_found_by_name_and_loads() -> None:
+def test_catalogue_campaigns_load_by_name() -> None:
     for name, path in catalogue().items():
         assert find_campaign(name) == path
         configuration = load_campaign(name).configuration
         assert configuration.name == name
-        assert [path for path, one in configuration.dispersions.items() if not one.source] == []
+        assert [path for path, entry in configuration.dispersions.items() if not entry.source] == []
 
 
-def test_the_example_of_the_documentation_loads(tmp_path: Path) -> None:
+def test_example_of_the_documentation_loads(tmp_path: Path) -> None:
     text = (Path(__file__).parents[3] / "docs" / "sampling.md").read_text()
     example = text.partition("```toml\n")[2].partition("```")[0]
     path = tmp_path / "example.toml"
@@ -232,15 +198,15 @@ def test_the_example_of_the_documentation_loads(tmp_path: Path) -> None:
     assert [campaign.draws(case)["descent.altitude_first_m"] for case in (1, 2, 40)] == [1400.0, 1700.0, 2600.0]
 
 
-def test_overrides(campaign_file: CampaignFile) -> None:
+def test_overrides_replace_values_and_dispersions(campaign_file: CampaignFile) -> None:
     path = str(campaign_file())
-    stated = ["altitude_m=1500", "wind.east_m_s = 3", "kind=smooth", "retain.showcase=none", "heights_m=[3, 4.5]"]
-    configuration = load_campaign(path, stated, cases=7, seed=9).configuration
+    overrides = ["altitude_m=1500", "wind.east_m_s = 3", "kind=smooth", "retain.showcase=none", "heights_m=[3, 4.5]"]
+    configuration = load_campaign(path, overrides, cases=7, seed=9).configuration
     assert (configuration.cases, configuration.seed, configuration.retain.showcase) == (7, 9, "none")
     assert configuration.parameters["altitude_m"] == 1500.0
     assert configuration.parameters["kind"] == "smooth"
     assert configuration.parameters["heights_m"] == [3.0, 4.5]
-    # A value that is set is the value of every case.
+    # Setting a parameter removes its dispersion.
     assert set(configuration.dispersions) == {"terrain"}
     quoted = load_campaign(path, ['dispersions."wind.east_m_s".low=-5', "cases=3", "parameters.kind=x"]).configuration
     assert quoted.dispersions["wind.east_m_s"].quantile(1e-9) == pytest.approx(-5.0)
@@ -264,7 +230,7 @@ def test_overrides(campaign_file: CampaignFile) -> None:
     ],
 )
 def test_invalid_overrides_are_reported_by_option(campaign_file: CampaignFile, override: str, message: str) -> None:
-    text = refusal(campaign_file(), override)
+    text = load_and_expect_error(campaign_file(), override)
     assert text.startswith(f"--set {override}: ".replace("\n", "\\n"))
     assert message in text
 
@@ -276,11 +242,11 @@ low high choice values truncate norm gamma id
 _words = st.sampled_from(_WORDS.split())
 
 
-def _toml(value: object) -> str:
+def _to_toml(value: object) -> str:
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{_toml(str(key))} = {_toml(inner)}" for key, inner in value.items()) + "}"
+        return "{" + ", ".join(f"{_to_toml(str(key))} = {_to_toml(inner)}" for key, inner in value.items()) + "}"
     if isinstance(value, list):
-        return "[" + ", ".join(map(_toml, value)) + "]"
+        return "[" + ", ".join(map(_to_toml, value)) + "]"
     if isinstance(value, str):
         return '"' + "".join(f"\\u{ord(letter):04x}" for letter in value) + '"'
     return str(value).lower()
@@ -295,17 +261,17 @@ _values = st.recursive(
 
 @given(changes=st.dictionaries(_words, _values, min_size=1, max_size=3))
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_no_file_ends_in_a_traceback(tmp_path: Path, changes: dict[str, object]) -> None:
+def test_random_files_load_or_report_their_keys(tmp_path: Path, changes: dict[str, object]) -> None:
     base: dict[str, object] = {"name": "fake", "scenario": "tests.campaigns.fake_scenario:FakeScenario", "cases": 3}
-    text = "\n".join(f"{_toml(key)} = {_toml(value)}" for key, value in {**base, **changes}.items())
+    text = "\n".join(f"{_to_toml(key)} = {_to_toml(value)}" for key, value in {**base, **changes}.items())
     path = tmp_path / "fuzzed.toml"
     path.write_text(text)
     tomllib.loads(text)
-    assert all(keys_named(lambda: load_campaign(str(path))))
+    assert all(find_error_keys(lambda: load_campaign(str(path))))
 
 
-def keys_named(load: Callable[[], object]) -> list[str]:
-    """The keys that a refusal names, one for each problem; none where nothing is refused."""
+def find_error_keys(load: Callable[[], object]) -> list[str]:
+    """Return one key per reported problem; empty if the campaign loads."""
     try:
         load()
     except ConfigurationError as error:
@@ -313,8 +279,8 @@ def keys_named(load: Callable[[], object]) -> list[str]:
     return []
 
 
-#: A valid campaign with something in every table.
-_WHOLE: dict[str, dict[str, object]] = {
+#: Values of a valid campaign, by table.
+_VALID_TABLES: dict[str, dict[str, object]] = {
     "limits": {"case_time_s": 10.0, "memory_gb": 1.0, "output_mb": 1.0},
     "retain": {"products": "worst", "worst": 2, "budget_gb": 1.0},
     "design": {"kind": "random", "nominal": True},
@@ -324,43 +290,43 @@ _WHOLE: dict[str, dict[str, object]] = {
 
 
 @given(
-    place=st.sampled_from([(table, key) for table, inner in _WHOLE.items() for key in inner]),
+    position=st.sampled_from([(table, key) for table, inner in _VALID_TABLES.items() for key in inner]),
     value=_values,
-    gone=st.booleans(),
+    is_removed=st.booleans(),
 )
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_an_invalid_value_is_reported_by_its_key(
-    tmp_path: Path, place: tuple[str, str], value: object, gone: bool
+def test_invalid_value_is_reported_by_its_key(
+    tmp_path: Path, position: tuple[str, str], value: object, is_removed: bool
 ) -> None:
-    table, key = place
-    tables = {name: dict(inner) for name, inner in _WHOLE.items()}
-    tables[table].pop(key) if gone else tables[table].update({key: value})
+    table, key = position
+    tables = {name: dict(inner) for name, inner in _VALID_TABLES.items()}
+    tables[table].pop(key) if is_removed else tables[table].update({key: value})
     head = 'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\ncases = 12\n'
-    texts = [f"{name} = {_toml([inner] if name == 'requirements' else inner)}" for name, inner in tables.items()]
-    path = tmp_path / "spoilt.toml"
+    texts = [f"{name} = {_to_toml([inner] if name == 'requirements' else inner)}" for name, inner in tables.items()]
+    path = tmp_path / "invalid.toml"
     path.write_text(head + "\n".join(texts))
-    named = keys_named(lambda: load_campaign(str(path)))
-    # a table that is wrong as a whole is named as such
-    assert all(one.startswith(table) for one in named), named
-    # none of these keys takes a table, and a requirement needs its metric and probability
-    assert named or not (key in ("metric", "probability") if gone else isinstance(value, dict))
+    reported_keys = find_error_keys(lambda: load_campaign(str(path)))
+    # an invalid table is reported by the table's own name
+    assert all(name.startswith(table) for name in reported_keys), reported_keys
+    # no key accepts a table as value; a requirement needs metric and probability
+    assert reported_keys or not (key in ("metric", "probability") if is_removed else isinstance(value, dict))
 
 
 @given(override=st.text(max_size=20) | st.builds("{}={}".format, _words, st.text(max_size=8)))
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_no_override_ends_in_a_traceback(campaign_file: CampaignFile, override: str) -> None:
+def test_random_overrides_raise_only_configuration_errors(campaign_file: CampaignFile, override: str) -> None:
     with contextlib.suppress(ConfigurationError):
         load_campaign(str(campaign_file()), [override])
 
 
-def test_a_choice_between_tables_draws_whole_tables(campaign_file: CampaignFile) -> None:
-    """What a table does not set has its default, whatever the campaign's own parameters say."""
+def test_choice_between_tables_uses_defaults_for_omitted_keys(campaign_file: CampaignFile) -> None:
+    """Omitted keys of a drawn table take their defaults, not the campaign's parameters."""
     choice = "[dispersions]\nwind = {distribution='choice', values=[{}, {east_m_s=3}, {north_m_s=-4, east_m_s=5}]}"
     path = str(campaign_file("wind = {north_m_s = 20}", dispersions=choice))
     campaign = load_campaign(path)
-    drawn = {tuple(campaign.parameters(case).wind.model_dump().values()) for case in range(40)}  # type: ignore[attr-defined]
-    assert drawn == {(0.0, 0.0), (3.0, 0.0), (5.0, -4.0)}
-    # a value set within the table is not drawn over
+    winds = {tuple(campaign.parameters(case).wind.model_dump().values()) for case in range(40)}  # type: ignore[attr-defined]
+    assert winds == {(0.0, 0.0), (3.0, 0.0), (5.0, -4.0)}
+    # setting a value of the table removes the dispersion of the table
     fixed = load_campaign(path, ["wind.east_m_s=7"])
     assert fixed.configuration.dispersions == {}
 
@@ -373,11 +339,9 @@ def test_a_choice_between_tables_draws_whole_tables(campaign_file: CampaignFile)
         ("wind.east_m_s.x", "wind.east_m_s, wind.north_m_s"),
     ],
 )
-def test_unknown_parameters_are_reported_with_their_neighbours(
-    campaign_file: CampaignFile, path: str, allowed: str
-) -> None:
-    """Of a scenario's hundreds only those of the innermost table that there is."""
+def test_unknown_parameter_error_lists_keys_of_its_table(campaign_file: CampaignFile, path: str, allowed: str) -> None:
+    """Only the keys of the innermost existing table are listed."""
     dispersion = f'[dispersions]\n"{path}" = {{distribution="uniform", low=1, high=2}}'
-    text = refusal(campaign_file(dispersions=dispersion))
+    text = load_and_expect_error(campaign_file(dispersions=dispersion))
     assert f"allowed: {allowed}" in text
     assert ("wind.*" in text) == path.startswith("wnd")

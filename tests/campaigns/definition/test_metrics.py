@@ -1,4 +1,4 @@
-"""Columns of requirements are checked against the scenario before any terrain is built."""
+"""Tests that the columns of requirements are checked against the scenario before terrain is built."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from marsyard.campaigns.definition.catalogue import catalogue
-from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.loading import catalogue, load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli.app import app
 from marsyard.scenarios.descent.scenario import DescentScenario
@@ -17,7 +16,7 @@ SCORE = """
 def braking(case):
     return {"lateral_j": 1.0, "soft": True}
 """
-ASKED = """
+REQUIREMENT = """
 [[requirements]]
 id = "OWN"
 metric = "{metric}"
@@ -28,10 +27,10 @@ population = "{population}"
 """
 
 
-def _campaign(folder: Path, metric: str, population: str = "valid", bound: str = "bound = 5.0") -> Path:
+def _write_campaign(folder: Path, metric: str, population: str = "valid", bound: str = "bound = 5.0") -> Path:
     text = catalogue()["dimes-smoke"].read_text(encoding="utf-8").partition("[[requirements]]")[0]
     path = folder / "mine.toml"
-    path.write_text(text + ASKED.format(metric=metric, population=population, bound=bound))
+    path.write_text(text + REQUIREMENT.format(metric=metric, population=population, bound=bound))
     return path
 
 
@@ -45,36 +44,36 @@ def _campaign(folder: Path, metric: str, population: str = "valid", bound: str =
         ("feasible_overlap", "valid", "bound = 5.0", "metric", "unknown column of numbers 'feasible_overlap'"),
     ],
 )
-def test_misspelt_columns_are_found_before_terrains_are_built(
+def test_misspelt_columns_are_reported_before_terrain_is_built(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, metric: str, population: str, bound: str, key: str, hint: str
 ) -> None:
-    prepared: list[int] = []
-    monkeypatch.setattr(DescentScenario, "prepare", lambda _, __, number: prepared.append(number))
-    path = _campaign(tmp_path, metric, population, bound)
-    with pytest.raises(ConfigurationError) as refused:
+    prepared_inputs: list[int] = []
+    monkeypatch.setattr(DescentScenario, "prepare", lambda _, __, number: prepared_inputs.append(number))
+    path = _write_campaign(tmp_path, metric, population, bound)
+    with pytest.raises(ConfigurationError) as raised:
         load_campaign(str(path))
-    assert f"requirements[0].{key}" in str(refused.value)
-    assert hint in str(refused.value)
-    ended = CliRunner().invoke(app, ["run", str(path), "-n", "1", "--jobs", "1", "--out", str(tmp_path / "run")])
-    assert ended.exit_code == 2
-    assert hint in ended.output
-    assert prepared == []
+    assert f"requirements[0].{key}" in str(raised.value)
+    assert hint in str(raised.value)
+    result = CliRunner().invoke(app, ["run", str(path), "-n", "1", "--jobs", "1", "--out", str(tmp_path / "run")])
+    assert result.exit_code == 2
+    assert hint in result.output
+    assert prepared_inputs == []
     assert not (tmp_path / "run").exists()
 
 
-def test_columns_of_custom_scores_parts_and_compared_algorithms_are_accepted(
+def test_columns_of_scores_and_compared_algorithms_are_accepted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "my_scores.py").write_text(SCORE)
     monkeypatch.chdir(tmp_path)
-    path = _campaign(tmp_path, "braking_lateral_j", "valid and braking_soft")
+    path = _write_campaign(tmp_path, "braking_lateral_j", "valid and braking_soft")
     load_campaign(str(path), ['scores=["my_scores:braking"]'])
     with pytest.raises(ConfigurationError, match="braking_lateral_j"):
         load_campaign(str(path))
-    compared = _campaign(tmp_path, "homography.velocity_error_m_s", "homography.answered".partition(".")[2])
-    load_campaign(str(compared), algorithms=["dimes", "homography"])
+    comparison = _write_campaign(tmp_path, "homography.velocity_error_m_s", "homography.answered".partition(".")[2])
+    load_campaign(str(comparison), algorithms=["dimes", "homography"])
 
 
 @pytest.mark.parametrize("name", list(catalogue()))
-def test_campaigns_of_the_catalogue_ask_for_columns_that_are_stated(name: str) -> None:
+def test_catalogue_campaigns_use_known_columns(name: str) -> None:
     load_campaign(name)

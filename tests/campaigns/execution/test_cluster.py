@@ -1,4 +1,4 @@
-"""A Dask cluster gives the rows of one machine, with the same isolation."""
+"""Tests of the Dask cluster executor: same rows as on one machine, same isolation of cases."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import read_rows
-from tests.campaigns.fake_campaign import Silence
+from tests.campaigns.fake_campaign import RecordingWatch
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    # Dask's own, in its own business.
+    # warnings of Dask itself
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
 
-def test_a_cluster_gives_the_rows_of_one_machine(
-    campaign_file: Callable[..., Path], tmp_path: Path, watch: Silence
+def test_cluster_rows_equal_rows_of_one_machine(
+    campaign_file: Callable[..., Path], tmp_path: Path, watch: RecordingWatch
 ) -> None:
     path = campaign_file("raising_cases = [3]\naborting_cases = [5]")
     rows = {}
@@ -45,8 +45,8 @@ def test_a_cluster_gives_the_rows_of_one_machine(
 
 
 @pytest.mark.parametrize("address", ["local:0", "local:x"])
-def test_invalid_numbers_of_workers_are_refused(
-    campaign_file: Callable[..., Path], tmp_path: Path, watch: Silence, address: str
+def test_invalid_worker_numbers_are_rejected(
+    campaign_file: Callable[..., Path], tmp_path: Path, watch: RecordingWatch, address: str
 ) -> None:
     with pytest.raises(CampaignError, match="expected local:N, with N at least 1"):
         run_campaign(load_campaign(str(campaign_file())), tmp_path / "run", ExecutorConfig(cluster=address), watch)
@@ -54,23 +54,23 @@ def test_invalid_numbers_of_workers_are_refused(
 
 
 @pytest.mark.parametrize("address", ["nowhere", "tcp://127.0.0.1:1"])
-def test_addresses_where_no_scheduler_answers(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
+def test_unreachable_scheduler_is_reported(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
     monkeypatch.setattr("marsyard.campaigns.execution.cluster._REACH_S", 1)
     with pytest.raises(CampaignError, match=f"--cluster {address}: no scheduler answers"):
         ClusterExecutor(address)
 
 
-def test_an_invalid_address_does_not_delay_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A client that is left is closed where garbage is collected: at worst where the next client's loop starts."""
+def test_invalid_address_does_not_delay_next_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The garbage collector may close the failed client while the event loop of the next client starts."""
     monkeypatch.setattr("marsyard.campaigns.execution.cluster._REACH_S", 1)
     with pytest.raises(CampaignError, match="missing port number"):
         ClusterExecutor("nowhere")
-    made = distributed.utils.get_loop_factory
+    get_loop_factory = distributed.utils.get_loop_factory
 
-    def collecting() -> Any:
+    def collect_and_get_loop_factory() -> Any:
         gc.collect()
-        return made()
+        return get_loop_factory()
 
-    monkeypatch.setattr("distributed.utils.get_loop_factory", collecting)
+    monkeypatch.setattr("distributed.utils.get_loop_factory", collect_and_get_loop_factory)
     with pytest.raises(CampaignError, match="no scheduler answers"):
         ClusterExecutor("tcp://127.0.0.1:1")

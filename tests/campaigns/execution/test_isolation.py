@@ -1,4 +1,4 @@
-"""A case leaves nothing behind: no process, no thread, no changed state of the process that the next one runs in."""
+"""Tests of the isolation of cases: processes, threads and process state do not reach the next case."""
 
 from __future__ import annotations
 
@@ -23,26 +23,29 @@ from typing import Any
 import numpy as np
 import pytest
 
+from marsyard.campaigns.errors import CRASHED, TIMED_OUT, CaseEndedError
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.cases import make_unfinished_row
 from marsyard.campaigns.execution.worker_process import TaskResult, Work, WorkLimits, request_fresh_worker
 from marsyard.campaigns.execution.workers import LocalExecutor
-from marsyard.campaigns.outcomes import CRASHED, TIMED_OUT, CaseEndedError
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
-#: Seconds within which everything ends that once waited for ever.
-GUARD_S = 60.0
+#: Maximum duration of runs that could wait forever, in seconds.
+MAX_DURATION_S = 60.0
 
-_kept: list[object] = []
+_held_objects: list[object] = []
 
 
-def run(
+def run_items(
     task: Callable[[int], Any], items: Iterable[int], limits: WorkLimits | None = None
 ) -> dict[int, TaskResult[Any]]:
-    """What became of items in one worker, which has ended by the time of the return."""
+    """Run items in one worker; return their results after the worker has ended."""
     with LocalExecutor(1) as workers:
-        return {done.item: done for done in chain.from_iterable(workers.run(Work(task, items, limits or WorkLimits())))}
+        return {
+            result.item: result
+            for result in chain.from_iterable(workers.run(Work(task, items, limits or WorkLimits())))
+        }
 
 
 def is_gone(process: int) -> bool:
@@ -53,26 +56,26 @@ def is_gone(process: int) -> bool:
 
 
 def leave_running(kind: str, folder: str, item: int) -> int:
-    """Starts something in the first item that would never end, and notes its processes."""
+    """Start endless threads or processes in the first item and record the process ids."""
     processes = []
     if item == 0 and kind == "thread":
         threading.Thread(target=time.sleep, args=(3600,)).start()
     elif item == 0 and kind == "pool":
         pool = ProcessPoolExecutor(2, mp_context=get_context("fork"))
-        processes = list(pool.map(process_number, range(2)))
-        _kept.append(pool)
+        processes = list(pool.map(get_process_id, range(2)))
+        _held_objects.append(pool)
     elif item == 0 and kind == "fork":
-        processes = [forked()]
+        processes = [fork_sleeping_child()]
     elif item == 0 and kind == "session":
         child = subprocess.Popen(["sleep", "3600"], start_new_session=True, close_fds=False)
         processes = [child.pid]
-        _kept.append(child)
+        _held_objects.append(child)
     elif item == 0 and kind == "orphan":
-        middle = os.fork()
-        if middle == 0:
-            Path(folder, "orphan").write_text(str(forked()))
+        parent = os.fork()
+        if parent == 0:
+            Path(folder, "orphan").write_text(str(fork_sleeping_child()))
             os._exit(0)
-        os.waitpid(middle, 0)
+        os.waitpid(parent, 0)
         processes = [int(Path(folder, "orphan").read_text())]
     if processes:
         Path(folder, "processes").write_text(" ".join(map(str, processes)))
@@ -80,13 +83,13 @@ def leave_running(kind: str, folder: str, item: int) -> int:
     return os.getpid()
 
 
-def process_number(_: int) -> int:
+def get_process_id(_: int) -> int:
     time.sleep(0.1)
     return os.getpid()
 
 
-def forked() -> int:
-    """A child that holds all files of this process, leads a session of its own and sleeps."""
+def fork_sleeping_child() -> int:
+    """Fork a child that keeps all open files, has its own session and sleeps."""
     child = os.fork()
     if child == 0:
         os.setsid()
@@ -96,19 +99,19 @@ def forked() -> int:
 
 
 @pytest.mark.parametrize("kind", ["thread", "pool", "fork", "session", "orphan"])
-def test_processes_left_by_a_case_neither_delay_its_end_nor_outlive_it(kind: str, tmp_path: Path) -> None:
-    began = time.monotonic()
-    done = run(partial(leave_running, kind, str(tmp_path)), range(3))
-    assert time.monotonic() - began < GUARD_S
+def test_processes_left_by_case_end_with_it(kind: str, tmp_path: Path) -> None:
+    start_s = time.monotonic()
+    results = run_items(partial(leave_running, kind, str(tmp_path)), range(3))
+    assert time.monotonic() - start_s < MAX_DURATION_S
     started = tmp_path / "processes"
     processes = list(map(int, started.read_text().split())) if started.exists() else []
     assert len(processes) == {"thread": 0, "pool": 2}.get(kind, 1)
     assert all(map(is_gone, processes))
     # the next items run in another process
-    assert done[1].result == done[2].result != done[0].result
-    what = "threads" if kind == "thread" else "child processes"
-    assert f"{what} that it left running" in done[0].changed[-1]
-    assert done[1].changed == done[2].changed == ()
+    assert results[1].result == results[2].result != results[0].result
+    kind_of_task = "threads" if kind == "thread" else "child processes"
+    assert f"{kind_of_task} that it left running" in results[0].changed[-1]
+    assert results[1].changed == results[2].changed == ()
 
 
 def wait_for_session(folder: str, item: int) -> int:
@@ -119,40 +122,40 @@ def wait_for_session(folder: str, item: int) -> int:
     return item
 
 
-def test_a_child_in_a_session_of_its_own_does_not_defeat_the_time_limit(tmp_path: Path) -> None:
-    began = time.monotonic()
-    done = run(partial(wait_for_session, str(tmp_path)), range(4), WorkLimits(time_s=2.0))
-    assert time.monotonic() - began < GUARD_S
-    error = done[1].error
+def test_child_in_own_session_respects_time_limit(tmp_path: Path) -> None:
+    start_s = time.monotonic()
+    results = run_items(partial(wait_for_session, str(tmp_path)), range(4), WorkLimits(time_s=2.0))
+    assert time.monotonic() - start_s < MAX_DURATION_S
+    error = results[1].error
     assert isinstance(error, CaseEndedError)
     assert error.outcome == TIMED_OUT
     assert " in wait_for_session" in error.trace
-    assert {item: one.result for item, one in done.items() if item != 1} == {0: 0, 2: 2, 3: 3}
+    assert {item: result.result for item, result in results.items() if item != 1} == {0: 0, 2: 2, 3: 3}
     assert is_gone(int((tmp_path / "processes").read_text()))
 
 
-def harm_supervisor(kind: int, folder: str, item: int) -> int:
+def signal_supervisor(kind: int, folder: str, item: int) -> int:
     if item == 1:
-        Path(folder, "processes").write_text(str(forked()))
+        Path(folder, "processes").write_text(str(fork_sleeping_child()))
         os.kill(os.getppid(), kind)
         time.sleep(3600)
     return item
 
 
 @pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_case_that_kills_or_stops_its_parent_ends_alone(kind: int, tmp_path: Path) -> None:
-    began = time.monotonic()
-    done = run(partial(harm_supervisor, kind, str(tmp_path)), range(3), WorkLimits(time_s=2.0))
-    assert time.monotonic() - began < GUARD_S
-    error = done[1].error
+def test_signal_to_supervisor_ends_only_the_case(kind: int, tmp_path: Path) -> None:
+    start_s = time.monotonic()
+    results = run_items(partial(signal_supervisor, kind, str(tmp_path)), range(3), WorkLimits(time_s=2.0))
+    assert time.monotonic() - start_s < MAX_DURATION_S
+    error = results[1].error
     assert isinstance(error, CaseEndedError)
     assert error.outcome == (CRASHED if kind == signal.SIGKILL else TIMED_OUT)
-    assert (done[0].result, done[2].result) == (0, 2)
+    assert (results[0].result, results[2].result) == (0, 2)
     assert is_gone(int((tmp_path / "processes").read_text()))
 
 
-def scribble(item: int) -> int:
-    """Writes a one into every field of what the worker shows its watcher, a process id where there is one."""
+def overwrite_board(item: int) -> int:
+    """Write 1 into every field of the status board, including process ids."""
     assert worker_process._context is not None
     board = worker_process._context.board._bytes
     board[:] = struct.pack("=q", 1) * (len(board) // 8)
@@ -160,28 +163,28 @@ def scribble(item: int) -> int:
     return item
 
 
-def test_only_processes_of_the_executor_are_signalled(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_executor_processes_are_signalled(monkeypatch: pytest.MonkeyPatch) -> None:
     signalled = []
     kill = os.kill
 
-    def note(process: int, number: int) -> None:
+    def record_and_kill(process: int, number: int) -> None:
         signalled.append(process)
         if process > 1:
             kill(process, number)
 
-    monkeypatch.setattr("os.kill", note)
-    monkeypatch.setattr("os.killpg", lambda group, number: note(group, number))
+    monkeypatch.setattr("os.kill", record_and_kill)
+    monkeypatch.setattr("os.killpg", lambda group, number: record_and_kill(group, number))
     with LocalExecutor(1) as workers:
-        (batch,) = workers.run(Work(scribble, [1], WorkLimits(time_s=3.0)))
-        known = workers._workers[0]
+        (batch,) = workers.run(Work(overwrite_board, [1], WorkLimits(time_s=3.0)))
+        worker = workers._workers[0]
         assert isinstance(batch[0].error, CaseEndedError)
         assert batch[0].error.outcome == TIMED_OUT
-    assert known is not None
+    assert worker is not None
     assert signalled
     assert min(signalled) > 1
 
 
-STATE = {
+STATE_CHANGES = {
     "the working folder": lambda: os.chdir("/"),
     "environment variables": lambda: os.environ.update(LEFT_BEHIND="1"),
     "sys.path": lambda: sys.path.insert(0, "/nowhere"),
@@ -198,10 +201,10 @@ STATE = {
 }
 
 
-def state() -> tuple[object, ...]:
+def read_state() -> tuple[object, ...]:
     import cv2
 
-    one, little = float("1"), 2.0**-60
+    unity, little = float("1"), 2.0**-60
     return (
         Path.cwd(),
         dict(os.environ),
@@ -210,78 +213,76 @@ def state() -> tuple[object, ...]:
         np.geterr(),
         sys.getrecursionlimit(),
         cv2.useOptimized(),
-        one + little,
+        unity + little,
         signal.getsignal(signal.SIGUSR1),
         random.random(),  # noqa: S311
         np.random.random_sample(),  # noqa: NPY002
     )
 
 
-def alter(seconds: float, item: int) -> object:
-    """What the process is like; then changes one part of it, in every second item."""
-    seen = state()
+def read_and_change_state(seconds: float, item: int) -> object:
+    """Return the process state; odd items then change one part of it."""
+    process_state = read_state()
     if item % 2:
-        changes: list[Any] = list(STATE.values())
+        changes: list[Any] = list(STATE_CHANGES.values())
         changes[item // 2]()
     time.sleep(seconds)
-    # the environment differs by the worker's folder
-    return item, [part for part in seen if not isinstance(part, dict)], sorted(set(seen[1]))  # type: ignore[call-overload]
+    # values of environment variables depend on the worker's folder; compare their names
+    return item, [part for part in process_state if not isinstance(part, dict)], sorted(set(process_state[1]))  # type: ignore[call-overload]
 
 
 @pytest.mark.parametrize("seconds", [0.01, 0.0])
-def test_state_of_the_process_does_not_reach_the_next_case(seconds: float) -> None:
-    """Also where cases are so short that several are checked at once."""
-    number = 2 * len(STATE)
-    done = run(partial(alter, seconds), range(number))
-    results: list[Any] = [done[item].result for item in range(number)]
-    # the last two are random numbers, which a case draws alike wherever it runs, and not as another case does
-    assert len({str((one[1][:-2], one[2])) for one in results}) == 1
-    assert len({str(one[1][-2:]) for one in results}) == number
-    for place, name in enumerate(STATE):
-        assert done[2 * place].changed == ()
-        assert done[2 * place + 1].changed == (name,)
-    alone: Any = run(partial(alter, 0.01), [5])[5].result
-    assert results[5][1][-2:] == alone[1][-2:]
+def test_process_state_does_not_reach_next_case(seconds: float) -> None:
+    """The check also holds for short cases that run in one batch."""
+    number = 2 * len(STATE_CHANGES)
+    run_results = run_items(partial(read_and_change_state, seconds), range(number))
+    results: list[Any] = [run_results[item].result for item in range(number)]
+    # the last two entries are random numbers: they depend on the case, not on the worker
+    assert len({str((result[1][:-2], result[2])) for result in results}) == 1
+    assert len({str(result[1][-2:]) for result in results}) == number
+    for position, name in enumerate(STATE_CHANGES):
+        assert run_results[2 * position].changed == ()
+        assert run_results[2 * position + 1].changed == (name,)
+    single_result: Any = run_items(partial(read_and_change_state, 0.01), [5])[5].result
+    assert results[5][1][-2:] == single_result[1][-2:]
 
 
 def import_and_alter(folder: Path, item: int) -> tuple[str | None, ...]:
-    """The environment as the case finds it; the first case imports a module that changes it, and changes it itself."""
-    found = (os.environ.get("SET_BY_MODULE"), os.environ.get("LEFT_BEHIND"), os.environ.get("HOME"))
+    """Return environment variables; the first case then changes them, directly and by importing a module."""
+    variables = (os.environ.get("SET_BY_MODULE"), os.environ.get("LEFT_BEHIND"), os.environ.get("HOME"))
     if item == 0:
         os.environ["LEFT_BEHIND"] = "1"
         sys.path.append(str(folder))
         __import__("changes_environment")
         del os.environ["HOME"]
-    return found
+    return variables
 
 
-def test_a_case_that_also_imports_a_module_does_not_reach_the_next_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_environment_is_restored_after_import_in_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/somewhere")
     (tmp_path / "changes_environment.py").write_text("import os\nos.environ['SET_BY_MODULE'] = 'yes'\n")
-    done = run(partial(import_and_alter, tmp_path), range(3))
-    assert done[0].changed == ("environment variables", "sys.path")
-    assert [done[item].result for item in (1, 2)] == [("yes", None, "/somewhere")] * 2
+    results = run_items(partial(import_and_alter, tmp_path), range(3))
+    assert results[0].changed == ("environment variables", "sys.path")
+    assert [results[item].result for item in (1, 2)] == [("yes", None, "/somewhere")] * 2
 
 
-def crash_where_spoiled(item: int) -> int:
-    """What a case alters that nobody compares makes the next one fail."""
-    if item in _kept or item == 3:
+def crash_after_other_case(item: int) -> int:
+    """Change state that is not compared between cases; the next case in this worker then crashes."""
+    if item in _held_objects or item == 3:
         request_fresh_worker()
         return -1
-    _kept.append(item + 1)
+    _held_objects.append(item + 1)
     time.sleep(0.01)
     return item
 
 
-def test_a_case_that_crashes_after_another_is_run_again_in_a_fresh_worker() -> None:
-    _kept.clear()
-    done = run(crash_where_spoiled, range(5))
-    assert {item: one.result for item, one in done.items()} == {0: 0, 1: 1, 2: 2, 3: -1, 4: 4}
-    # those whose crash was another's doing say whose; the one that crashes by itself does so
-    assert [done[item].spoiled_by for item in range(5)] == [None, 0, 1, None, None]
-    assert [done[item].crashed for item in range(5)] == [False, False, False, True, False]
+def test_crash_after_other_case_is_repeated_in_fresh_worker() -> None:
+    _held_objects.clear()
+    results = run_items(crash_after_other_case, range(5))
+    assert {item: result.result for item, result in results.items()} == {0: 0, 1: 1, 2: 2, 3: -1, 4: 4}
+    # spoiled_by names the earlier case; case 3 crashes in a fresh worker too
+    assert [results[item].spoiled_by for item in range(5)] == [None, 0, 1, None, None]
+    assert [results[item].crashed for item in range(5)] == [False, False, False, True, False]
 
 
 def close_files(item: int) -> int:
@@ -290,14 +291,14 @@ def close_files(item: int) -> int:
     return item
 
 
-def test_a_case_that_closes_the_files_of_its_worker_crashes_alone() -> None:
-    done = run(close_files, range(4))
-    assert str(done[1].error) == "the case closed or replaced the worker's file descriptors"
-    assert {item: one.result for item, one in done.items() if item != 1} == {0: 0, 2: 2, 3: 3}
+def test_closing_worker_files_crashes_only_that_case() -> None:
+    results = run_items(close_files, range(4))
+    assert str(results[1].error) == "the case closed or replaced the worker's file descriptors"
+    assert {item: result.result for item, result in results.items() if item != 1} == {0: 0, 2: 2, 3: 3}
 
 
 def share_memory(item: int) -> int:
-    """100 MB, of which four children have their copies, never written to."""
+    """Allocate 100 MB and fork four children that share the pages without writing."""
     block = np.ones(100_000_000, dtype=np.uint8)
     children = []
     for _ in range(4):
@@ -310,13 +311,13 @@ def share_memory(item: int) -> int:
     return int(block[item])
 
 
-def test_memory_that_forked_children_share_counts_once() -> None:
-    done = run(share_memory, [0], WorkLimits(memory_bytes=0.3e9))
-    assert done[0].error is None
-    assert done[0].result == 1
+def test_memory_shared_by_forked_children_counts_once() -> None:
+    results = run_items(share_memory, [0], WorkLimits(memory_bytes=0.3e9))
+    assert results[0].error is None
+    assert results[0].result == 1
 
 
-def test_long_texts_of_errors_keep_their_beginning_and_their_end() -> None:
+def test_long_error_texts_keep_both_ends() -> None:
     row = make_unfinished_row(0, CRASHED, "begin" + "x" * 200_000 + "end", "first" + "y" * 200_000 + "last")
     for column, head, tail in (("error", "begin", "end"), ("traceback", "first", "last")):
         text = str(row[column])

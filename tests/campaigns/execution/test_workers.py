@@ -1,4 +1,4 @@
-"""Executor: what is lost with one is its task alone."""
+"""Tests of the local executor: limits, worker crashes, batches and memory accounting."""
 
 from __future__ import annotations
 
@@ -19,21 +19,20 @@ import numpy as np
 import pytest
 
 from marsyard.algorithms.processes import used_memory
-from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CampaignError, CaseEndedError
 from marsyard.campaigns.execution.worker_process import StatusBoard, TaskResult, Work, WorkLimits
 from marsyard.campaigns.execution.workers import MAX_BATCH, Batches, LocalExecutor
-from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CaseEndedError
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
 
-def run(
+def run_items(
     workers: LocalExecutor, task: Callable[[int], Any], items: Iterable[int], limits: WorkLimits | None = None
 ) -> Iterator[TaskResult[Any]]:
     return chain.from_iterable(workers.run(Work(task, items, limits or WorkLimits())))
 
 
-def process_number(_: int) -> int:
+def get_process_id(_: int) -> int:
     return os.getpid()
 
 
@@ -44,7 +43,7 @@ def abort_once(marker: str, item: int) -> int:
     return item
 
 
-def misbehave(item: int) -> object:
+def raise_or_exit(item: int) -> object:
     if item == 0:
         raise LookupError("nothing there")
     if item == 1:
@@ -52,78 +51,78 @@ def misbehave(item: int) -> object:
     return lambda: None if item == 2 else item
 
 
-def nap(seconds: float, item: int) -> int:
+def sleep_and_return(seconds: float, item: int) -> int:
     time.sleep(seconds)
     return item
 
 
-def test_tasks_run_in_as_many_processes_as_asked_for() -> None:
+def test_number_of_worker_processes_is_respected() -> None:
     with LocalExecutor(1) as workers:
-        assert {done.result for done in run(workers, process_number, range(5))} != {os.getpid()}
+        assert {result.result for result in run_items(workers, get_process_id, range(5))} != {os.getpid()}
     with LocalExecutor(2) as workers:
-        assert len({done.result for done in run(workers, process_number, range(20))}) == 2
+        assert len({result.result for result in run_items(workers, get_process_id, range(20))}) == 2
 
 
-def test_a_task_whose_worker_was_killed_is_run_again(tmp_path: Path) -> None:
+def test_task_of_killed_worker_is_repeated(tmp_path: Path) -> None:
     with LocalExecutor(2) as workers:
-        done = list(run(workers, partial(abort_once, str(tmp_path / "marker")), range(6)))
-    assert sorted(ended.item for ended in done if ended.result == ended.item) == list(range(6))
-    assert all(ended.error is None for ended in done)
+        results = list(run_items(workers, partial(abort_once, str(tmp_path / "marker")), range(6)))
+    assert sorted(result.item for result in results if result.result == result.item) == list(range(6))
+    assert all(result.error is None for result in results)
 
 
-def test_errors_belong_to_their_tasks() -> None:
+def test_errors_are_assigned_to_their_tasks() -> None:
     with LocalExecutor(2) as workers:
-        ended = {done.item: done for done in run(workers, misbehave, range(3))}
-        assert isinstance(ended[0].error, LookupError)
-        assert isinstance(ended[1].error, CaseEndedError)
-        assert str(ended[1].error) == "the worker process died: EXIT (3)"
-        assert callable(ended[2].result)
-        # The pool goes on working.
-        assert [done.result for done in run(workers, partial(nap, 0.0), [7])] == [7]
+        results = {result.item: result for result in run_items(workers, raise_or_exit, range(3))}
+        assert isinstance(results[0].error, LookupError)
+        assert isinstance(results[1].error, CaseEndedError)
+        assert str(results[1].error) == "the worker process died: EXIT (3)"
+        assert callable(results[2].result)
+        # the pool still works
+        assert [result.result for result in run_items(workers, partial(sleep_and_return, 0.0), [7])] == [7]
 
 
-def interrupted() -> None:
+def run_and_interrupt() -> None:
     with LocalExecutor(1) as workers:
-        for _ in run(workers, lambda item: nap(60.0 * item, item), range(2)):
+        for _ in run_items(workers, lambda item: sleep_and_return(60.0 * item, item), range(2)):
             raise KeyboardInterrupt
 
 
-def test_exit_by_an_exception_does_not_wait() -> None:
-    began = time.monotonic()
+def test_interruption_does_not_wait_for_tasks() -> None:
+    start_s = time.monotonic()
     with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert time.monotonic() - began < 20.0
+        run_and_interrupt()
+    assert time.monotonic() - start_s < 20.0
 
 
-def test_memory_of_pending_items_is_constant() -> None:
-    taken = 0
+def test_items_are_read_as_needed() -> None:
+    n_items = 0
 
     def items() -> object:
-        nonlocal taken
+        nonlocal n_items
         for item in range(1000):
-            taken += 1
+            n_items += 1
             yield item
 
     with LocalExecutor(2) as workers:
-        for number, _ in enumerate(run(workers, partial(nap, 0.0), items())):  # type: ignore[arg-type]
+        for number, _ in enumerate(run_items(workers, partial(sleep_and_return, 0.0), items())):  # type: ignore[arg-type]
             if number == 10:
                 break
-    # batches double as they end: after 1, 2, 4 and 8 there may be one of 16 and one of 32 under way, hardly more
-    assert taken < 200
+    # batches double: after 1, 2, 4 and 8, one of 16 and one of 32 may be running
+    assert n_items < 200
 
 
-def hurt(folder: str, item: int) -> int:
-    """Does something different to its worker for each of the first items; all note that they began."""
+def exceed_limit(folder: str, item: int) -> int:
+    """Exceed one limit per item 1 to 4: time, memory, output, segmentation fault. Each start is recorded in a file."""
     with Path(folder, str(item)).open("a") as file:
         file.write(".")
     if item == 1:
-        # in C, without letting go of the interpreter: two to the power of 64 ways to share the letters out
+        # backtracks 2^64 times in C without releasing the interpreter lock
         re.match("(a+)+$", "a" * 64 + "b")
-    hoard = []
+    arrays = []
     while item == 2:
-        hoard.append(np.ones(500_000))
+        arrays.append(np.ones(500_000))
     while item == 3:
-        os.write(2, b"and another thing\n" * 100)
+        os.write(2, b"another line of text\n" * 100)
     if item == 4:
         ctypes.string_at(0)
     return item
@@ -131,13 +130,15 @@ def hurt(folder: str, item: int) -> int:
 
 def test_only_tasks_over_a_limit_are_ended(tmp_path: Path) -> None:
     limits = WorkLimits(time_s=3.0, memory_bytes=0.2e9, output_bytes=1e5)
-    # With one worker the items run in their order; the first batches are small, the later ones hold several.
+    # one worker runs the items in order; later batches hold several items
     with LocalExecutor(1) as workers:
-        ended = {
-            done.item: done
-            for done in run(workers, partial(hurt, str(tmp_path)), [0, 5, 6, 7, 1, 2, 3, 4, 8, 9], limits)
+        results = {
+            result.item: result
+            for result in run_items(
+                workers, partial(exceed_limit, str(tmp_path)), [0, 5, 6, 7, 1, 2, 3, 4, 8, 9], limits
+            )
         }
-    errors = {item: done.error for item, done in ended.items() if done.error is not None}
+    errors = {item: result.error for item, result in results.items() if result.error is not None}
     assert all(isinstance(error, CaseEndedError) for error in errors.values())
     assert {item: error.outcome for item, error in errors.items()} == {  # type: ignore[attr-defined]
         1: TIMED_OUT,
@@ -151,38 +152,38 @@ def test_only_tasks_over_a_limit_are_ended(tmp_path: Path) -> None:
         "wrote more than its limit of 0.1 MB",
         "the worker process died: SIGSEGV (-11)",
     ]
-    # Each says where it stood, down to the line.
+    # each error has the trace of the running line
     for error in errors.values():
         assert isinstance(error, CaseEndedError)
-        assert " in hurt" in error.trace
-    assert {item: done.result for item, done in ended.items() if done.error is None} == {
+        assert " in exceed_limit" in error.trace
+    assert {item: result.result for item, result in results.items() if result.error is None} == {
         n: n for n in (0, 5, 6, 7, 8, 9)
     }
-    # What is surely the task's own fault is not tried again; a death and want of memory are, once.
-    began = {item: len((tmp_path / str(item)).read_text()) for item in (1, 2, 3, 4)}
-    assert began == {1: 1, 2: 2, 3: 1, 4: 2}
+    # a crash and missing memory may have another cause, so these tasks run twice
+    starts = {item: len((tmp_path / str(item)).read_text()) for item in (1, 2, 3, 4)}
+    assert starts == {1: 1, 2: 2, 3: 1, 4: 2}
 
 
-def fill(item: int, kept: list[object] = []) -> int:  # noqa: B006  (kept on purpose, as a leak is)
-    kept.append(np.ones(4_000_000))
+def leak_memory(item: int, arrays: list[object] = []) -> int:  # noqa: B006  (the list imitates a memory leak)
+    arrays.append(np.ones(4_000_000))
     return item
 
 
-def test_a_leak_is_not_attributed_to_the_task_that_reaches_the_limit() -> None:
+def test_memory_leak_does_not_end_the_task_at_the_limit() -> None:
     limits = WorkLimits(memory_bytes=0.2e9)
     with LocalExecutor(1) as workers:
-        ended = list(run(workers, slow_fill, range(12), limits))
-    assert sorted(done.item for done in ended if done.error is None) == list(range(12))
+        results = list(run_items(workers, leak_memory_slowly, range(12), limits))
+    assert sorted(result.item for result in results if result.error is None) == list(range(12))
 
 
-def slow_fill(item: int) -> int:
-    fill(item)
-    # so that the watcher looks in between
+def leak_memory_slowly(item: int) -> int:
+    leak_memory(item)
+    # long enough for the watcher to measure the memory
     time.sleep(0.1)
     return item
 
 
-def spawn(item: int) -> int:
+def start_endless_process(item: int) -> int:
     subprocess.Popen(["sleep", "3600"])
     time.sleep(3600)
     return item
@@ -190,41 +191,43 @@ def spawn(item: int) -> int:
 
 def test_processes_started_by_a_task_end_with_it() -> None:
     with LocalExecutor(1) as workers:
-        (done,) = run(workers, spawn, [0], WorkLimits(time_s=1.0))
-        assert isinstance(done.error, CaseEndedError)
-        found = subprocess.run(["ps", "-eo", "ppid,args"], capture_output=True, text=True, check=True).stdout
-    # orphans would have been taken in by the first process
-    assert not [line for line in found.splitlines() if line.split()[1:] == ["sleep", "3600"] and line.split()[0] == "1"]
+        (result,) = run_items(workers, start_endless_process, [0], WorkLimits(time_s=1.0))
+        assert isinstance(result.error, CaseEndedError)
+        processes = subprocess.run(["ps", "-eo", "ppid,args"], capture_output=True, text=True, check=True).stdout
+    # process 1 adopts orphans
+    assert not [
+        line for line in processes.splitlines() if line.split()[1:] == ["sleep", "3600"] and line.split()[0] == "1"
+    ]
 
 
-def leave(*_: object) -> None:
+def exit_at_start(*_: object) -> None:
     os._exit(7)
 
 
-def test_a_worker_that_cannot_begin_is_an_error_of_the_campaign(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_that_die_at_start_are_a_campaign_error(monkeypatch: pytest.MonkeyPatch) -> None:
     with LocalExecutor(1) as workers:
-        monkeypatch.setattr("marsyard.campaigns.execution.workers.run_batch", leave)
+        monkeypatch.setattr("marsyard.campaigns.execution.workers.run_batch", exit_at_start)
         with pytest.raises(CampaignError, match="worker processes die before they begin a case"):
-            list(workers.run(Work(process_number, range(3))))
+            list(workers.run(Work(get_process_id, range(3))))
 
 
 def test_memory_counts_private_pages(tmp_path: Path) -> None:
     size = 40_000_000
-    # what earlier tests have left in this process may be released meanwhile
+    # objects of earlier tests must not be released during the measurement
     gc.collect()
-    before = used_memory([os.getpid()])
+    initial_memory = used_memory([os.getpid()])
     mapped = np.memmap(tmp_path / "terrain", dtype=np.uint8, mode="w+", shape=size)
     mapped[:] = 1
-    with_map = used_memory([os.getpid()])
-    assert with_map - before < 0.5 * size
-    # not an array: NumPy would take its memory from what earlier tests have left, which counts already
-    own = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
-    np.frombuffer(own, np.uint8)[:] = 1
-    assert used_memory([os.getpid()]) - with_map > 0.5 * size
+    memory_with_map = used_memory([os.getpid()])
+    assert memory_with_map - initial_memory < 0.5 * size
+    # not an array: NumPy could reuse memory that is already counted
+    private_pages = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
+    np.frombuffer(private_pages, np.uint8)[:] = 1
+    assert used_memory([os.getpid()]) - memory_with_map > 0.5 * size
     assert used_memory([2**22 + 1]) == 0.0
 
 
-def test_batches_grow_to_a_second_and_shrink_to_the_end() -> None:
+def test_batches_last_about_one_second_and_shrink_at_the_end() -> None:
     batches = Batches(range(400), 400, 2)
     sizes = []
     while batch := batches.next():
@@ -234,7 +237,7 @@ def test_batches_grow_to_a_second_and_shrink_to_the_end() -> None:
     assert sizes[:5] == [1, 2, 4, 8, 16]
     assert max(sizes) == 20
     assert sizes[-1] == 1
-    # Empty cases go a thousand at a time, unknown numbers of them as well; slow ones alone.
+    # batches of empty cases reach the maximum size; slow cases run one by one
     empty = Batches(range(10_000), None, 2)
     sizes = [len(empty.next())]
     while batch := empty.next():
@@ -247,7 +250,7 @@ def test_batches_grow_to_a_second_and_shrink_to_the_end() -> None:
     assert slow.next() == []
 
 
-def test_the_status_board_shows_item_and_start(tmp_path: Path) -> None:
+def test_status_board_shows_item_and_start(tmp_path: Path) -> None:
     board = StatusBoard.create(tmp_path / "board")
     assert board.read()[0] is None
     StatusBoard(tmp_path / "board").write(2**40, 1.5)

@@ -1,4 +1,4 @@
-"""Folders that a kill, a full disk or an editor left odd: each is used again, or refused with one message."""
+"""Tests of damaged campaign folders: each is used again or rejected with one message."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from marsyard.campaigns.store.table import write_table
 from marsyard.cli.options import handle_user_errors
-from tests.campaigns.fake_campaign import Silence, rows_of, run
+from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run
 
 CampaignFile = Callable[..., Path]
 
 
-def test_a_run_killed_before_its_record_was_written_can_be_started_again(
-    campaign_file: CampaignFile, tmp_path: Path, watch: Silence
+def test_run_killed_before_its_record_can_be_restarted(
+    campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
     directory = tmp_path / "run"
     directory.mkdir()
@@ -36,8 +36,8 @@ def test_a_run_killed_before_its_record_was_written_can_be_started_again(
     with pytest.raises(StoreError, match="a run was stopped before it began: start it again with --out"):
         resume_campaign(directory, ExecutorConfig(1), watch)
     run(campaign_file(), directory, watch, "cases=2", jobs=1)
-    assert len(rows_of(directory)) == 2
-    # a store with rows is never written over, whatever became of the record
+    assert len(read_case_rows(directory)) == 2
+    # a store with rows is never overwritten, even if its record is missing
     (directory / "campaign.json").unlink()
     for name in ("cases.parquet", "cases"):
         path = directory / name
@@ -61,15 +61,17 @@ def test_a_run_killed_before_its_record_was_written_can_be_started_again(
         ("changes", None, "changes is not a list"),
     ],
 )
-def test_a_record_of_wrong_types_is_refused(troubled: Path, tmp_path: Path, key: str, value: Any, message: str) -> None:
-    stored = json.loads((troubled / "campaign.json").read_text())
+def test_record_with_wrong_types_is_rejected(
+    failing_campaign: Path, tmp_path: Path, key: str, value: Any, message: str
+) -> None:
+    stored = json.loads((failing_campaign / "campaign.json").read_text())
     (tmp_path / "campaign.json").write_text(json.dumps({**stored, key: value}))
     with pytest.raises(StoreError, match=message):
         record.read(tmp_path)
 
 
-def test_a_record_that_lacks_a_key_is_refused(troubled: Path, tmp_path: Path) -> None:
-    stored = json.loads((troubled / "campaign.json").read_text())
+def test_record_with_missing_key_is_rejected(failing_campaign: Path, tmp_path: Path) -> None:
+    stored = json.loads((failing_campaign / "campaign.json").read_text())
     del stored["sessions"]
     (tmp_path / "campaign.json").write_text(json.dumps(stored))
     with pytest.raises(StoreError, match="damaged: it has no sessions"):
@@ -77,15 +79,15 @@ def test_a_record_that_lacks_a_key_is_refused(troubled: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("command", [lambda folder: replay(folder, 0), lambda folder: resume_campaign(
-    folder, ExecutorConfig(1), Silence()
+    folder, ExecutorConfig(1), RecordingWatch()
 )])  # fmt: skip
-def test_stored_parameters_of_wrong_types_are_refused(
-    troubled: Path, tmp_path: Path, command: Callable[[Path], Any]
+def test_stored_parameters_with_wrong_types_are_rejected(
+    failing_campaign: Path, tmp_path: Path, command: Callable[[Path], Any]
 ) -> None:
-    stored = json.loads((troubled / "campaign.json").read_text())
+    stored = json.loads((failing_campaign / "campaign.json").read_text())
     stored["configuration"]["parameters"] = {"altitude_m": [1], "wind": 3}
     (tmp_path / "campaign.json").write_text(json.dumps(stored))
-    shutil.copy(troubled / ROWS_FILE, tmp_path)
+    shutil.copy(failing_campaign / ROWS_FILE, tmp_path)
     with pytest.raises(ConfigurationError, match=r"parameters\.altitude_m"):
         command(tmp_path)
 
@@ -101,7 +103,7 @@ def test_stored_parameters_of_wrong_types_are_refused(
         ("DROP TABLE layouts", "no such table"),
     ],
 )
-def test_an_unknown_layout_of_the_store_is_one_message(tmp_path: Path, change: str, message: str) -> None:
+def test_unknown_store_layout_is_reported(tmp_path: Path, change: str, message: str) -> None:
     path = tmp_path / ROWS_FILE
     create_store(path, {})
     with RowStore(path) as store:
@@ -120,27 +122,27 @@ def test_an_unknown_layout_of_the_store_is_one_message(tmp_path: Path, change: s
         read()
 
 
-def test_a_full_folder_for_temporary_files_is_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object, **__: object) -> None:
+def test_full_temporary_folder_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    def raise_disk_full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("marsyard.campaigns.execution.workers.tempfile.mkdtemp", full)
+    monkeypatch.setattr("marsyard.campaigns.execution.workers.tempfile.mkdtemp", raise_disk_full)
     with pytest.raises(CampaignError, match=r"TMPDIR says where they go.*No space left"):
         LocalExecutor(1)
 
 
-def test_a_full_disk_ends_any_command_with_one_message(capsys: pytest.CaptureFixture[str]) -> None:
+def test_full_disk_is_reported_by_commands(capsys: pytest.CaptureFixture[str]) -> None:
     @handle_user_errors
     def command() -> None:
         raise OSError(errno.ENOSPC, "No space left on device", "somewhere")
 
-    with pytest.raises(typer.Exit) as ended:
+    with pytest.raises(typer.Exit) as raised:
         command()
-    assert ended.value.exit_code == 2
+    assert raised.value.exit_code == 2
     assert capsys.readouterr().err == "error: [Errno 28] No space left on device: 'somewhere'\n"
 
 
-def test_a_site_that_is_a_table_and_a_distribution_beyond_numbers_are_problems_of_the_file(tmp_path: Path) -> None:
+def test_invalid_site_and_distribution_are_reported_by_key(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     path.write_text('name = "x"\nscenario = "landing"\ncases = 3\nseed = 1\n[parameters]\nsite = {a = 1}\n')
     with pytest.raises(ConfigurationError, match=r"parameters\.site: input should be a valid string"):

@@ -1,4 +1,4 @@
-"""Campaigns finish although cases fail, and give the same rows with any executor."""
+"""Tests of the campaign engine: failing cases, stored rows and records, shared inputs and metrics."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from marsyard.campaigns.running.engine import check_metrics
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import refresh_table
-from tests.campaigns.fake_campaign import TROUBLE, Silence, rows_of, run
+from tests.campaigns.fake_campaign import FAILING_CASES, RecordingWatch, read_case_rows, run
 
 CampaignFile = Callable[..., Path]
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
 
-def test_a_campaign_with_failing_cases_finishes(
-    troubled: Path, campaign_file: CampaignFile, tmp_path: Path, watch: Silence
+def test_campaign_with_failing_cases_finishes(
+    failing_campaign: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
-    rows = rows_of(troubled)
+    rows = read_case_rows(failing_campaign)
     assert [row["case"] for row in rows] == list(range(12))
     outcomes = [row["outcome"] for row in rows]
     assert [case for case, outcome in enumerate(outcomes) if outcome == "CRASHED"] == [3, 5, 6]
@@ -37,35 +37,35 @@ def test_a_campaign_with_failing_cases_finishes(
     assert "in run" in rows[3]["traceback"]
     assert rows[5]["error"] == "the worker process died: SIGABRT (-6)"
     assert "fake_scenario.py" in rows[5]["traceback"]
-    # One worker, and a rerun of any case alone, give the same rows; healthy cases do not notice the others.
-    single = rows_of(run(campaign_file(TROUBLE), tmp_path / "single", watch, jobs=1))
+    # same rows with one worker, without the failing cases, and for single replayed cases
+    single = read_case_rows(run(campaign_file(FAILING_CASES), tmp_path / "single", watch, jobs=1))
     assert [differing_columns(row, other) for row, other in zip(rows, single, strict=True)] == [()] * 12
-    healthy = rows_of(run(campaign_file("silent_cases = [2]"), tmp_path / "healthy", watch))
+    healthy = read_case_rows(run(campaign_file("silent_cases = [2]"), tmp_path / "healthy", watch))
     for case in (0, 1, 2, 4, 7, 8, 9, 10, 11):
         assert differing_columns(rows[case], healthy[case]) == ()
     for case in (3, 5, 7):
-        replayed = replay(troubled, case)
+        replayed = replay(failing_campaign, case)
         assert replayed.stored is not None
         assert replayed.differing == ()
     assert watch.notes == []
 
 
-def test_the_table_keeps_types_and_nan(troubled: Path) -> None:
-    schema = pq.read_schema(troubled / "cases.parquet")
+def test_table_keeps_types_and_nan(failing_campaign: Path) -> None:
+    schema = pq.read_schema(failing_campaign / "cases.parquet")
     kinds = {name: str(schema.field(name).type) for name in schema.names}
     assert list(kinds)[:3] == ["case", "outcome", "answered"]
     assert list(kinds)[-4:] == ["wall_time_s", "cpu_time_s", "error", "traceback"]
     expected = {"case": "int64", "answered": "bool", "velocity_error_m_s": "double", "terrain": "int64"}
     assert expected.items() <= kinds.items()
     assert (kinds["kind"], kinds["clear"], kinds["wall_time_s"]) == ("string", "bool", "double")
-    frame = pd.read_parquet(troubled / "cases.parquet")
+    frame = pd.read_parquet(failing_campaign / "cases.parquet")
     assert frame["velocity_error_m_s"].isna().tolist() == [case in (2, 3, 5, 6) for case in range(12)]
-    assert pq.read_table(troubled / "cases.parquet")["velocity_error_m_s"].null_count == 0
+    assert pq.read_table(failing_campaign / "cases.parquet")["velocity_error_m_s"].null_count == 0
     assert frame["error"][0] == ""
 
 
-def test_the_record_describes_the_run(troubled: Path) -> None:
-    stored = record.read(troubled)
+def test_record_describes_the_run(failing_campaign: Path) -> None:
+    stored = record.read(failing_campaign)
     assert (stored["schema"], stored["state"], stored["exit_code"]) == (1, "finished", None)
     assert (stored["cases_finished"], stored["cases_crashed"], stored["seed"]) == (12, 3, 5)
     assert stored["configuration"]["parameters"]["lowest_altitude_m"] == 0.0
@@ -75,35 +75,35 @@ def test_the_record_describes_the_run(troubled: Path) -> None:
     assert {"python", "platform", "processor", "processor_features"} <= set(stored["environment"])
     assert stored["started_utc"] <= stored["finished_utc"]
     files = ["campaign.json", "campaign.lock", "cases", "cases.parquet", "cases.sqlite"]
-    assert sorted(path.name for path in troubled.iterdir()) == files
+    assert sorted(path.name for path in failing_campaign.iterdir()) == files
 
 
-def test_threads_and_hashes_are_pinned_in_workers(troubled: Path) -> None:
-    rows = [row for row in rows_of(troubled) if row["outcome"] != "CRASHED"]
+def test_threads_and_hashes_are_pinned_in_workers(failing_campaign: Path) -> None:
+    rows = [row for row in read_case_rows(failing_campaign) if row["outcome"] != "CRASHED"]
     assert {row["threads"] for row in rows} == {"1"}
     assert len({row["hash_of_text"] for row in rows}) == 1
 
 
-def test_shared_inputs_are_prepared_once(campaign_file: CampaignFile, tmp_path: Path, watch: Silence) -> None:
-    stated = f"shared = 3\ncache = '{tmp_path}'"
-    run(campaign_file(stated), tmp_path / "run", watch, "cases=1", "retain.showcase=none")
+def test_shared_inputs_are_prepared_once(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> None:
+    parameters = f"shared = 3\ncache = '{tmp_path}'"
+    run(campaign_file(parameters), tmp_path / "run", watch, "cases=1", "retain.showcase=none")
     assert len(list(tmp_path.glob("shared-*"))) == 3
     assert watch.steps == {"preparing": 3, "cases": 1}
 
 
-def test_shared_inputs_that_fail_are_noted(campaign_file: CampaignFile, tmp_path: Path, watch: Silence) -> None:
+def test_failed_shared_inputs_are_noted(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> None:
     run(campaign_file("shared = 1\nfail_prepare = true"), tmp_path / "run", watch, "cases=1", jobs=1)
     note = "shared input 0 could not be prepared: OSError: no room for the terrain"
     assert watch.notes == [note]
 
 
-def test_a_folder_with_a_campaign_is_refused(
-    campaign_file: CampaignFile, troubled: Path, tmp_path: Path, watch: Silence
+def test_used_folder_is_rejected(
+    campaign_file: CampaignFile, failing_campaign: Path, tmp_path: Path, watch: RecordingWatch
 ) -> None:
-    before = {path: path.stat().st_mtime_ns for path in troubled.rglob("*")}
+    before = {path: path.stat().st_mtime_ns for path in failing_campaign.rglob("*")}
     with pytest.raises(StoreError, match="already holds a campaign"):
-        run(campaign_file(), troubled, watch)
-    assert {path: path.stat().st_mtime_ns for path in troubled.rglob("*")} == before
+        run(campaign_file(), failing_campaign, watch)
+    assert {path: path.stat().st_mtime_ns for path in failing_campaign.rglob("*")} == before
     for name in ("report.html", "cases.sqlite"):
         (tmp_path / name).mkdir()
         (tmp_path / name / name).touch()
@@ -113,16 +113,16 @@ def test_a_folder_with_a_campaign_is_refused(
         run(campaign_file(), tmp_path / "fake.toml" / "run", watch)
 
 
-def test_a_metric_that_no_case_has_stops_the_campaign_early(
-    campaign_file: CampaignFile, tmp_path: Path, watch: Silence
+def test_unknown_metric_stops_the_campaign_early(
+    campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
     requirement = "[[requirements]]\nid='a'\nmetric='velocity_eror_m_s'\nbound=1\nprobability=0.9\nconfidence=0.9"
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as raised:
         run(campaign_file(requirement=requirement), tmp_path / "run", watch, jobs=1)
-    assert "unknown column of numbers 'velocity_eror_m_s' (did you mean 'velocity_error_m_s'?)" in str(caught.value)
+    assert "unknown column of numbers 'velocity_eror_m_s' (did you mean 'velocity_error_m_s'?)" in str(raised.value)
     assert record.read(tmp_path / "run")["state"] == "interrupted"
     refresh_table(tmp_path / "run")
-    assert len(rows_of(tmp_path / "run")) == 1
+    assert len(read_case_rows(tmp_path / "run")) == 1
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_a_metric_that_no_case_has_stops_the_campaign_early(
         ("metric='answered'\npopulation='valid and rom'", "[0].population: unknown column of true and false 'rom'"),
     ],
 )
-def test_requirements_need_columns_of_their_kind(campaign_file: CampaignFile, change: str, message: str) -> None:
+def test_requirement_with_wrong_column_type_is_rejected(campaign_file: CampaignFile, change: str, message: str) -> None:
     requirement = f"[[requirements]]\nid='a'\nprobability=0.9\nconfidence=0.9\n{change}"
     configuration = load_campaign(str(campaign_file(requirement=requirement))).configuration
     row = {"case": 0, "answered": True, "velocity_error_m_s": 1.0}
@@ -142,16 +142,16 @@ def test_requirements_need_columns_of_their_kind(campaign_file: CampaignFile, ch
         check_metrics(configuration, row, Path("runs"))
 
 
-def test_requirements_may_name_sums_and_times(campaign_file: CampaignFile) -> None:
-    asked = "metric='matching_time_s + search_time_s'\nbound=1"
-    requirement = f"[[requirements]]\nid='a'\nprobability=0.9\nconfidence=0.9\n{asked}"
+def test_sum_of_times_is_accepted_as_metric(campaign_file: CampaignFile) -> None:
+    metric = "metric='matching_time_s + search_time_s'\nbound=1"
+    requirement = f"[[requirements]]\nid='a'\nprobability=0.9\nconfidence=0.9\n{metric}"
     configuration = load_campaign(str(campaign_file(requirement=requirement))).configuration
     row = {"case": 0, "answered": True, "matching_time_s": 0.1, "search_time_s": 0.2}
     check_metrics(configuration, row, Path("runs"))
 
 
-def test_where_every_case_crashes_the_metric_still_has_its_column(
-    campaign_file: CampaignFile, tmp_path: Path, watch: Silence
+def test_metric_column_exists_if_all_cases_crash(
+    campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
     directory = run(campaign_file("raising_cases = [0, 1]"), tmp_path / "run", watch, "cases=2", jobs=1)
     frame = pd.read_parquet(directory / "cases.parquet")

@@ -1,4 +1,4 @@
-"""Time and disk space of a campaign are estimated from a few of its cases."""
+"""Tests of the estimated time and disk space of a campaign."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ CampaignFile = Callable[..., Path]
 
 def test_trial_cases_estimate_time_and_disk_space(campaign_file: CampaignFile) -> None:
     campaign = load_campaign(str(campaign_file("sleep_s = 0.05")), ["cases=1000", "retain.products=all"])
-    found = estimate(campaign, jobs=2)
-    assert (found.trials, found.unfinished) == (9, 0)
-    assert 0.05 <= found.case_s < 0.5
-    assert found.time_s == pytest.approx(1000 * found.case_s / 2)
-    # a row of some 15 columns, products of some kilobytes
-    assert 1e5 < found.rows_bytes < 1e6
-    assert 5e5 < found.products_bytes < 5e6
+    cost = estimate(campaign, jobs=2)
+    assert (cost.trials, cost.unfinished) == (9, 0)
+    assert 0.05 <= cost.case_s < 0.5
+    assert cost.time_s == pytest.approx(1000 * cost.case_s / 2)
+    # a row has about 15 columns; products have a few kilobytes
+    assert 1e5 < cost.rows_bytes < 1e6
+    assert 5e5 < cost.products_bytes < 5e6

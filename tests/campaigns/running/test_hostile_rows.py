@@ -1,4 +1,4 @@
-"""No row and no closed file stops a campaign: the case is recorded as crashed, with its reason and its conditions."""
+"""Tests that cases with invalid rows or closed files are recorded as crashed, with reason and conditions."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from marsyard.reports.campaign import write_report
 from marsyard.reports.stored import read_run
 from marsyard.reports.verdicts import Status, judge_campaign
-from tests.campaigns.fake_campaign import Silence, rows_of, run, write_campaign
-from tests.campaigns.hostile_scenario import DEEDS
+from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run, write_campaign
+from tests.campaigns.hostile_scenario import FAULTS
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
@@ -29,7 +29,7 @@ probability = 0.9
 confidence = 0.9
 population = "near"
 """
-#: What the error of each deed's case says; of those that are left out the case is whole.
+#: Recorded error of each fault; other cases are valid.
 REASONS = {
     "text in a metric": "column velocity_error_m_s holds 'small'; error needs a number",
     "text in a population": "column near holds 'yes'; error needs true or false",
@@ -45,28 +45,28 @@ REASONS = {
 
 @pytest.fixture(scope="module")
 def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Every deed twice, in one campaign of two workers."""
+    """Run a campaign with two cases per fault on two workers."""
     folder = tmp_path_factory.mktemp("hostile")
     path = write_campaign(folder, head=HEAD, dispersions="", requirement=REQUIREMENTS)
-    return run(path, folder / "hostile", Silence())
+    return run(path, folder / "hostile", RecordingWatch())
 
 
 @pytest.fixture(scope="module")
 def rows(hostile: Path) -> list[Any]:
-    return list(rows_of(hostile))
+    return list(read_case_rows(hostile))
 
 
-def test_the_campaign_continues_and_reports_the_reason(rows: list[Any]) -> None:
-    assert len(rows) == 2 * len(DEEDS)
+def test_campaign_continues_and_reports_the_reason(rows: list[Any]) -> None:
+    assert len(rows) == 2 * len(FAULTS)
     for row in rows:
-        reason = REASONS.get(DEEDS[row["case"] % len(DEEDS)])
+        reason = REASONS.get(FAULTS[row["case"] % len(FAULTS)])
         assert row["outcome"] == ("CRASHED" if reason else row["outcome"]), row
         assert (reason or "") in row["error"], row
         assert reason is not None or (row["outcome"].startswith("VALID") and row["error"] == ""), row
 
 
 def test_conditions_of_crashed_cases_are_kept(rows: list[Any]) -> None:
-    """Also those of a case whose process ended."""
+    """Conditions are also stored for cases whose process died."""
     assert [(row["near"], row["height_m"]) for row in rows] == [(True, 10.0 + row["case"]) for row in rows]
 
 
@@ -76,6 +76,6 @@ def test_crashed_cases_stay_in_their_populations(hostile: Path) -> None:
     assert (verdict.status, verdict.n, verdict.failures) == (Status.FAIL, 24, 2 * len(REASONS))
 
 
-def test_a_report_is_written(hostile: Path) -> None:
+def test_report_of_hostile_campaign_is_written(hostile: Path) -> None:
     write_report(hostile)
     assert "the algorithm raised" in (hostile / "report.html").read_text(encoding="utf-8")

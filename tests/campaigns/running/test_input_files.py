@@ -1,4 +1,4 @@
-"""Files that a campaign's parameters name belong to its identity: a changed one is noticed by `resume` and `append`."""
+"""Tests that input files belong to a campaign's identity: `resume` and `append` detect changed files."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.campaigns.definition.identity import identity_of
+from marsyard.campaigns.definition.identity import create_identity
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import append_cases, resume_campaign
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
-from tests.campaigns.fake_campaign import Silence, run
+from tests.campaigns.fake_campaign import RecordingWatch, run
 
 CAMERA = (
     "Model = CAHV = perspective, linear\nDimensions = 1024 1024\nC = 0 0 0\nA = 0 0 1\nH = 1200 0 512\nV = 0 1200 512\n"
@@ -46,72 +46,74 @@ def table(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def done(campaign_file: CampaignFile, tmp_path: Path, watch: Silence, table: Path) -> Path:
-    """A finished campaign whose parameters name a file."""
+def finished(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch, table: Path) -> Path:
+    """Run a campaign whose parameters name an input file."""
     return run(campaign_file(f'table = "{table}"'), tmp_path / "done", watch, "cases=2", jobs=1)
 
 
-def test_a_changed_file_is_noticed_by_resume_and_append(done: Path, table: Path, watch: Silence) -> None:
-    assert list(record.read(done)["identity"]["inputs"]) == [str(table)]
-    resume_campaign(done, ExecutorConfig(1), watch)
+def test_changed_input_file_is_detected(finished: Path, table: Path, watch: RecordingWatch) -> None:
+    assert list(record.read(finished)["identity"]["inputs"]) == [str(table)]
+    resume_campaign(finished, ExecutorConfig(1), watch)
     table.write_text("1,2,4\n")
-    acts: tuple[Callable[[], None], ...] = (
-        lambda: resume_campaign(done, ExecutorConfig(1), watch),
-        lambda: append_cases(done, 1, ExecutorConfig(1), watch),
+    commands: tuple[Callable[[], None], ...] = (
+        lambda: resume_campaign(finished, ExecutorConfig(1), watch),
+        lambda: append_cases(finished, 1, ExecutorConfig(1), watch),
     )
-    for act in acts:
+    for command in commands:
         with pytest.raises(CampaignError, match=r"Changed:\n  .*table.csv \(\w{12}, now \w{12}\)\nTo continue"):
-            act()
-    assert replay(done, 0).changed[0].startswith(str(table))
-    append_cases(done, 1, ExecutorConfig(1), watch, allow_changed=True)
-    (change,) = record.read(done)["changes"]
+            command()
+    assert replay(finished, 0).changed[0].startswith(str(table))
+    append_cases(finished, 1, ExecutorConfig(1), watch, allow_changed=True)
+    (change,) = record.read(finished)["changes"]
     assert "table.csv" in change["in"][0]
-    append_cases(done, 1, ExecutorConfig(1), watch)
+    append_cases(finished, 1, ExecutorConfig(1), watch)
 
 
-def test_campaigns_of_earlier_versions_resume_and_store_hashes(done: Path, table: Path, watch: Silence) -> None:
-    stored = json.loads((done / "campaign.json").read_text())
+def test_campaigns_without_input_hashes_resume_and_store_them(
+    finished: Path, table: Path, watch: RecordingWatch
+) -> None:
+    stored = json.loads((finished / "campaign.json").read_text())
     del stored["identity"]["inputs"]
-    (done / "campaign.json").write_text(json.dumps(stored))
-    append_cases(done, 1, ExecutorConfig(1), watch)
+    (finished / "campaign.json").write_text(json.dumps(stored))
+    append_cases(finished, 1, ExecutorConfig(1), watch)
     assert any("table.csv" in note and "not known" in note for note in watch.notes)
-    assert record.read(done)["identity"]["inputs"]
+    assert record.read(finished)["identity"]["inputs"]
     table.write_text("other\n")
     with pytest.raises(CampaignError, match=r"table\.csv"):
-        resume_campaign(done, ExecutorConfig(1), watch)
+        resume_campaign(finished, ExecutorConfig(1), watch)
 
 
-def test_files_that_are_dispersed_over_belong_to_it(campaign_file: CampaignFile, tmp_path: Path, table: Path) -> None:
+def test_dispersed_input_files_belong_to_the_identity(campaign_file: CampaignFile, tmp_path: Path, table: Path) -> None:
     other = tmp_path / "other.csv"
     other.write_text("4,5,6\n")
-    drawn = f'[dispersions]\ntable = {{distribution = "choice", values = ["{table}", "{other}"]}}\n'
-    campaign = load_campaign(str(campaign_file(f'table = "{table}"', dispersions=drawn)))
-    assert set(identity_of(campaign.configuration).inputs or {}) == {str(table), str(other)}
+    dispersions = f'[dispersions]\ntable = {{distribution = "choice", values = ["{table}", "{other}"]}}\n'
+    campaign = load_campaign(str(campaign_file(f'table = "{table}"', dispersions=dispersions)))
+    assert set(create_identity(campaign.configuration).inputs or {}) == {str(table), str(other)}
 
 
-def test_terrain_camera_and_datasheet_belong_to_a_descent(tmp_path: Path) -> None:
+def test_terrain_camera_and_datasheet_belong_to_the_identity(tmp_path: Path) -> None:
     files = {name: tmp_path / name for name in ("site.npz", "cam.cahv", "sensor.toml")}
     rng = np.random.default_rng(1)
     np.savez(files["site.npz"], dem=rng.normal(size=(64, 64)), dem_gsd=4.0)
     files["cam.cahv"].write_text(CAMERA)
     files["sensor.toml"].write_text(DATASHEET)
-    stated = [
+    overrides = [
         f"terrain.source.dtm={files['site.npz']}",
         f"camera.model={files['cam.cahv']}",
         f"detector.file={files['sensor.toml']}",
     ]
-    configuration = load_campaign("dimes-gusev", stated).configuration
-    before = identity_of(configuration)
+    configuration = load_campaign("dimes-gusev", overrides).configuration
+    before = create_identity(configuration)
     assert set(before.inputs or {}) == {str(path) for path in files.values()}
     np.savez(files["site.npz"], dem=rng.normal(size=(64, 64)), dem_gsd=4.0)
     files["cam.cahv"].write_text(CAMERA.replace("1200", "1201"))
     files["sensor.toml"].write_text(DATASHEET.replace("25.0", "26.0"))
-    changed = before.differences(identity_of(configuration))
+    changed = before.differences(create_identity(configuration))
     assert [line.split(" ")[0] for line in changed] == sorted(str(path) for path in files.values())
-    # what was read from a camera's file and a datasheet is kept with the campaign: it does without the files
+    # the campaign stores the content of the camera file and datasheet, so these files may be deleted
     files["cam.cahv"].unlink()
     files["sensor.toml"].unlink()
-    assert list(identity_of(configuration).inputs or {}) == [str(files["site.npz"])]
+    assert list(create_identity(configuration).inputs or {}) == [str(files["site.npz"])]
     files["site.npz"].unlink()
     with pytest.raises(CampaignError, match=r"cannot be used any more: .*site.npz: no such file"):
-        identity_of(configuration)
+        create_identity(configuration)

@@ -1,4 +1,4 @@
-"""Only the shared inputs (terrains) that a campaign's own cases use are built, and a trial counts their cost."""
+"""Tests of shared inputs (terrains): only used inputs are built, and estimates include their cost."""
 
 from __future__ import annotations
 
@@ -15,98 +15,100 @@ from marsyard.campaigns.running.engine import append_cases
 from marsyard.campaigns.running.preparation import estimate, find_used_inputs, plan_inputs
 from marsyard.scenarios.interface import SelectsInputs
 from marsyard.scenarios.systems import scenario, scenario_names
-from tests.campaigns.fake_campaign import HEAD, Silence, rows_of, run
+from tests.campaigns.fake_campaign import HEAD, RecordingWatch, read_case_rows, run
 
 CampaignFile = Callable[..., Path]
-DRAWN = '[dispersions]\nterrain = {distribution = "integer", low = 0, high = 9}'
+DISPERSION = '[dispersions]\nterrain = {distribution = "integer", low = 0, high = 9}'
 
 
 @pytest.fixture
 def selecting(campaign_file: CampaignFile, tmp_path: Path) -> Path:
-    """Three cases over ten terrains."""
+    """Write a campaign with three cases over ten terrains."""
     head = HEAD.replace("FakeScenario", "SelectingScenario").replace("cases = 12", "cases = 3")
     folder = tmp_path / "inputs"
     folder.mkdir()
-    return campaign_file(f'shared = 10\ncache = "{folder}"', head=head, dispersions=DRAWN)
+    return campaign_file(f'shared = 10\ncache = "{folder}"', head=head, dispersions=DISPERSION)
 
 
-def _built(folder: Path) -> set[str]:
+def _list_inputs(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_only_inputs_that_cases_draw_are_built(selecting: Path, tmp_path: Path, watch: Silence) -> None:
+def test_only_used_inputs_are_built(selecting: Path, tmp_path: Path, watch: RecordingWatch) -> None:
     directory = run(selecting, tmp_path / "run", watch)
-    drawn = {f"shared-{row['terrain']}" for row in rows_of(directory)}
-    assert _built(tmp_path / "inputs") == drawn
-    assert watch.steps["preparing"] == len(drawn) <= 3
-    # cases that are added build those of their own
+    expected = {f"shared-{row['terrain']}" for row in read_case_rows(directory)}
+    assert _list_inputs(tmp_path / "inputs") == expected
+    assert watch.steps["preparing"] == len(expected) <= 3
+    # appended cases build their inputs
     append_cases(directory, 3, ExecutorConfig(1), watch)
-    assert _built(tmp_path / "inputs") == {f"shared-{row['terrain']}" for row in rows_of(directory)}
+    assert _list_inputs(tmp_path / "inputs") == {f"shared-{row['terrain']}" for row in read_case_rows(directory)}
 
 
-def test_warnings_of_the_cache_while_preparing_become_notes(selecting: Path, tmp_path: Path, watch: Silence) -> None:
+def test_cache_warnings_become_notes(selecting: Path, tmp_path: Path, watch: RecordingWatch) -> None:
     run(selecting, tmp_path / "run", watch)
     assert {note for note in watch.notes if "was damaged" in note} == {
-        f"input {name.removeprefix('shared-')} was damaged" for name in _built(tmp_path / "inputs")
+        f"input {name.removeprefix('shared-')} was damaged" for name in _list_inputs(tmp_path / "inputs")
     }
 
 
-def test_a_trial_counts_the_inputs_to_be_built_and_their_size(selecting: Path, tmp_path: Path) -> None:
+def test_estimate_includes_inputs_to_build(selecting: Path, tmp_path: Path) -> None:
     campaign = load_campaign(str(selecting))
-    drawn = len(find_used_inputs(campaign, range(3)))
-    found = estimate(campaign, jobs=1)
-    assert (found.inputs, found.inputs_bytes) == (drawn, drawn * 1e6)
-    assert found.input_s > 0.0
-    assert found.time_s == pytest.approx(3 * found.case_s + drawn * found.input_s)
-    # the trial has built them
-    assert len(_built(tmp_path / "inputs")) == drawn
-    again = estimate(campaign, jobs=1)
-    assert (again.inputs, again.inputs_bytes, again.input_s) == (0, 0, 0.0)
+    n_inputs = len(find_used_inputs(campaign, range(3)))
+    first = estimate(campaign, jobs=1)
+    assert (first.inputs, first.inputs_bytes) == (n_inputs, n_inputs * 1e6)
+    assert first.input_s > 0.0
+    assert first.time_s == pytest.approx(3 * first.case_s + n_inputs * first.input_s)
+    # the trial cases have built the inputs
+    assert len(_list_inputs(tmp_path / "inputs")) == n_inputs
+    second = estimate(campaign, jobs=1)
+    assert (second.inputs, second.inputs_bytes, second.input_s) == (0, 0, 0.0)
 
 
-def test_inputs_beyond_the_limit_of_the_cache_are_left_to_the_cases(
-    selecting: Path, tmp_path: Path, watch: Silence, monkeypatch: pytest.MonkeyPatch
+def test_inputs_beyond_cache_limit_are_built_by_cases(
+    selecting: Path, tmp_path: Path, watch: RecordingWatch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MARSYARD_CACHE_GB", "0.0015")
     directory = run(selecting, tmp_path / "run", watch)
-    assert len(_built(tmp_path / "inputs")) == 1
+    assert len(_list_inputs(tmp_path / "inputs")) == 1
     assert any("more than the cache may" in note for note in watch.notes)
-    assert len(rows_of(directory)) == 3
+    assert len(read_case_rows(directory)) == 3
 
 
-def test_a_limit_that_is_no_number_is_one_message(selecting: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_cache_limit_is_reported(selecting: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE_GB", "plenty")
     with pytest.raises(CampaignError, match="MARSYARD_CACHE_GB is 'plenty'"):
         plan_inputs(load_campaign(str(selecting)), range(3))
 
 
-def test_a_scenario_that_states_nothing_has_all_of_its_inputs_built(
-    campaign_file: CampaignFile, tmp_path: Path, watch: Silence
+def test_all_inputs_are_built_without_case_inputs(
+    campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
-    """Scenarios of users keep working as they are."""
+    """The method `case_inputs` is optional for custom scenarios."""
     folder = tmp_path / "inputs"
     folder.mkdir()
     path = campaign_file(f'shared = 4\ncache = "{folder}"')
     run(path, tmp_path / "run", watch, "cases=2")
-    assert len(_built(folder)) == 4
+    assert len(_list_inputs(folder)) == 4
 
 
 def test_eight_descents_over_gusev_need_eight_terrains() -> None:
     campaign = load_campaign("dimes-gusev", [], 8)
     assert len(find_used_inputs(campaign, range(8))) == 8
     parameters: list[Any] = [campaign.parameters(case) for case in range(8)]
-    assert {one.location.terrain for one in parameters} == set(find_used_inputs(campaign, range(8)))
+    assert {case_parameters.location.terrain for case_parameters in parameters} == set(
+        find_used_inputs(campaign, range(8))
+    )
 
 
 @pytest.mark.parametrize("name", ["hda-hazardous", "vtt-montecarlo", "vtt-accuracy", "dimes-fieldtest", "dimes-smoke"])
 def test_cases_use_terrains_of_their_campaign(name: str) -> None:
     campaign = load_campaign(name)
-    every = campaign.scenario.shared_inputs(campaign.base_parameters())
+    all_inputs = campaign.scenario.shared_inputs(campaign.base_parameters())
     assert isinstance(campaign.scenario, SelectsInputs)
     used = find_used_inputs(campaign, range(3))
-    assert set(used) <= set(every)
-    assert not every or used
-    assert all(campaign.scenario.missing_bytes(campaign.base_parameters(), one) >= 0 for one in used)
+    assert set(used) <= set(all_inputs)
+    assert not all_inputs or used
+    assert all(campaign.scenario.missing_bytes(campaign.base_parameters(), shared_input) >= 0 for shared_input in used)
 
 
 def test_every_scenario_with_shared_inputs_selects_them() -> None:

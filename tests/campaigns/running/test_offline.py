@@ -1,8 +1,9 @@
-"""Exported cases are answered elsewhere, and the answers are scored as in a run."""
+"""Tests of exported cases: answers of an external algorithm are scored as in a normal run."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -15,7 +16,6 @@ from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.offline import (
-    Exported,
     cases_with_changed_pictures,
     export_campaign,
     scored_campaign,
@@ -23,7 +23,7 @@ from marsyard.campaigns.running.offline import (
 )
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.sim.measurements import DescentMeasurements
-from tests.campaigns.fake_campaign import Silence, rows_of
+from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
 
 CASES = 3
 FILE = f"""
@@ -40,48 +40,53 @@ confidence = 0.5
 """
 
 
+class Exported(NamedTuple):
+    directory: Path
+    truth: Path
+
+
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
     folder = tmp_path_factory.mktemp("offline")
     (folder / "fake.toml").write_text(FILE)
-    made = Exported(folder / "out", truth_folder(folder / "out"))
-    export_campaign(campaign(made), made, ExecutorConfig(1), Silence())
-    return made
+    export = Exported(folder / "out", truth_folder(folder / "out"))
+    export_campaign(load_export_campaign(export), *export, ExecutorConfig(1), RecordingWatch())
+    return export
 
 
-def campaign(exported: Exported, *settings: str) -> Campaign:
-    kept = ["retain.showcase=none", *settings]
+def load_export_campaign(exported: Exported, *settings: str) -> Campaign:
+    overrides = ["retain.showcase=none", *settings]
     return load_campaign(
-        str(exported.directory.parent / "fake.toml"), kept, None, None, [f"export:{exported.directory}"]
+        str(exported.directory.parent / "fake.toml"), overrides, None, None, [f"export:{exported.directory}"]
     )
 
 
-def answered(exported: Exported) -> dict[int, VelocityEstimate]:
-    """What an estimator makes of the exported files, and of nothing else."""
-    found = {}
+def estimate_exported(exported: Exported) -> dict[int, VelocityEstimate]:
+    """Run an estimator on the exported files only."""
+    estimates = {}
     for folder in sorted((exported.directory / "cases").iterdir()):
         measurements = read_case(folder)
         assert isinstance(measurements, DescentMeasurements)
-        found[int(folder.name)] = HomographyEstimator().estimate(measurements)
-    return found
+        estimates[int(folder.name)] = HomographyEstimator().estimate(measurements)
+    return estimates
 
 
-def written(path: Path, answers: dict[int, VelocityEstimate]) -> Path:
+def write_answers(path: Path, answers: dict[int, VelocityEstimate]) -> Path:
     lines = ["case,outcome,velocity_east_m_s,velocity_north_m_s"]
-    for case, one in answers.items():
-        numbers = ["", ""] if one.velocity_m_s is None else [repr(float(value)) for value in one.velocity_m_s]
-        lines.append(",".join([str(case), one.outcome.name, *numbers]))
+    for case, estimate in answers.items():
+        numbers = ["", ""] if estimate.velocity_m_s is None else [repr(float(value)) for value in estimate.velocity_m_s]
+        lines.append(",".join([str(case), estimate.outcome.name, *numbers]))
     path.write_text("\n".join(lines))
     return path
 
 
-def test_answers_made_elsewhere_score_as_a_run(exported: Exported, tmp_path: Path) -> None:
-    watch = Silence()
-    scored = scored_campaign(exported, written(tmp_path / "theirs.csv", answered(exported)))
+def test_external_answers_score_as_a_normal_run(exported: Exported, tmp_path: Path) -> None:
+    watch = RecordingWatch()
+    scored = scored_campaign(*exported, write_answers(tmp_path / "theirs.csv", estimate_exported(exported)))
     run_campaign(scored, tmp_path / "scored", ExecutorConfig(1), watch)
-    own = load_campaign(str(exported.directory.parent / "fake.toml"))
-    run_campaign(own, tmp_path / "own", ExecutorConfig(1), watch)
-    for row, other in zip(rows_of(tmp_path / "scored"), rows_of(tmp_path / "own"), strict=True):
+    normal_run = load_campaign(str(exported.directory.parent / "fake.toml"))
+    run_campaign(normal_run, tmp_path / "own", ExecutorConfig(1), watch)
+    for row, other in zip(read_case_rows(tmp_path / "scored"), read_case_rows(tmp_path / "own"), strict=True):
         assert differing_columns(row, other) == ("algorithm",)
         assert row["algorithm"] == "theirs"
         assert row["velocity_error_m_s"] < 1.0
@@ -89,41 +94,45 @@ def test_answers_made_elsewhere_score_as_a_run(exported: Exported, tmp_path: Pat
     assert watch.notes == []
 
 
-def test_truth_stays_in_its_own_folder(exported: Exported) -> None:
-    rows = rows_of(exported.truth)
+def test_truth_is_stored_in_a_separate_folder(exported: Exported) -> None:
+    rows = read_case_rows(exported.truth)
     assert [row["velocity_true_x_m_s"] for row in rows] == [12.0] * CASES
     files = sorted(path.relative_to(exported.directory).as_posix() for path in exported.directory.rglob("*"))
     assert {name for name in files if "/" not in name} == {"README.md", "cases", "export.json"}
     assert not any("12.0" in path.read_text() for path in exported.directory.glob("*.*"))
     with pytest.raises(CampaignError, match="lies within"):
         export_campaign(
-            campaign(exported), Exported(exported.directory, exported.directory / "truth"), ExecutorConfig(1), Silence()
+            load_export_campaign(exported),
+            exported.directory,
+            exported.directory / "truth",
+            ExecutorConfig(1),
+            RecordingWatch(),
         )
 
 
-def test_an_export_resumes_and_is_not_mixed_with_another(exported: Exported) -> None:
+def test_export_resumes_and_rejects_other_exports(exported: Exported) -> None:
     times = {path: path.stat().st_mtime_ns for path in (exported.directory / "cases").rglob("*")}
-    export_campaign(campaign(exported), exported, ExecutorConfig(1), Silence())
+    export_campaign(load_export_campaign(exported), *exported, ExecutorConfig(1), RecordingWatch())
     assert {path: path.stat().st_mtime_ns for path in times} == times
     with pytest.raises(StoreError, match="holds the truth of another export"):
-        export_campaign(campaign(exported, "seed=4"), exported, ExecutorConfig(1), Silence())
+        export_campaign(load_export_campaign(exported, "seed=4"), *exported, ExecutorConfig(1), RecordingWatch())
     elsewhere = Exported(exported.directory, exported.truth.with_name("new-truth"))
     with pytest.raises(StoreError, match="is there already, and is not empty"):
-        export_campaign(campaign(exported), elsewhere, ExecutorConfig(1), Silence())
+        export_campaign(load_export_campaign(exported), *elsewhere, ExecutorConfig(1), RecordingWatch())
 
 
-def test_tables_that_do_not_answer_each_case_once(exported: Exported, tmp_path: Path) -> None:
-    answers = answered(exported)
-    few = written(tmp_path / "few.csv", {case: answers[case] for case in (0, 2)})
+def test_tables_with_missing_or_unknown_cases_are_rejected(exported: Exported, tmp_path: Path) -> None:
+    answers = estimate_exported(exported)
+    incomplete = write_answers(tmp_path / "few.csv", {case: answers[case] for case in (0, 2)})
     with pytest.raises(CampaignError, match=r"no answer to 1 of 3 cases: 1; .*such as NO_TEMPLATE_AREA"):
-        scored_campaign(exported, few)
-    many = written(tmp_path / "many.csv", {**answers, 7: answers[0]})
+        scored_campaign(*exported, incomplete)
+    unknown_case = write_answers(tmp_path / "many.csv", {**answers, 7: answers[0]})
     with pytest.raises(CampaignError, match="there is no case 7; allowed: 0 to 2"):
-        scored_campaign(exported, many)
+        scored_campaign(*exported, unknown_case)
     with pytest.raises(CampaignError, match="No such file"):
-        scored_campaign(exported, tmp_path / "none.csv")
+        scored_campaign(*exported, tmp_path / "none.csv")
     with pytest.raises(StoreError, match="holds no finished export"):
-        scored_campaign(Exported(tmp_path, exported.truth), few)
+        scored_campaign(tmp_path, exported.truth, incomplete)
 
 
 def test_closed_loops_cannot_be_exported(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A replayed case is compared with its stored row."""
+"""Tests of replayed cases against their stored rows."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from marsyard.campaigns.running.replay import replay
 CampaignFile = Callable[..., Path]
 
 
-def test_replay_reports_differing_columns(troubled: Path, tmp_path: Path) -> None:
-    troubled = shutil.copytree(troubled, tmp_path / "copy")
-    frame = pd.read_parquet(troubled / "cases.parquet")
+def test_replay_reports_differing_columns(failing_campaign: Path, tmp_path: Path) -> None:
+    failing_campaign = shutil.copytree(failing_campaign, tmp_path / "copy")
+    frame = pd.read_parquet(failing_campaign / "cases.parquet")
     altitudes = frame["altitude_m"].to_numpy(copy=True)
     altitudes[4] = np.nextafter(altitudes[4], np.inf)
     frame["altitude_m"] = altitudes
-    frame.to_parquet(troubled / "cases.parquet")
-    (troubled / "cases.sqlite").unlink()
-    assert replay(troubled, 4).differing == ("altitude_m",)
+    frame.to_parquet(failing_campaign / "cases.parquet")
+    (failing_campaign / "cases.sqlite").unlink()
+    assert replay(failing_campaign, 4).differing == ("altitude_m",)
     with pytest.raises(CampaignError, match="has no case 12; allowed: 0 to 11"):
-        replay(troubled, 12)
+        replay(failing_campaign, 12)
     with pytest.raises(StoreError, match="does not hold a campaign"):
-        replay(troubled / "cases", 0)
+        replay(failing_campaign / "cases", 0)

@@ -1,4 +1,4 @@
-"""Groups are correlated as stated, their members keep their distributions, and what is no correlation is refused."""
+"""Tests of correlated dispersions: correlations, marginal distributions and rejected matrices."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from marsyard.campaigns.sampling.design import Correlation
 CampaignFile = Callable[..., Path]
 CASES = 4000
 HEAD = 'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\nseed = 5\ncases = {cases}\n'
-#: Standard errors that a right sampler stays within but for one seed in 16,000 for each figure.
-BAND = 4.0
+#: Tolerance in standard errors: a correct sampler exceeds it for one of 16,000 seeds.
+MAX_STANDARD_ERRORS = 4.0
 
 SKEWED = """
 [dispersions]
@@ -41,50 +41,53 @@ parameters = ["wind.east_m_s", "wind.north_m_s"]
 """
 
 
-def campaign(file: CampaignFile, dispersions: str, design: str = "random", cases: int = CASES) -> Campaign:
+def load_correlated(file: CampaignFile, dispersions: str, design: str = "random", cases: int = CASES) -> Campaign:
     text = f'[design]\nkind = "{design}"\n{dispersions}'
     return load_campaign(str(file(head=HEAD.format(cases=cases), dispersions=text)))
 
 
-def table(of: Campaign, cases: int = CASES) -> np.ndarray:
-    return np.array([list(of.draws(case).values()) for case in range(cases)], dtype=np.float64)
+def draw_table(campaign: Campaign, cases: int = CASES) -> np.ndarray:
+    return np.array([list(campaign.draws(case).values()) for case in range(cases)], dtype=np.float64)
 
 
-def rank_error(rank: float, cases: int) -> float:
-    """Standard error of Spearman's coefficient: sqrt((1 + r^2 / 2) (1 - r^2)^2 / (n - 3)) bounds it from above.
+def rank_standard_error(rank: float, cases: int) -> float:
+    """Standard error of Spearman's coefficient: sqrt((1 + r^2 / 2) / (n - 3)) (1 - r^2), an upper bound.
 
-    Fisher's z of Pearson's coefficient has variance 1 / (n - 3) for normal numbers; that of Spearman's is (1 + r^2 / 2)
-    times as large (Bonett & Wright 2000, Psychometrika 65, 23-28), and dr/dz = 1 - r^2.
+    Fisher's z of Pearson's coefficient has variance 1 / (n - 3) for normal numbers. The variance for Spearman's
+    coefficient is (1 + r^2 / 2) times as large (Bonett & Wright 2000, Psychometrika 65, 23-28); dr/dz = 1 - r^2.
     """
     return float(np.sqrt((1.0 + 0.5 * rank**2) / (cases - 3)) * (1.0 - rank**2))
 
 
 @pytest.mark.parametrize(("design", "cases"), [("random", CASES), ("latin-hypercube", CASES), ("sobol", 4096)])
 def test_rank_correlation_holds_for_any_distribution(campaign_file: CampaignFile, design: str, cases: int) -> None:
-    group = campaign(campaign_file, SKEWED, design, cases)
-    drawn = table(group, cases)
-    found = np.atleast_2d(stats.spearmanr(drawn).statistic)
-    stated = group.configuration.correlations[0].rank
-    assert stated is not None
+    group = load_correlated(campaign_file, SKEWED, design, cases)
+    draws = draw_table(group, cases)
+    estimate = np.atleast_2d(stats.spearmanr(draws).statistic)
+    ranks = group.configuration.correlations[0].rank
+    assert ranks is not None
     for row in range(3):
         for column in range(row):
-            rank = stated[row][column]
-            assert abs(found[row, column] - rank) < BAND * rank_error(rank, cases), (row, column)
-    # the one outside of the group is left alone
-    assert np.abs(found[3, :3]).max() < BAND / np.sqrt(cases - 1)
+            rank = ranks[row][column]
+            assert abs(estimate[row, column] - rank) < MAX_STANDARD_ERRORS * rank_standard_error(rank, cases), (
+                row,
+                column,
+            )
+    # the parameter outside the group is uncorrelated
+    assert np.abs(estimate[3, :3]).max() < MAX_STANDARD_ERRORS / np.sqrt(cases - 1)
 
 
 @pytest.mark.parametrize("design", ["random", "latin-hypercube"])
 def test_members_keep_their_distributions(campaign_file: CampaignFile, design: str) -> None:
-    drawn = table(campaign(campaign_file, SKEWED, design))
+    draws = draw_table(load_correlated(campaign_file, SKEWED, design))
     gamma, low, high = stats.gamma(2, scale=3), *stats.norm(2000, 100).cdf([1700, 2100])
-    shapes = [
+    cdfs = [
         lambda x: gamma.cdf(x) / gamma.cdf(40),
         stats.uniform(-10, 20).cdf,
         lambda x: (stats.norm(2000, 100).cdf(x) - low) / (high - low),
     ]
-    for column, shape in enumerate(shapes):
-        assert stats.kstest(drawn[:, column], shape).pvalue > 1e-3
+    for column, cdf in enumerate(cdfs):
+        assert stats.kstest(draws[:, column], cdf).pvalue > 1e-3
 
 
 @pytest.mark.parametrize(
@@ -94,22 +97,24 @@ def test_members_keep_their_distributions(campaign_file: CampaignFile, design: s
         (", sd = 2", ", sd = 3", "correlation = [[1.0, -0.75], [-0.75, 1.0]]"),
     ],
 )
-def test_normal_groups_have_their_covariance(campaign_file: CampaignFile, east: str, north: str, matrix: str) -> None:
-    """The whitened draws are independent standard normal numbers, tested as such: no tolerance of ours is in it."""
-    drawn = table(campaign(campaign_file, NORMAL.format(east=east, north=north, matrix=matrix)))
+def test_normal_groups_have_the_stated_covariance(
+    campaign_file: CampaignFile, east: str, north: str, matrix: str
+) -> None:
+    """Whitened draws are independent standard normal numbers (Kolmogorov-Smirnov tests)."""
+    draws = draw_table(load_correlated(campaign_file, NORMAL.format(east=east, north=north, matrix=matrix)))
     covariance = np.array([[4.0, -4.5], [-4.5, 9.0]])
-    white = np.linalg.solve(np.linalg.cholesky(covariance), (drawn - [1.0, -2.0]).T)
+    white = np.linalg.solve(np.linalg.cholesky(covariance), (draws - [1.0, -2.0]).T)
     for row in (*white, (white[0] + white[1]) / np.sqrt(2), (white[0] - white[1]) / np.sqrt(2)):
         assert stats.kstest(row, stats.norm.cdf).pvalue > 1e-3
     assert stats.kstest((white**2).sum(axis=0), stats.chi2(2).cdf).pvalue > 1e-3
     # Wishart: the variance of an entry s_ij is (c_ij^2 + c_ii c_jj) / (n - 1)
     variances = np.diag(covariance)
     error = np.sqrt((covariance**2 + np.outer(variances, variances)) / (CASES - 1))
-    assert np.all(np.abs(np.cov(drawn.T) - covariance) < BAND * error)
+    assert np.all(np.abs(np.cov(draws.T) - covariance) < MAX_STANDARD_ERRORS * error)
 
 
-def test_the_conversion_of_ranks_is_exact() -> None:
-    """2 sin(pi/6 rho_s) against Spearman's coefficient of a bivariate normal, by integration: 6/pi asin(rho / 2)."""
+def test_conversion_of_rank_correlation_is_exact() -> None:
+    """Compare 2 sin(pi/6 rho_s) with Spearman's coefficient of a bivariate normal by quadrature."""
     group = Correlation(parameters=("a", "b"), rank=((1.0, 0.4), (0.4, 1.0)))
     rho = group.normal_correlation[0, 1]
     nodes, weights = np.polynomial.hermite_e.hermegauss(80)
@@ -119,28 +124,28 @@ def test_the_conversion_of_ranks_is_exact() -> None:
     assert spearman == pytest.approx(0.4, abs=1e-9)
 
 
-def test_a_member_added_at_the_end_changes_none_before_it(campaign_file: CampaignFile) -> None:
-    before = campaign(campaign_file, SKEWED).draws(7)
+def test_added_member_does_not_change_earlier_members(campaign_file: CampaignFile) -> None:
+    before = load_correlated(campaign_file, SKEWED).draws(7)
     longer = SKEWED.replace('"altitude_m"]', '"altitude_m", "heights_m.0"]').replace(
         "rank = [[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]]",
         "rank = [[1.0, 0.6, -0.3, 0.1], [0.6, 1.0, 0.2, 0.1], [-0.3, 0.2, 1.0, 0.1], [0.1, 0.1, 0.1, 1.0]]",
     )
     longer = longer.replace("[dispersions]", '[dispersions]\n"heights_m.0" = {distribution = "uniform", low=0, high=1}')
-    after = campaign(campaign_file, longer).draws(7)
+    after = load_correlated(campaign_file, longer).draws(7)
     assert after.pop("heights_m.0") != before["altitude_m"]
     assert after == before
 
 
-def test_a_member_that_is_set_leaves_its_group(campaign_file: CampaignFile) -> None:
+def test_overridden_member_leaves_its_group(campaign_file: CampaignFile) -> None:
     path = str(campaign_file(dispersions=SKEWED))
     (group,) = load_campaign(path, ["wind.north_m_s=3"]).configuration.correlations
     assert (group.parameters, group.rank) == (("wind.east_m_s", "altitude_m"), ((1.0, -0.3), (-0.3, 1.0)))
-    gone = load_campaign(path, ["wind={}", "altitude_m=1800"])
-    assert gone.configuration.correlations == ()
+    without_group = load_campaign(path, ["wind={}", "altitude_m=1800"])
+    assert without_group.configuration.correlations == ()
 
 
 @pytest.mark.parametrize(
-    ("stated", "message"),
+    ("matrices", "message"),
     [
         ({}, "one of covariance, correlation, rank is needed, got none"),
         ({"rank": [[1, 0], [0, 1]], "correlation": [[1, 0], [0, 1]]}, "got correlation, rank"),
@@ -154,10 +159,10 @@ def test_a_member_that_is_set_leaves_its_group(campaign_file: CampaignFile) -> N
         ({"covariance": [[1, float("nan")], [0, 1]]}, "finite number"),
     ],
 )
-def test_invalid_correlations_are_refused(stated: dict[str, object], message: str) -> None:
-    with pytest.raises(ValidationError) as caught:
-        Correlation.model_validate({"parameters": ["a", "b"], **stated})
-    assert message in str(caught.value)
+def test_invalid_correlations_are_rejected(matrices: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError) as raised:
+        Correlation.model_validate({"parameters": ["a", "b"], **matrices})
+    assert message in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -175,7 +180,7 @@ def test_invalid_correlations_are_refused(stated: dict[str, object], message: st
         ("[correlations]\nx = 1", "correlations: input should be a valid tuple"),
     ],
 )
-def test_impossible_groups_are_refused(campaign_file: CampaignFile, dispersions: str, message: str) -> None:
-    with pytest.raises(ConfigurationError) as caught:
+def test_invalid_groups_are_rejected(campaign_file: CampaignFile, dispersions: str, message: str) -> None:
+    with pytest.raises(ConfigurationError) as raised:
         load_campaign(str(campaign_file(dispersions=dispersions)))
-    assert message in str(caught.value)
+    assert message in str(raised.value)

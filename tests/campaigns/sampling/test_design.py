@@ -1,4 +1,4 @@
-"""Sampling designs: stratification, cases drawn alone, appended blocks and added dispersions."""
+"""Tests of sampling designs: stratification, single cases, appended blocks and added dispersions."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ error_scale = {distribution = "grid", values = [0.5, 2.0]}
 """
 
 
-def load(
+def load_design(
     file: CampaignFile,
     kind: str,
     cases: int,
@@ -55,40 +55,40 @@ def load(
     return load_campaign(str(file(head=head, dispersions=design + dispersions)))
 
 
-def uniform(of: Campaign, cases: range) -> np.ndarray:
-    return np.array([list((of.probabilities(case) or {}).values()) for case in cases])
+def read_probabilities(campaign: Campaign, cases: range) -> np.ndarray:
+    return np.array([list((campaign.probabilities(case) or {}).values()) for case in cases])
 
 
 @given(cases=st.integers(1, 300), seed=st.integers(0, 2**63 - 1))
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_every_stratum_of_a_latin_hypercube_holds_one_case(campaign_file: CampaignFile, cases: int, seed: int) -> None:
+def test_each_latin_hypercube_stratum_has_one_case(campaign_file: CampaignFile, cases: int, seed: int) -> None:
     for dispersions in (DISPERSIONS, DISPERSIONS + GROUP):
-        points = uniform(
-            load(campaign_file, "latin-hypercube", cases, dispersions=dispersions, seed=seed), range(cases)
+        points = read_probabilities(
+            load_design(campaign_file, "latin-hypercube", cases, dispersions=dispersions, seed=seed), range(cases)
         )
         assert points.shape == (cases, 4)
         for column in points.T:
             assert sorted(np.floor(column * cases).astype(int).tolist()) == list(range(cases))
 
 
-def test_strata_reach_the_values(campaign_file: CampaignFile) -> None:
-    campaign = load(campaign_file, "latin-hypercube", 200, dispersions=DISPERSIONS + GROUP)
-    drawn = [campaign.draws(case) for case in range(200)]
-    normal = stats.norm.cdf([one["wind.north_m_s"] for one in drawn])
+def test_drawn_values_are_stratified(campaign_file: CampaignFile) -> None:
+    campaign = load_design(campaign_file, "latin-hypercube", 200, dispersions=DISPERSIONS + GROUP)
+    draws = [campaign.draws(case) for case in range(200)]
+    normal = stats.norm.cdf([draw["wind.north_m_s"] for draw in draws])
     assert sorted(np.floor(200 * normal).astype(int).tolist()) == list(range(200))
-    assert [one["kind"] for one in drawn].count("rough") == 100
+    assert [draw["kind"] for draw in draws].count("rough") == 100
 
 
-def test_columns_of_a_latin_hypercube_are_independent(campaign_file: CampaignFile) -> None:
-    points = uniform(load(campaign_file, "latin-hypercube", 2000), range(2000))
-    found = stats.spearmanr(points).statistic - np.eye(4)
-    # six pairs of random orders: the largest stays below 4.5 standard errors
-    assert np.abs(found).max() < 4.5 / np.sqrt(1999)
+def test_latin_hypercube_columns_are_uncorrelated(campaign_file: CampaignFile) -> None:
+    points = read_probabilities(load_design(campaign_file, "latin-hypercube", 2000), range(2000))
+    difference = stats.spearmanr(points).statistic - np.eye(4)
+    # maximum of six pairs of random orders: below 4.5 standard errors
+    assert np.abs(difference).max() < 4.5 / np.sqrt(1999)
 
 
-def test_a_sobol_design_is_a_net(campaign_file: CampaignFile) -> None:
-    """The first two scrambled dimensions of 2^m points: one in every elementary interval of volume 2^-m (t = 0)."""
-    points = uniform(load(campaign_file, "sobol", 256), range(256))[:, :2]
+def test_sobol_design_is_a_digital_net(campaign_file: CampaignFile) -> None:
+    """The first two dimensions of 2^m points have one point per elementary interval of volume 2^-m (t = 0)."""
+    points = read_probabilities(load_design(campaign_file, "sobol", 256), range(256))[:, :2]
     for rows in range(9):
         boxes = np.floor(points * [2**rows, 2 ** (8 - rows)]).astype(int)
         assert len({tuple(box) for box in boxes.tolist()}) == 256
@@ -96,86 +96,88 @@ def test_a_sobol_design_is_a_net(campaign_file: CampaignFile) -> None:
     assert points.max() < 1.0
 
 
-def test_a_sobol_design_is_evener_than_random_draws(campaign_file: CampaignFile) -> None:
-    sobol = uniform(load(campaign_file, "sobol", 512), range(512))
-    random = uniform(load(campaign_file, "random", 512), range(512))
+def test_sobol_discrepancy_is_below_random_draws(campaign_file: CampaignFile) -> None:
+    sobol = read_probabilities(load_design(campaign_file, "sobol", 512), range(512))
+    random = read_probabilities(load_design(campaign_file, "random", 512), range(512))
     assert qmc.discrepancy(sobol) < 0.1 * qmc.discrepancy(random)
 
 
 @pytest.mark.parametrize("kind", ["random", "latin-hypercube", "sobol"])
 @pytest.mark.parametrize("nominal", [False, True])
-def test_any_case_is_drawn_alone(campaign_file: CampaignFile, kind: str, nominal: bool) -> None:
+def test_single_case_equals_case_of_full_design(campaign_file: CampaignFile, kind: str, nominal: bool) -> None:
     cases = 6 * 16 + nominal
-    of: dict[str, Any] = {"dispersions": DISPERSIONS + GRID + GROUP, "nominal": nominal}
-    forward = load(campaign_file, kind, cases, **of)
-    drawn = [forward.draws(case) for case in range(cases)]
+    design: dict[str, Any] = {"dispersions": DISPERSIONS + GRID + GROUP, "nominal": nominal}
+    forward = load_design(campaign_file, kind, cases, **design)
+    draws = [forward.draws(case) for case in range(cases)]
     for case in (cases - 1, 17, 3, 0):
         build_stratified_design.cache_clear()
-        assert load(campaign_file, kind, cases, **of).draws(case) == drawn[case]
-    assert len({str(one) for one in drawn}) == cases
+        assert load_design(campaign_file, kind, cases, **design).draws(case) == draws[case]
+    assert len({str(draw) for draw in draws}) == cases
 
 
 @pytest.mark.parametrize("kind", ["random", "latin-hypercube", "sobol"])
 @given(name=st.sampled_from(["wind.east_m_s", "heights_m.0", "lowest_altitude_m"]), case=st.integers(0, 63))
 @settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_an_added_dispersion_changes_no_other_draw(
+def test_added_dispersion_does_not_change_other_draws(
     campaign_file: CampaignFile, kind: str, name: str, case: int
 ) -> None:
-    """Wherever it stands in the file; of a Sobol design's dimensions only if it stands behind the others."""
+    """The position in the file is arbitrary; in a Sobol design the new dispersion must be the last."""
     others = DISPERSIONS.replace('"wind.east_m_s" = {distribution = "uniform", low = 0, high = 1}', "")
-    one = f'"{name}" = {{distribution = "uniform", low = 0, high = 1}}\n'
-    without = load(campaign_file, kind, 64, dispersions=others).draws(case)
+    entry = f'"{name}" = {{distribution = "uniform", low = 0, high = 1}}\n'
+    without = load_design(campaign_file, kind, 64, dispersions=others).draws(case)
     texts = (
-        [others + one] if kind == "sobol" else [others + one, others.replace("[dispersions]", f"[dispersions]\n{one}")]
+        [others + entry]
+        if kind == "sobol"
+        else [others + entry, others.replace("[dispersions]", f"[dispersions]\n{entry}")]
     )
     for text in texts:
-        drawn = load(campaign_file, kind, 64, dispersions=text).draws(case)
-        assert 0.0 < drawn.pop(name) < 1.0
-        assert drawn == without
+        draw = load_design(campaign_file, kind, 64, dispersions=text).draws(case)
+        assert 0.0 < draw.pop(name) < 1.0
+        assert draw == without
 
 
 @pytest.mark.parametrize("kind", ["random", "latin-hypercube", "sobol"])
-def test_an_appended_block_keeps_the_earlier_cases(campaign_file: CampaignFile, kind: str) -> None:
-    before = load(campaign_file, kind, 33, nominal=True)
-    after = load(campaign_file, kind, 33, nominal=True, more="appended = [16, 8]")
+def test_appended_block_keeps_earlier_cases(campaign_file: CampaignFile, kind: str) -> None:
+    before = load_design(campaign_file, kind, 33, nominal=True)
+    after = load_design(campaign_file, kind, 33, nominal=True, more="appended = [16, 8]")
     assert after.configuration.total_cases == 57
     assert [after.draws(case) for case in range(33)] == [before.draws(case) for case in range(33)]
-    points = uniform(after, range(1, 57))
+    points = read_probabilities(after, range(1, 57))
     assert len(np.unique(points[:, 0])) == 56
     if kind != "random":
         for block in (points[:32], points[32:48], points[48:]):
             assert sorted(np.floor(block[:, 0] * len(block)).astype(int).tolist()) == list(range(len(block)))
 
 
-def test_the_size_is_part_of_what_a_latin_hypercube_is(campaign_file: CampaignFile) -> None:
-    small, large = (load(campaign_file, "latin-hypercube", cases) for cases in (10, 11))
+def test_latin_hypercube_depends_on_the_number_of_cases(campaign_file: CampaignFile) -> None:
+    small, large = (load_design(campaign_file, "latin-hypercube", cases) for cases in (10, 11))
     assert small.draws(3) != large.draws(3)
-    assert load(campaign_file, "random", 10).draws(3) == load(campaign_file, "random", 11).draws(3)
+    assert load_design(campaign_file, "random", 10).draws(3) == load_design(campaign_file, "random", 11).draws(3)
 
 
-def test_a_grid_is_a_full_factorial_under_any_design(campaign_file: CampaignFile) -> None:
+def test_grid_is_a_full_factorial_in_all_designs(campaign_file: CampaignFile) -> None:
     for kind in ("random", "latin-hypercube", "sobol"):
-        campaign = load(campaign_file, kind, 48, dispersions=DISPERSIONS + GRID)
-        drawn = [campaign.draws(case) for case in range(48)]
-        points = [(one["terrain"], one["error_scale"]) for one in drawn]
+        campaign = load_design(campaign_file, kind, 48, dispersions=DISPERSIONS + GRID)
+        draws = [campaign.draws(case) for case in range(48)]
+        points = [(draw["terrain"], draw["error_scale"]) for draw in draws]
         assert points[:6] == [(0.0, 0.5), (0.0, 2.0), (3.0, 0.5), (3.0, 2.0), (6.0, 0.5), (6.0, 2.0)]
         assert points == points[:6] * 8
-        if kind != "random":  # each point of the grid has a design of its own
-            rows = uniform(campaign, range(48))[:, 0].reshape(8, 6)
+        if kind != "random":  # each grid point has its own design
+            rows = read_probabilities(campaign, range(48))[:, 0].reshape(8, 6)
             assert np.all(np.sort(np.floor(8 * rows), axis=0) == np.arange(8)[:, None])
             assert len(np.unique(rows)) == 48
 
 
-def test_the_nominal_case_draws_nothing(campaign_file: CampaignFile) -> None:
+def test_nominal_case_uses_no_draws(campaign_file: CampaignFile) -> None:
     derived = 'altitude_m = {distribution = "derived", formula = "1000 + 100 * heights_m[1]"}\n'
     fixed = 'lowest_altitude_m = {distribution = "fixed", value = 7.0}\n'
     text = DISPERSIONS + GRID + derived + fixed
-    campaign = load(campaign_file, "random", 7, dispersions=text, nominal=True)
+    campaign = load_design(campaign_file, "random", 7, dispersions=text, nominal=True)
     assert campaign.probabilities(0) is None
     nominal = campaign.parameters(0).model_dump()
     assert nominal["wind"] == {"east_m_s": 0.0, "north_m_s": 0.0}
     assert (nominal["altitude_m"], nominal["lowest_altitude_m"], nominal["terrain"]) == (1200.0, 7.0, 0)
-    # the drawn cases are what they are without it, but for their numbers
+    # the other cases are drawn as without a nominal case
     assert campaign.draws(1)["altitude_m"] == 1000.0 + 100.0 * campaign.draws(1)["heights_m.1"]
 
 
@@ -192,9 +194,9 @@ def test_the_nominal_case_draws_nothing(campaign_file: CampaignFile) -> None:
         ("halton", 8, {}, "design.kind: input should be 'random', 'latin-hypercube' or 'sobol', got 'halton'"),
     ],
 )
-def test_impossible_designs_are_refused(
+def test_invalid_designs_are_rejected(
     campaign_file: CampaignFile, kind: str, cases: int, more: dict[str, object], message: str
 ) -> None:
-    with pytest.raises(ConfigurationError) as caught:
-        load(campaign_file, kind, cases, **more)  # type: ignore[arg-type]
-    assert message in str(caught.value)
+    with pytest.raises(ConfigurationError) as raised:
+        load_design(campaign_file, kind, cases, **more)  # type: ignore[arg-type]
+    assert message in str(raised.value)

@@ -1,4 +1,4 @@
-"""Formulas are arithmetic over parameters: right where they are that, refused in one sentence where they are not."""
+"""Tests of formulas: arithmetic over parameters; other syntax is rejected."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marsyard.campaigns.sampling.formulas import MAX_LENGTH, formula
+from marsyard.campaigns.sampling.dispersion import MAX_LENGTH, formula
 
 VALUES = {"altitude_m": 2000.0, "wind.east_m_s": -3.0, "heights_m.1": 4, "on": True, "site": "gusev"}
 
@@ -27,11 +27,11 @@ VALUES = {"altitude_m": 2000.0, "wind.east_m_s": -3.0, "heights_m.1": 4, "on": T
         ("1e3", 1000.0),
     ],
 )
-def test_values(text: str, value: float) -> None:
+def test_formulas_have_the_expected_value(text: str, value: float) -> None:
     assert formula(text).value(VALUES) == pytest.approx(value, rel=1e-15)
 
 
-def test_names_are_paths() -> None:
+def test_formula_names_are_parameter_paths() -> None:
     assert formula("a.b_m * heights_m[1] + a.b_m + pi").names == ("a.b_m", "heights_m.1")
 
 
@@ -73,7 +73,7 @@ def test_names_are_paths() -> None:
         "[" * 200 + "1" + "]" * 200,
     ],
 )
-def test_other_syntax_than_arithmetic_is_refused(text: str) -> None:
+def test_other_syntax_than_arithmetic_is_rejected(text: str) -> None:
     with pytest.raises(ValueError, match=r"is neither a number nor a formula|has at most"):
         formula(text)
 
@@ -90,16 +90,16 @@ def test_other_syntax_than_arithmetic_is_refused(text: str) -> None:
         ("on + 1", "uses on, which is True and not a number"),
     ],
 )
-def test_formulas_without_a_value_report_their_numbers(text: str, message: str) -> None:
+def test_formulas_without_a_value_are_reported(text: str, message: str) -> None:
     with pytest.raises(ValueError, match=re.escape(message)):
         formula(text).value(VALUES)
 
 
 @given(text=st.text(max_size=40) | st.text("ab.[]()+-*/0123456789e ,", max_size=40))
-def test_any_text_is_parsed_or_refused(text: str) -> None:
+def test_random_text_is_parsed_or_rejected(text: str) -> None:
     try:
-        read = formula(text)
-        value = read.value(dict.fromkeys(read.names, 1.5))
+        parsed = formula(text)
+        value = parsed.value(dict.fromkeys(parsed.names, 1.5))
     except ValueError:
         return
     assert math.isfinite(value)
@@ -110,9 +110,9 @@ def test_any_text_is_parsed_or_refused(text: str) -> None:
     lambda inner: st.builds("({} {} {})".format, inner, st.sampled_from("+-*"), inner) | inner.map("(-{})".format),
     max_leaves=8,
 ))  # fmt: skip
-def test_formulas_evaluate_as_in_python(text: str) -> None:
+def test_formulas_evaluate_like_python(text: str) -> None:
     if len(text) > MAX_LENGTH:
         return
-    there = type("Table", (), {"b": -0.75})
-    expected = eval(text, {"a": 2.5, "t": there})  # noqa: S307
+    table = type("Table", (), {"b": -0.75})
+    expected = eval(text, {"a": 2.5, "t": table})  # noqa: S307
     assert formula(text).value({"a": 2.5, "t.b": -0.75}) == expected

@@ -1,4 +1,4 @@
-"""Products are kept of the configured cases and of the showcase."""
+"""Tests of the products that are kept: the configured cases and the showcase."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.store.products import fails, load_products
 from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import find_showcase, find_worst_cases, write_table
-from tests.campaigns.fake_campaign import Silence, rows_of, run
+from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run
 
 CampaignFile = Callable[..., Path]
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
 
-def test_the_worst_answered_case_is_the_showcase(troubled: Path) -> None:
-    rows = rows_of(troubled)
+def test_worst_answered_case_is_the_showcase(failing_campaign: Path) -> None:
+    rows = read_case_rows(failing_campaign)
     worst = max((row for row in rows if row["answered"]), key=lambda row: row["velocity_error_m_s"])["case"]
-    assert record.read(troubled)["showcase"] == worst
-    kept = troubled / "cases" / str(worst)
-    assert differing_columns(json.loads((kept / "row.json").read_text()), rows[worst]) == ()
-    products = load_products(kept)
+    assert record.read(failing_campaign)["showcase"] == worst
+    folder = failing_campaign / "cases" / str(worst)
+    assert differing_columns(json.loads((folder / "row.json").read_text()), rows[worst]) == ()
+    products = load_products(folder)
     assert products["picture"].dtype == np.uint16
     assert products["picture"].tolist() == [[0, 1, 2], [3, 4, 5]]
     assert np.array_equal(products["nested"][0]["x"], np.eye(2))
     assert products["title"] == "a"
 
 
-def test_showcase_case(campaign_file: CampaignFile, tmp_path: Path) -> None:
+def test_showcase_follows_the_configuration(campaign_file: CampaignFile, tmp_path: Path) -> None:
     rows: list[dict[str, Any]] = [
         {"case": 0, "outcome": "CRASHED", "answered": False},
         {"case": 1, "outcome": "SILENT", "answered": False, "velocity_error_m_s": math.nan},
@@ -53,29 +53,35 @@ def test_showcase_case(campaign_file: CampaignFile, tmp_path: Path) -> None:
         worst = load_campaign(str(campaign_file()), ["retain.worst=9"]).configuration
         first = load_campaign(str(campaign_file()), ["retain.showcase=first"]).configuration
         none = load_campaign(str(campaign_file()), ["retain.showcase=none"]).configuration
-        unasked = load_campaign(str(campaign_file(requirement=""))).configuration
+        no_requirement = load_campaign(str(campaign_file(requirement=""))).configuration
         assert find_showcase(worst, table, store) is None
         store.add(rows[1:2])
         write_table(table, store)
         assert find_showcase(worst, table, store) == 1
         store.add(rows[2:])
         write_table(table, store)
-        assert [find_showcase(asked, table, store) for asked in (worst, first, none, unasked)] == [3, 1, None, 1]
-    assert [find_worst_cases(asked, table, asked.retain.worst) for asked in (worst, unasked)] == [[3, 2], []]
-    # a requirement on a sum of columns, which are times, makes no case the worst
-    summed = 'id = "T"\nmetric = "a_time_s + b_time_s"\nbound = 2.0\nprobability = 0.9\nconfidence = 0.9\n'
-    times = load_campaign(str(campaign_file(requirement=f"[[requirements]]\n{summed}"))).configuration
+        assert [
+            find_showcase(configuration, table, store) for configuration in (worst, first, none, no_requirement)
+        ] == [3, 1, None, 1]
+    assert [
+        find_worst_cases(configuration, table, configuration.retain.worst) for configuration in (worst, no_requirement)
+    ] == [[3, 2], []]
+    # a requirement on a sum of times selects no worst case
+    requirement = 'id = "T"\nmetric = "a_time_s + b_time_s"\nbound = 2.0\nprobability = 0.9\nconfidence = 0.9\n'
+    times = load_campaign(str(campaign_file(requirement=f"[[requirements]]\n{requirement}"))).configuration
     assert find_worst_cases(times, table, 2) == []
 
 
-def test_products_that_cannot_be_kept_stop_nothing(campaign_file: CampaignFile, tmp_path: Path, watch: Silence) -> None:
+def test_unsupported_products_do_not_stop_the_campaign(
+    campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
+) -> None:
     directory = run(campaign_file(), tmp_path / "run", watch, "products=bad", "cases=2", jobs=1)
     assert record.read(directory)["state"] == "finished"
     assert "products.thing is a object; allowed" in watch.notes[0]
 
 
 @pytest.mark.parametrize(
-    ("kept", "cases"),
+    ("overrides", "cases"),
     [
         (["retain.products=all"], [0, 1, 3, 4, 5]),
         (["retain.products=every", "retain.every=3"], [0, 3]),
@@ -85,28 +91,28 @@ def test_products_that_cannot_be_kept_stop_nothing(campaign_file: CampaignFile, 
     ],
 )
 def test_products_are_kept_as_configured(
-    campaign_file: CampaignFile, tmp_path: Path, watch: Silence, kept: list[str], cases: list[int] | None
+    campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch, overrides: list[str], cases: list[int] | None
 ) -> None:
     path = campaign_file("silent_cases = [1]\nraising_cases = [2]")
-    directory = run(path, tmp_path / "run", watch, "cases=6", "retain.showcase=none", *kept, jobs=1)
-    rows = rows_of(directory)
+    directory = run(path, tmp_path / "run", watch, "cases=6", "retain.showcase=none", *overrides, jobs=1)
+    rows = read_case_rows(directory)
     if cases is None:
         answered = [row for row in rows if row["answered"]]
         cases = sorted(row["case"] for row in sorted(answered, key=lambda row: -row["velocity_error_m_s"])[:2])
-    found = sorted(int(path.name) for path in (directory / "cases").iterdir())
-    assert found == cases
-    for case in found:
+    stored_cases = sorted(int(path.name) for path in (directory / "cases").iterdir())
+    assert stored_cases == cases
+    for case in stored_cases:
         assert load_products(directory / "cases" / str(case))["title"] == "a"
-        kept_row = json.loads((directory / "cases" / str(case) / "row.json").read_text())
-        assert differing_columns(kept_row, rows[case]) == ()
+        stored_row = json.loads((directory / "cases" / str(case) / "row.json").read_text())
+        assert differing_columns(stored_row, rows[case]) == ()
     assert [note for note in watch.notes if "budget" in note] == (
         ["the budget for kept products (retain.budget_gb) is used up: none is kept from case 1 on"]
-        if "retain.budget_gb=1e-6" in kept
+        if "retain.budget_gb=1e-6" in overrides
         else []
     )
 
 
-def test_a_failing_case_is_found_by_sums_and_scales_of_columns() -> None:
+def test_failure_is_decided_by_scaled_sums_of_columns() -> None:
     time = Requirement(
         id="TIME",
         statement="A picture and a map take at most 2 s on the flight processor.",

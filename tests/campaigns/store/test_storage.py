@@ -1,4 +1,4 @@
-"""Rows and products are read as they were written."""
+"""Tests of the stores of rows, tables, records and products."""
 
 from __future__ import annotations
 
@@ -24,78 +24,78 @@ from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import read_rows, write_table
 
 
-def full(row: dict[str, Any]) -> dict[str, Any]:
-    """A row with what every row has."""
+def complete_row(row: dict[str, Any]) -> dict[str, Any]:
+    """Add the columns that every row needs."""
     return {"outcome": "VALID", "answered": True, **row}
 
 
 @contextmanager
-def store_with(folder: Path, rows: Iterable[dict[str, Any]]) -> Iterator[RowStore]:
+def open_store(folder: Path, rows: Iterable[dict[str, Any]]) -> Iterator[RowStore]:
     create_store(folder / "cases.sqlite", {"identity": "abc"})
     with RowStore(folder / "cases.sqlite", thorough=True) as store:
-        store.add(map(full, rows))
+        store.add(map(complete_row, rows))
         yield store
 
 
-def test_rows_come_back_in_the_order_of_their_cases(tmp_path: Path) -> None:
+def test_rows_are_read_in_case_order(tmp_path: Path) -> None:
     rows: list[dict[str, Any]] = [
         {"case": 2, "x": math.nan, "big": 2**62},
         {"case": 0, "x": math.inf, "text": "ä\0\n"},
         {"case": 1, "x": 0.1 + 0.2, "flag": True},
     ]
-    with store_with(tmp_path, rows) as store:
+    with open_store(tmp_path, rows) as store:
         stored = [store.row(case) or {} for case in range(3)]
         assert store.about == {"identity": "abc"}
-        assert (store.count(), store.with_outcomes(["VALID"]), store.unfinished()) == (3, [0, 1, 2], 0)
-        assert store.row(1) == full(rows[2])
+        assert (store.count(), store.with_outcomes(["VALID"]), store.count_unfinished()) == (3, [0, 1, 2], 0)
+        assert store.row(1) == complete_row(rows[2])
         assert store.row(7) is None
     assert [row["case"] for row in stored] == [0, 1, 2]
-    assert stored[1] == full(rows[2])
+    assert stored[1] == complete_row(rows[2])
     assert math.isnan(float(stored[2]["x"]))
     assert stored[0]["text"] == "ä\0\n"
 
 
-def test_missing_and_replaced_rows(tmp_path: Path) -> None:
-    with store_with(tmp_path, [{"case": 1, "outcome": "CRASHED"}, {"case": 2}, {"case": 5}]) as store:
+def test_missing_rows_are_listed_and_rows_replaced(tmp_path: Path) -> None:
+    with open_store(tmp_path, [{"case": 1, "outcome": "CRASHED"}, {"case": 2}, {"case": 5}]) as store:
         assert store.missing(9) == [range(1), range(3, 5), range(6, 9)]
         assert store.missing(6) == [range(1), range(3, 5)]
         assert store.with_outcomes(["CRASHED", "TIMED_OUT"]) == [1]
-        assert (store.with_outcomes([]), store.unfinished()) == ([], 1)
-        store.add([full({"case": 1, "x": 3.0})])
-        assert store.row(1) == full({"case": 1, "x": 3.0})
+        assert (store.with_outcomes([]), store.count_unfinished()) == ([], 1)
+        store.add([complete_row({"case": 1, "x": 3.0})])
+        assert store.row(1) == complete_row({"case": 1, "x": 3.0})
         assert store.with_outcomes(["VALID"]) == [1, 2, 5]
 
 
-def test_a_transaction_is_whole_or_not_at_all(tmp_path: Path) -> None:
-    with store_with(tmp_path, [{"case": 0}]) as store, pytest.raises(KeyError):
-        store.add([full({"case": 1}), {"case": 2}])
+def test_failed_transaction_stores_no_row(tmp_path: Path) -> None:
+    with open_store(tmp_path, [{"case": 0}]) as store, pytest.raises(KeyError):
+        store.add([complete_row({"case": 1}), {"case": 2}])
     with RowStore(tmp_path / "cases.sqlite") as store:
         assert store.count() == 1
 
 
-def test_rows_survive_a_program_that_never_closes(tmp_path: Path) -> None:
+def test_rows_are_kept_without_closing_the_store(tmp_path: Path) -> None:
     (tmp_path / "copy").mkdir()
-    with store_with(tmp_path, [{"case": 0}]):
+    with open_store(tmp_path, [{"case": 0}]):
         for name in ("cases.sqlite", "cases.sqlite-wal"):
             (tmp_path / "copy" / name).write_bytes((tmp_path / name).read_bytes())
     with RowStore(tmp_path / "copy" / "cases.sqlite", thorough=True) as store:
         assert store.count() == 1
 
 
-def test_a_full_disk_is_reported_and_loses_nothing(tmp_path: Path) -> None:
-    with store_with(tmp_path, [{"case": 0}]) as store:
+def test_full_disk_is_reported_without_loss_of_rows(tmp_path: Path) -> None:
+    with open_store(tmp_path, [{"case": 0}]) as store:
         store._connection.execute("PRAGMA max_page_count = 12")
         with pytest.raises(StoreError, match="the disk is full; the rows before that are safe"):
-            store.add(full({"case": case, "text": "x" * 1000}) for case in range(1, 100))
+            store.add(complete_row({"case": case, "text": "x" * 1000}) for case in range(1, 100))
         assert store.count() == 1
 
 
-def _cut(path: Path, pages: float) -> None:
+def _truncate(path: Path, pages: float) -> None:
     with path.open("r+b") as file:
         file.truncate(int(pages * 4096))
 
 
-def _scribble(path: Path) -> None:
+def _overwrite_pages(path: Path) -> None:
     with path.open("r+b") as file:
         file.seek(5 * 4096)
         file.write(b"\xa5" * 8192)
@@ -104,17 +104,17 @@ def _scribble(path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda path: _cut(path, 0), "does not say that it is one"),
-        (lambda path: _cut(path, 0.5), "damaged"),
-        (lambda path: _cut(path, 7.5), "damaged"),
-        (_scribble, "damaged"),
+        (lambda path: _truncate(path, 0), "does not say that it is one"),
+        (lambda path: _truncate(path, 0.5), "damaged"),
+        (lambda path: _truncate(path, 7.5), "damaged"),
+        (_overwrite_pages, "damaged"),
         (lambda path: path.write_text("no database at all, but some text that is longer than a header" * 9), "damaged"),
         (lambda path: path.unlink(), "no such file"),
     ],
 )
-def test_a_damaged_store_is_refused_and_unchanged(tmp_path: Path, damage: Callable[[Path], None], message: str) -> None:
+def test_damaged_store_is_rejected_and_unchanged(tmp_path: Path, damage: Callable[[Path], None], message: str) -> None:
     path = tmp_path / "cases.sqlite"
-    with store_with(tmp_path, ({"case": case, "text": "x" * 100} for case in range(300))):
+    with open_store(tmp_path, ({"case": case, "text": "x" * 100} for case in range(300))):
         pass
     damage(path)
     before = path.read_bytes() if path.exists() else None
@@ -123,8 +123,8 @@ def test_a_damaged_store_is_refused_and_unchanged(tmp_path: Path, damage: Callab
     assert (path.read_bytes() if path.exists() else None) == before
 
 
-def test_a_store_of_another_version_is_refused(tmp_path: Path) -> None:
-    with store_with(tmp_path, []):
+def test_store_of_another_version_is_rejected(tmp_path: Path) -> None:
+    with open_store(tmp_path, []):
         pass
     connection = sqlite3.connect(tmp_path / "cases.sqlite")
     connection.execute("PRAGMA user_version = 99")
@@ -133,50 +133,50 @@ def test_a_store_of_another_version_is_refused(tmp_path: Path) -> None:
         RowStore(tmp_path / "cases.sqlite")
 
 
-def table_of(folder: Path, rows: Iterable[dict[str, Any]], measures: tuple[str, ...] = ()) -> Path:
-    with store_with(folder, rows) as store:
+def write_rows_table(folder: Path, rows: Iterable[dict[str, Any]], measures: tuple[str, ...] = ()) -> Path:
+    with open_store(folder, rows) as store:
         write_table(folder / "t.parquet", store, measures)
     return folder / "t.parquet"
 
 
-def test_columns_take_the_narrowest_type(tmp_path: Path) -> None:
+def test_columns_have_the_narrowest_type(tmp_path: Path) -> None:
     rows: list[dict[str, Any]] = [
         {"case": 1, "mixed": 2.5, "whole": 2, "odd": "x", "huge": 1, "late": "y"},
         {"case": 0, "mixed": 1, "whole": 1, "odd": 1, "huge": 10**30, "lacking": 1.0},
     ]
-    path = table_of(tmp_path, rows, ("absent",))
+    path = write_rows_table(tmp_path, rows, ("absent",))
     first, second = read_rows(path)
     assert (first["mixed"], type(first["whole"]), first["odd"], first["huge"]) == (1.0, int, "1", 1e30)
     assert math.isnan(second["lacking"])
     assert math.isnan(first["absent"])
     assert ("late" in first, second["late"]) == (False, "y")
     assert not list(tmp_path.glob("*.partial"))
-    # Columns stand as in the first case that has them, whichever was stored first.
-    own = ["mixed", "whole", "odd", "huge", "lacking", "late", "absent"]
-    names = ["case", "outcome", "answered", *own, "wall_time_s", "cpu_time_s", "error", "traceback"]
+    # the order of columns follows the case numbers, not the order of storage
+    row_columns = ["mixed", "whole", "odd", "huge", "lacking", "late", "absent"]
+    names = ["case", "outcome", "answered", *row_columns, "wall_time_s", "cpu_time_s", "error", "traceback"]
     assert pq.read_schema(path).names == names
     assert str(read_rows(path, 1)) == str([second])
 
 
-def test_tables_are_made_group_by_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tables_are_written_in_row_groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("marsyard.campaigns.store.table._GROUP", 7)
     rows = [{"case": case, "x": case / 3, **({"y": case} if case % 5 else {"z": True})} for case in range(50)]
-    path = table_of(tmp_path, rows)
+    path = write_rows_table(tmp_path, rows)
     assert pq.ParquetFile(path).num_row_groups == 8
     for row, stored in zip(rows, read_rows(path), strict=True):
         numbers = {name: value for name, value in stored.items() if value == value and name in ("case", "x", "y", "z")}
         assert numbers == row
 
 
-def test_an_empty_table_is_one(tmp_path: Path) -> None:
-    path = table_of(tmp_path, [])
+def test_empty_table_is_read_and_text_is_rejected(tmp_path: Path) -> None:
+    path = write_rows_table(tmp_path, [])
     assert read_rows(path) == []
     path.write_text("not a table")
     with pytest.raises(StoreError, match="not a table of cases"):
         read_rows(path)
 
 
-def test_a_folder_is_held_by_one(tmp_path: Path) -> None:
+def test_folder_lock_is_exclusive(tmp_path: Path) -> None:
     assert not is_locked(tmp_path)
     with folder_lock(tmp_path):
         assert is_locked(tmp_path)
@@ -190,7 +190,7 @@ def test_a_folder_is_held_by_one(tmp_path: Path) -> None:
         pass
 
 
-def test_records_that_are_not_ours_are_refused(tmp_path: Path) -> None:
+def test_invalid_records_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="no such folder"):
         record.read(tmp_path / "nothing")
     with pytest.raises(StoreError, match=r"it has no campaign\.json"):
@@ -216,25 +216,25 @@ _products = st.dictionaries(
 )
 
 
-def _same(value: Any, other: Any) -> bool:
+def _is_equal(value: Any, other: Any) -> bool:
     if isinstance(value, np.ndarray):
         return value.dtype == other.dtype and np.array_equal(value, other)
     if isinstance(value, dict):
-        return value.keys() == other.keys() and all(_same(value[key], other[key]) for key in value)
+        return value.keys() == other.keys() and all(_is_equal(value[key], other[key]) for key in value)
     if isinstance(value, list):
-        return len(value) == len(other) and all(map(_same, value, other))
+        return len(value) == len(other) and all(map(_is_equal, value, other))
     return type(value) is type(other) and value == other
 
 
 @given(products=_products)
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_products_come_back_as_they_were(tmp_path: Path, products: dict[str, Any]) -> None:
+def test_products_are_read_as_written(tmp_path: Path, products: dict[str, Any]) -> None:
     save_packed(tmp_path, pack_products(products), {})
-    assert _same(products, load_products(tmp_path))
+    assert _is_equal(products, load_products(tmp_path))
 
 
 @pytest.mark.parametrize("value", [object(), np.array([object()]), {1, 2}])
-def test_products_of_other_kinds_are_named(tmp_path: Path, value: object) -> None:
+def test_unsupported_products_are_rejected(tmp_path: Path, value: object) -> None:
     with pytest.raises(TypeError, match=r"products\.a\.0 is a"):
         pack_products({"a": [value]})
     with pytest.raises(StoreError, match="holds no products"):

@@ -1,7 +1,10 @@
+"""Tests of the dashboard: entries, pages, links, escaping of texts and sparklines."""
+
 from __future__ import annotations
 
 import csv
 import io
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -14,10 +17,10 @@ from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.reports.dashboard.entries import (
     ShownRequirement,
     find_campaigns,
+    make_slug,
     margin_text,
     read_entries,
     requirement_rows,
-    slug_of,
     sparkline,
 )
 from marsyard.reports.dashboard.site import write_site
@@ -25,41 +28,41 @@ from marsyard.reports.sections import script_hash
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
-BARE = ["case", "outcome", "answered", "velocity_error_m_s"]
+MIN_COLUMNS = ["case", "outcome", "answered", "velocity_error_m_s"]
 HOSTILE = "<script>alert('x')</script><img src=x onerror=alert(1)>\"'../../{{ 7*7 }}"
 
 
-def _site(tmp_path: Path) -> str:
+def _write_index(tmp_path: Path) -> str:
     write_site(tmp_path / "site", [tmp_path])
     return (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
 
 
-def test_every_requirement_has_a_row_and_every_campaign(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
+def test_index_lists_all_requirements_and_campaigns(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
     for day in (1, 2, 3):
-        make_run(make_rows(24, seed=day)[BARE], name=f"run-{day}", started_utc=f"2026-01-0{day}T00:00:00Z")
-    text = _site(tmp_path)
+        make_run(make_rows(24, seed=day)[MIN_COLUMNS], name=f"run-{day}", started_utc=f"2026-01-0{day}T00:00:00Z")
+    text = _write_index(tmp_path)
     for name in shipped_requirements():
         assert f'data-requirement="{name}"' in text
-    # One is shown by campaigns, all others by none.
+    # only DIMES-VEL has stored campaigns
     assert text.count("No stored campaign shows it.") == len(shipped_requirements()) - 1
     assert len(re.findall(r'<tr id="dimes-synthetic-', text)) == 3
     assert '<svg class="spark"' in text
     assert "3 stored campaigns" in text
-    counted = re.search(r'<ul class="coverage".*?</ul>', text, re.DOTALL)
-    assert counted is not None
-    reported = " ".join(re.sub(r"<[^>]+>", " ", counted[0]).split())
-    assert reported == f"INSUFFICIENT 1 NO CAMPAIGN {len(shipped_requirements()) - 1}"
+    coverage = re.search(r'<ul class="coverage".*?</ul>', text, re.DOTALL)
+    assert coverage is not None
+    coverage_text = " ".join(re.sub(r"<[^>]+>", " ", coverage[0]).split())
+    assert coverage_text == f"INSUFFICIENT 1 NO CAMPAIGN {len(shipped_requirements()) - 1}"
     matrix = list(csv.DictReader(io.StringIO((tmp_path / "site" / "verification.csv").read_text())))
     verdicts = {row["requirement"]: row["verdict"] for row in matrix}
     assert (verdicts["DIMES-VEL"], verdicts["HDA-TIME"]) == ("INSUFFICIENT", "NO CAMPAIGN")
 
 
-def test_what_came_to_its_end_stands_before_what_did_not(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
+def test_finished_campaigns_precede_interrupted_ones(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
     paths = []
     for day, (name, state) in enumerate([("a", "finished"), ("b", "finished"), ("c", "interrupted")], start=1):
-        message = {"started_utc": f"2026-01-0{day}T00:00:00Z", "state": state}
-        frame = make_rows(24, seed=day)[BARE].assign(site=["east", "west"] * 12, algorithm="mine")
-        record = make_run(frame, **message) / "campaign.json"
+        record_changes = {"started_utc": f"2026-01-0{day}T00:00:00Z", "state": state}
+        frame = make_rows(24, seed=day)[MIN_COLUMNS].assign(site=["east", "west"] * 12, algorithm="mine")
+        record = make_run(frame, **record_changes) / "campaign.json"
         paths.append(record.parent.rename(tmp_path / name))
         text = (tmp_path / name / "campaign.json").read_text()
         (tmp_path / name / "campaign.json").write_text(text.replace("dimes-synthetic", f"dimes-{name}"))
@@ -71,11 +74,11 @@ def test_what_came_to_its_end_stands_before_what_did_not(make_rows: Rows, make_r
     assert [cell.entry.name for cell in row.cells] == ["dimes-b", "dimes-a", "dimes-c"]
 
 
-def test_links_lead_to_files_of_the_site(
+def test_links_have_targets_in_the_site(
     make_rows: Rows, make_run: MakeRun, tmp_path: Path, dimes_products: dict[str, Any]
 ) -> None:
-    make_run(make_rows(24)[BARE], products=dimes_products)
-    _site(tmp_path)
+    make_run(make_rows(24)[MIN_COLUMNS], products=dimes_products)
+    _write_index(tmp_path)
     site = tmp_path / "site"
     pages = list(site.rglob("index.html")) + list(site.rglob("case-*.html"))
     assert any(page.name == "case-3.html" for page in pages)
@@ -87,53 +90,51 @@ def test_links_lead_to_files_of_the_site(
     assert (next(site.glob("c/*")) / "report.html").is_file()
 
 
-def test_scripts_are_those_that_the_policy_names(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
-    make_run(make_rows(6)[BARE])
-    text = _site(tmp_path)
+def test_security_policy_names_the_script(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
+    make_run(make_rows(6)[MIN_COLUMNS])
+    text = _write_index(tmp_path)
     (script,) = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
     assert f"script-src '{script_hash(script)}'" in text
     assert "default-src 'none'" in text
 
 
-def test_hostile_names_are_texts_and_stay_in_the_site(
+def test_texts_are_escaped_and_files_stay_in_the_site(
     make_rows: Rows, make_run: MakeRun, tmp_path: Path, velocity: dict[str, Any]
 ) -> None:
-    frame = make_rows(12, crashed=1)[[*BARE, "error"]].assign(error=HOSTILE)
+    frame = make_rows(12, crashed=1)[[*MIN_COLUMNS, "error"]].assign(error=HOSTILE)
     parameters = {"site": HOSTILE, "algorithm": HOSTILE}
     directory = make_run(frame, [{**velocity, "id": HOSTILE, "statement": HOSTILE}], name="hostile", git_commit=HOSTILE)
     record = (directory / "campaign.json").read_text()
-    import json
-
     stored = {**json.loads(record), "name": HOSTILE, "state": HOSTILE, "started_utc": HOSTILE}
     stored["configuration"]["parameters"] = parameters
     (directory / "campaign.json").write_text(json.dumps(stored))
-    text = _site(tmp_path)
+    text = _write_index(tmp_path)
     assert "alert('x')</script>" not in text
     assert "<img" not in text
-    assert "{{ 7*7 }}" in text  # shown, not worked out
-    written = [path for path in tmp_path.rglob("*.html") if directory not in path.parents]
-    assert all((tmp_path / "site") in path.parents for path in written)
+    assert "{{ 7*7 }}" in text  # not evaluated as a template
+    pages = [path for path in tmp_path.rglob("*.html") if directory not in path.parents]
+    assert all((tmp_path / "site") in path.parents for path in pages)
 
 
-def test_names_of_folders_hold_nothing_but_letters_digits_and_hyphens(tmp_path: Path) -> None:
+def test_folder_names_have_only_letters_digits_and_hyphens(tmp_path: Path) -> None:
     for name in ("../../etc/passwd", "", "ä/\x00", "a" * 500):
-        slug = slug_of(tmp_path, name)
+        slug = make_slug(tmp_path, name)
         assert re.fullmatch(r"[A-Za-z0-9-]{1,80}", slug)
-    assert slug_of(tmp_path / "a", "x") != slug_of(tmp_path / "b", "x")
+    assert make_slug(tmp_path / "a", "x") != make_slug(tmp_path / "b", "x")
 
 
-def test_campaigns_are_found_below_folders_once(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
-    first = make_run(make_rows(6)[BARE], name="a/b")
-    make_run(make_rows(6)[BARE], name="c")
+def test_campaigns_are_found_once(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
+    first = make_run(make_rows(6)[MIN_COLUMNS], name="a/b")
+    make_run(make_rows(6)[MIN_COLUMNS], name="c")
     assert find_campaigns([tmp_path, first, tmp_path / "a"]) == [first, tmp_path / "c"]
     assert find_campaigns([tmp_path / "nowhere"]) == []
 
 
-def test_a_campaign_that_cannot_be_read_is_said_and_the_others_are_shown(
+def test_unreadable_campaign_is_reported_and_others_are_shown(
     make_rows: Rows, make_run: MakeRun, tmp_path: Path
 ) -> None:
-    make_run(make_rows(6)[BARE], name="good")
-    bad = make_run(make_rows(6)[BARE], name="bad")
+    make_run(make_rows(6)[MIN_COLUMNS], name="good")
+    bad = make_run(make_rows(6)[MIN_COLUMNS], name="bad")
     (bad / "cases.parquet").write_bytes(b"nothing")
     site = write_site(tmp_path / "site", [tmp_path])
     assert site.campaigns == 1
@@ -141,40 +142,40 @@ def test_a_campaign_that_cannot_be_read_is_said_and_the_others_are_shown(
     assert "bad" in site.index.read_text(encoding="utf-8")
 
 
-def test_pages_of_unchanged_campaigns_are_left(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
-    directory = make_run(make_rows(6)[BARE])
-    _site(tmp_path)
+def test_pages_of_unchanged_campaigns_are_kept(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
+    directory = make_run(make_rows(6)[MIN_COLUMNS])
+    _write_index(tmp_path)
     page = next((tmp_path / "site" / "c").glob("*/index.html"))
     page.write_text("as it was", encoding="utf-8")
-    _site(tmp_path)
+    _write_index(tmp_path)
     assert page.read_text(encoding="utf-8") == "as it was"
     (directory / "report.json").unlink()
-    _site(tmp_path)
+    _write_index(tmp_path)
     assert "as it was" not in page.read_text(encoding="utf-8")
 
 
-def _shown(estimate: float, margin: float = -0.05) -> ShownRequirement:
+def _make_shown_requirement(estimate: float, margin: float = -0.05) -> ShownRequirement:
     return ShownRequirement(
         "R", "", "PASS", estimate, 0.9, 0.95, margin, n=10, failures=1, confidence=0.9, decide_by="", note=""
     )
 
 
-def test_sparkline_draws_better_higher() -> None:
-    line = sparkline([_shown(0.9), _shown(0.97), _shown(1.0)])
+def test_sparkline_draws_higher_rates_higher() -> None:
+    line = sparkline([_make_shown_requirement(0.9), _make_shown_requirement(0.97), _make_shown_requirement(1.0)])
     assert line is not None
     heights = [float(point.split(",")[1]) for point in line.points.split()]
     assert heights[0] > line.asked > heights[1] > heights[2]
-    assert sparkline([_shown(0.9)]) is None
-    assert sparkline([_shown(float("nan"))] * 3) is None
+    assert sparkline([_make_shown_requirement(0.9)]) is None
+    assert sparkline([_make_shown_requirement(float("nan"))] * 3) is None
 
 
-def test_margin_in_words() -> None:
-    assert margin_text(_shown(0.9)) == "−5.00 pp"
-    assert margin_text(_shown(0.9, margin=0.0123)) == "+1.23 pp"
-    assert margin_text(_shown(0.9, margin=float("nan"))) == "–"
+def test_margin_is_given_in_percentage_points() -> None:
+    assert margin_text(_make_shown_requirement(0.9)) == "−5.00 pp"
+    assert margin_text(_make_shown_requirement(0.9, margin=0.0123)) == "+1.23 pp"
+    assert margin_text(_make_shown_requirement(0.9, margin=float("nan"))) == "–"
 
 
 @pytest.mark.parametrize("entries", [[]])
-def test_no_campaigns_at_all(entries: list[Any], tmp_path: Path) -> None:
+def test_index_without_campaigns_is_written(entries: list[Any], tmp_path: Path) -> None:
     assert all(row.latest is None for row in requirement_rows(entries, shipped_requirements()))
-    assert "0 stored campaigns" in _site(tmp_path)
+    assert "0 stored campaigns" in _write_index(tmp_path)

@@ -1,4 +1,4 @@
-"""The field test's section: its table beside the paper's, and the errors by category."""
+"""Tests of the section on the field test: results next to the paper's values, and errors by category."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MakeRows = Callable[..., pd.DataFrame]
 
 @pytest.fixture
 def field_frame(make_rows: MakeRows) -> pd.DataFrame:
-    """20 triples in two of the paper's cells and one other: all, half and none answered."""
+    """20 image triples in each of three cells, with 20, 10 and 0 answers; the paper has two of the cells."""
     frame = make_rows(60, answered=1.0)
     frame["category"] = ["short time"] * 20 + ["same direction"] * 20 + ["opposite direction"] * 20
     frame["run"] = ["Kelso Run 3"] * 40 + ["Mojave Run 9"] * 20
@@ -31,7 +31,7 @@ def field_frame(make_rows: MakeRows) -> pd.DataFrame:
     return frame
 
 
-def test_cells_stand_next_to_the_papers(make_run: MakeRun, field_frame: pd.DataFrame) -> None:
+def test_cells_are_compared_with_the_paper(make_run: MakeRun, field_frame: pd.DataFrame) -> None:
     run = read_run(make_run(field_frame, requirements=[VELOCITY]))
     short, same, other = field_cells(Subject(run, "velocity_error_m_s", 5.0))
     assert (short["valid"].hits, short["paper_percent"]) == (20, 100)
@@ -43,7 +43,7 @@ def test_cells_stand_next_to_the_papers(make_run: MakeRun, field_frame: pd.DataF
     assert np.isnan(other["largest"])
 
 
-def test_page_tells_misprints_and_draws_each_category(make_run: MakeRun, field_frame: pd.DataFrame) -> None:
+def test_page_reports_misprints_and_categories(make_run: MakeRun, field_frame: pd.DataFrame) -> None:
     directory = make_run(field_frame, requirements=[VELOCITY])
     page = write_report(directory).read_text(encoding="utf-8")
     assert "1,913" in page
@@ -51,13 +51,13 @@ def test_page_tells_misprints_and_draws_each_category(make_run: MakeRun, field_f
     assert "Pisgah Run 3, short time (128 + 8 ≠ 134)" in page
     section = field_test_section(Subject(read_run(directory), "velocity_error_m_s", 5.0))
     assert section is not None
-    assert len(section.blocks[1].plates) == 2  # nobody answered in the third category
+    assert len(section.blocks[1].plates) == 2  # the third category has no answers
 
 
-def test_papers_table_is_as_printed() -> None:
-    """Two rows do not add up; each per cent is that of valid over both counts, but for one (97 printed as 99)."""
-    odd = [key for key, cell in FIG_11.items() if cell["valid"] + cell["invalid"] != cell["total"]]
-    assert odd == [("short time", "Pisgah Run 3"), ("same direction", "Pisgah Run 3")]
+def test_table_of_the_paper_has_its_known_misprints() -> None:
+    """The totals of two printed rows are wrong, and one percentage (97 is printed as 99)."""
+    wrong_totals = [key for key, cell in FIG_11.items() if cell["valid"] + cell["invalid"] != cell["total"]]
+    assert wrong_totals == [("short time", "Pisgah Run 3"), ("same direction", "Pisgah Run 3")]
     assert sum(cell["total"] for cell in FIG_11.values()) == 1913
     assert sum(cell["valid"] + cell["invalid"] for cell in FIG_11.values()) == 1925
     assert [
@@ -67,6 +67,6 @@ def test_papers_table_is_as_printed() -> None:
     ] == [("same direction", "Pisgah Run 3")]
 
 
-def test_other_rows_have_no_such_section(make_run: MakeRun, make_rows: MakeRows) -> None:
+def test_other_campaigns_have_no_field_test_section(make_run: MakeRun, make_rows: MakeRows) -> None:
     run = read_run(make_run(make_rows(30), requirements=[VELOCITY]))
     assert field_test_section(Subject(run, "velocity_error_m_s", 5.0)) is None

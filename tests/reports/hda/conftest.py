@@ -1,4 +1,4 @@
-"""Products of a made-up landing for every test."""
+"""Fixtures of a synthetic landing."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from tests.reports.hda.made_up import synthetic_products
+from tests.reports.hda.synthetic_landing import synthetic_products
 
 
 @pytest.fixture
 def hda_products() -> dict[str, Any]:
-    """A fresh copy for every test; see `synthetic_products`."""
+    """Products of a synthetic landing; see `synthetic_products`."""
     return synthetic_products()

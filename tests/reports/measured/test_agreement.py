@@ -1,4 +1,4 @@
-"""The section and the figures of real cases, from rows and products that hold much, little or nothing of them."""
+"""Tests of the section and figures of recorded images, with complete and missing data."""
 
 from __future__ import annotations
 
@@ -7,19 +7,18 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from marsyard.reports.measured.case_figures import matched_pairs
-from marsyard.reports.measured.presentation import MEASURED, agreement_section
+from marsyard.reports.measured.presentation import MEASURED, agreement_section, matched_pairs
 from marsyard.reports.presentation import case_kind
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
 
 
-def subject(**columns: object) -> Subject:
+def make_subject(**columns: object) -> Subject:
     frame = pd.DataFrame({"case": range(4), "outcome": ["VALID"] * 4, **columns})
     return Subject(StoredRun(Path("run"), frame, frame, {}, ()), None, None)
 
 
-def products(matches: int) -> dict[str, object]:
+def make_products(matches: int) -> dict[str, object]:
     rng = np.random.default_rng(1)
     table = np.concatenate(
         [rng.uniform(0, 60, (matches, 4)), rng.normal(0, 0.5, (matches, 2)), np.ones((matches, 1))], 1
@@ -29,10 +28,10 @@ def products(matches: int) -> dict[str, object]:
     return {**pictures, "matches_1": table}
 
 
-def test_the_section_tells_cases_and_what_is_apart() -> None:
+def test_section_reports_residuals_and_unmatched_cases() -> None:
     residuals = [0.4, np.nan, 0.6, 1.5]
     section = agreement_section(
-        subject(
+        make_subject(
             measured_case=["a", "b", "c", "d"],
             residual_median_px=residuals,
             residual_90_percent_px=[1.0, np.nan, 1.2, 3.0],
@@ -51,24 +50,24 @@ def test_the_section_tells_cases_and_what_is_apart() -> None:
     assert len(block.plates) == 1
 
 
-def test_no_section_without_real_cases() -> None:
-    assert agreement_section(subject(residual_median_px=[1.0] * 4)) is None
+def test_no_section_without_recorded_cases() -> None:
+    assert agreement_section(make_subject(residual_median_px=[1.0] * 4)) is None
 
 
-def test_a_case_without_matches_is_shown_all_the_same(tmp_path: Path) -> None:
-    view = MEASURED.cases[0].view(products(0), "k")
+def test_case_without_matches_is_shown(tmp_path: Path) -> None:
+    view = MEASURED.cases[0].view(make_products(0), "k")
     assert view.rows[0].succeeded is False
     assert "0 matches" in view.plates[0].caption
-    (path,) = MEASURED.cases[0].write(tmp_path, products(40))
+    (path,) = MEASURED.cases[0].write(tmp_path, make_products(40))
     assert path.stat().st_size > 5000
 
 
-def test_pairs_are_read_with_care() -> None:
-    whole = products(40)
-    (pair,) = matched_pairs(whole)
+def test_invalid_matches_and_images_give_no_pairs() -> None:
+    products = make_products(40)
+    (pair,) = matched_pairs(products)
     assert np.count_nonzero(pair.right) == 30
     assert pair.caption.startswith("Pictures 1 and 2: 30 matches, median residual ")
-    assert matched_pairs({**whole, "matches_1": np.zeros((4, 3))}) == []
-    assert matched_pairs({**whole, "image_2": None}) == []
-    # a real case is known before the systems whose pictures it may hold too
-    assert case_kind(whole) is MEASURED.cases[0]
+    assert matched_pairs({**products, "matches_1": np.zeros((4, 3))}) == []
+    assert matched_pairs({**products, "image_2": None}) == []
+    # recorded cases are recognised before the other systems
+    assert case_kind(products) is MEASURED.cases[0]

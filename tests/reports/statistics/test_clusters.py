@@ -1,16 +1,25 @@
+"""Tests of binomial bounds for correlated cases: coverage, design effect and terrain counts."""
+
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from marsyard.reports.statistics.clusters import ClusterMethod, clustered_evidence, number_terrains
-from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
+from marsyard.reports.statistics.proportions import (
+    ClusterMethod,
+    clustered_evidence,
+    number_terrains,
+    proportion_lower,
+    proportion_upper,
+)
 
 SIZE = 8
 
 
-def _cases(rng: np.random.Generator, rate: float, correlation: float, terrains: int) -> tuple[np.ndarray, np.ndarray]:
-    """Cases on terrains whose own success rates are beta distributed: beta-binomial, correlated on a terrain."""
+def _draw_cases(
+    rng: np.random.Generator, rate: float, correlation: float, terrains: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw beta-binomial cases: the success rates of terrains are beta distributed."""
     if correlation == 1.0:
         rates = (rng.random(terrains) < rate).astype(float)
     else:
@@ -23,43 +32,43 @@ def _cases(rng: np.random.Generator, rate: float, correlation: float, terrains: 
 @pytest.mark.parametrize("correlation", [0.05, 0.3, 1.0])
 @pytest.mark.parametrize(("rate", "terrains"), [(0.99, 60), (0.95, 60), (0.8, 60), (0.9, 20)])
 def test_bounds_cover_clustered_cases(rate: float, terrains: int, correlation: float) -> None:
-    # 400 campaigns: one standard deviation of the coverage is 1.5 %.
+    # 400 campaigns: standard deviation of the coverage 1.5 %
     rng = np.random.default_rng(11)
-    shown = [clustered_evidence(*_cases(rng, rate, correlation, terrains), 0.9) for _ in range(400)]
-    assert np.mean([evidence.lower <= rate for evidence in shown]) >= 0.9 - 3 * 0.015
-    assert np.mean([evidence.upper >= rate for evidence in shown]) >= 0.9 - 3 * 0.015
+    campaigns = [clustered_evidence(*_draw_cases(rng, rate, correlation, terrains), 0.9) for _ in range(400)]
+    assert np.mean([evidence.lower <= rate for evidence in campaigns]) >= 0.9 - 3 * 0.015
+    assert np.mean([evidence.upper >= rate for evidence in campaigns]) >= 0.9 - 3 * 0.015
 
 
 @pytest.mark.parametrize(
-    ("terrains", "size", "answering", "bad", "rates"),
+    ("terrains", "size", "answer_rate", "bad_fraction", "rates"),
     [(40, 8, 0.1, 0.3, (0.2, 0.99)), (49, 20, 0.05, 0.3, (0.0, 0.99)), (60, 8, 0.3, 0.1, (0.0, 1.0)),
      (60, 20, 0.2, 0.1, (0.0, 1.0)), (60, 8, 0.2, 0.3, (0.6, 0.97))],
 )  # fmt: skip
-def test_bounds_hold_where_bad_terrains_answer_less_often(
-    terrains: int, size: int, answering: float, bad: float, rates: tuple[float, float]
+def test_bounds_cover_if_bad_terrains_answer_less_often(
+    terrains: int, size: int, answer_rate: float, bad_fraction: float, rates: tuple[float, float]
 ) -> None:
-    """Counting whole terrains alone, the upper bound missed the answers' rate in up to 99 % of these campaigns."""
+    """Counting terrains only, the upper bound would miss the rate in up to 99 % of these campaigns."""
     rng = np.random.default_rng(15)
-    weights = np.array([bad * answering, 1.0 - bad])
-    rate, missed = float(weights @ np.array(rates) / weights.sum()), np.zeros(2)
+    weights = np.array([bad_fraction * answer_rate, 1.0 - bad_fraction])
+    rate, n_missed = float(weights @ np.array(rates) / weights.sum()), np.zeros(2)
     for _ in range(400):
-        is_bad = rng.random(terrains) < bad
-        answers = rng.binomial(size, np.where(is_bad, answering, 1.0))
+        is_bad = rng.random(terrains) < bad_fraction
+        answers = rng.binomial(size, np.where(is_bad, answer_rate, 1.0))
         terrain = np.repeat(np.arange(terrains), answers)
         success = rng.random(terrain.size) < np.where(is_bad, *rates)[terrain]
         evidence = clustered_evidence(success, terrain, 0.9)
-        missed += evidence.lower > rate, evidence.upper < rate
-    assert (missed / 400 <= 0.1 + 2 * 0.015).all()
+        n_missed += evidence.lower > rate, evidence.upper < rate
+    assert (n_missed / 400 <= 0.1 + 2 * 0.015).all()
 
 
-def test_bounds_for_independent_cases_fall_short() -> None:
-    # The reason for all this: with correlated cases the plain bound lies above the truth far too often.
+def test_bounds_for_independent_cases_do_not_cover() -> None:
+    # the bound for independent cases is too high for correlated cases
     rng = np.random.default_rng(12)
-    passed_over = 0
+    n_exceeded = 0
     for _ in range(300):
-        success, _ = _cases(rng, 0.8, 0.3, 60)
-        passed_over += proportion_lower(int(success.sum()), success.size, 0.9) > 0.8
-    assert passed_over / 300 > 0.2
+        success, _ = _draw_cases(rng, 0.8, 0.3, 60)
+        n_exceeded += proportion_lower(int(success.sum()), success.size, 0.9) > 0.8
+    assert n_exceeded / 300 > 0.2
 
 
 def test_too_few_failures_count_terrains() -> None:
@@ -72,12 +81,11 @@ def test_too_few_failures_count_terrains() -> None:
     assert evidence.upper == 1.0
 
 
-def test_a_reliability_takes_as_many_terrains_as_cases() -> None:
-    # Issue 8: 99 % at 90 % confidence needs 230 terrains.
-    def lower(terrains: int) -> float:
+def test_99_percent_at_90_percent_confidence_needs_230_terrains() -> None:
+    def lower_bound(terrains: int) -> float:
         return clustered_evidence(np.ones(10 * terrains, dtype=bool), np.arange(10 * terrains) % terrains, 0.9).lower
 
-    assert lower(229) < 0.99 <= lower(230)
+    assert lower_bound(229) < 0.99 <= lower_bound(230)
 
 
 def test_design_effect_of_independent_cases_is_about_one() -> None:
@@ -85,22 +93,22 @@ def test_design_effect_of_independent_cases_is_about_one() -> None:
     terrain = np.repeat(np.arange(400), 10)
     evidence = clustered_evidence(rng.random(4000) < 0.7, terrain, 0.9)
     assert evidence.method is ClusterMethod.KORN_GRAUBARD
-    # Relative standard deviation of a variance over 400 terrains: sqrt(2 / 399) = 7 %.
+    # relative standard deviation of a variance over 400 terrains: sqrt(2 / 399) = 7 %
     assert evidence.design_effect == pytest.approx(1.0, abs=0.25)
 
 
-def test_design_effect_of_identical_cases_is_their_number() -> None:
+def test_design_effect_of_identical_cases_is_the_cluster_size() -> None:
     rng = np.random.default_rng(14)
-    fate = rng.random(200) < 0.7
-    evidence = clustered_evidence(np.repeat(fate, 5), np.repeat(np.arange(200), 5), 0.9)
-    # 5 cases a terrain, all alike; times m / (m - 1) for the variance over m = 200 terrains.
+    succeeds = rng.random(200) < 0.7
+    evidence = clustered_evidence(np.repeat(succeeds, 5), np.repeat(np.arange(200), 5), 0.9)
+    # 5 identical cases per terrain, times m / (m - 1) for m = 200 terrains
     assert evidence.design_effect == pytest.approx(5 * 200 / 199)
     assert evidence.effective_n <= 200
-    assert evidence.lower < fate.mean() < evidence.upper
+    assert evidence.lower < succeeds.mean() < evidence.upper
 
 
 def test_effective_sample_size_never_exceeds_the_cases() -> None:
-    # Every terrain fails once in ten: less variance than independent cases have.
+    # each terrain has 1 failure in 10 cases: less variance than independent cases
     success = np.tile(np.arange(10) > 0, 100)
     evidence = clustered_evidence(success, np.repeat(np.arange(100), 10), 0.9)
     assert evidence.effective_n == 1000.0
@@ -108,22 +116,22 @@ def test_effective_sample_size_never_exceeds_the_cases() -> None:
     assert evidence.upper == proportion_upper(900, 1000, 0.9)
 
 
-def test_terrains_are_counted_without_gaps() -> None:
+def test_terrains_are_numbered_without_gaps() -> None:
     for terrain in ([7, 3, 7, 5], [-2, 10**15, -2], [4]):
-        numbered = np.array(terrain, dtype=np.int64)
-        np.testing.assert_array_equal(number_terrains(numbered), np.unique(numbered, return_inverse=True)[1])
+        terrain_ids = np.array(terrain, dtype=np.int64)
+        np.testing.assert_array_equal(number_terrains(terrain_ids), np.unique(terrain_ids, return_inverse=True)[1])
 
 
-@pytest.mark.parametrize(("terrains", "failing", "estimated"), [(50, 10, True), (49, 10, False), (50, 9, False)])
-def test_correlation_is_estimated_from_enough_terrains(terrains: int, failing: int, estimated: bool) -> None:
+@pytest.mark.parametrize(("terrains", "failing", "is_estimated"), [(50, 10, True), (49, 10, False), (50, 9, False)])
+def test_correlation_is_estimated_from_enough_terrains(terrains: int, failing: int, is_estimated: bool) -> None:
     terrain = np.repeat(np.arange(terrains), 4)
     success = ~((terrain < failing) & (np.arange(terrain.size) % 4 == 0))
-    method = ClusterMethod.KORN_GRAUBARD if estimated else ClusterMethod.TERRAIN_COUNT
+    method = ClusterMethod.KORN_GRAUBARD if is_estimated else ClusterMethod.TERRAIN_COUNT
     assert clustered_evidence(success, terrain, 0.9).method is method
 
 
-def test_a_terrain_with_a_single_success_has_succeeded() -> None:
+def test_terrain_with_one_success_counts_as_success() -> None:
     success, terrain = np.zeros(40, dtype=bool), np.repeat(np.arange(20), 2)
-    success[::4] = True  # one of two cases on every second terrain
+    success[::4] = True  # one success on every second terrain
     evidence = clustered_evidence(success, terrain, 0.9)
     assert evidence.upper == proportion_upper(10, 20, 0.9)

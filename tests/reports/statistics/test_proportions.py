@@ -1,3 +1,5 @@
+"""Tests of Clopper-Pearson bounds and sample sizes for proportions."""
+
 from __future__ import annotations
 
 import math
@@ -17,7 +19,7 @@ from marsyard.reports.statistics.proportions import (
     proportion_upper,
 )
 
-#: `design.md`, "Minimum number of cases for a reliability at a confidence, by failures seen (binomial)".
+#: Minimum number of cases for (reliability, confidence), with 0 to 3 failures (docs/design.md).
 SAMPLE_SIZES = {
     (0.99865, 0.90): (1705, 2880, 3941, 4947),
     (0.9973, 0.90): (852, 1440, 1970, 2473),
@@ -29,7 +31,6 @@ COUNTS = st.integers(0, 400).flatmap(lambda n: st.tuples(st.integers(0, n), st.j
 
 
 def test_two_sided_interval_of_seven_in_fifty() -> None:
-    # Issue 8, bar 1: k = 7, n = 50, 95 %: 0.0582 to 0.2674.
     lower, upper = proportion_interval(7, 50, 0.95)
     assert (round(lower, 4), round(upper, 4)) == (0.0582, 0.2674)
 
@@ -45,7 +46,7 @@ def test_interval_agrees_with_scipy(counts: tuple[int, int], confidence: float) 
 
 @given(COUNTS, CONFIDENCES)
 def test_lower_bound_solves_its_equation(counts: tuple[int, int], confidence: float) -> None:
-    # Clopper & Pearson 1934: at the lower bound p, P(Bin(n, p) >= successes) is what the confidence leaves.
+    # Clopper & Pearson 1934: at the lower bound p, P(Bin(n, p) >= successes) = 1 - confidence
     successes, n = counts
     lower = proportion_lower(successes, n, confidence)
     if successes:
@@ -55,41 +56,39 @@ def test_lower_bound_solves_its_equation(counts: tuple[int, int], confidence: fl
 
 
 @given(COUNTS, CONFIDENCES)
-def test_upper_bound_mirrors_the_lower_one(counts: tuple[int, int], confidence: float) -> None:
+def test_upper_bound_mirrors_the_lower_bound(counts: tuple[int, int], confidence: float) -> None:
     successes, n = counts
     mirrored = 1.0 - proportion_lower(n - successes, n, confidence)
     assert proportion_upper(successes, n, confidence) == pytest.approx(mirrored, abs=1e-12)
 
 
 @given(COUNTS, CONFIDENCES)
-def test_one_more_success_raises_the_bound_and_one_more_failure_lowers_it(
-    counts: tuple[int, int], confidence: float
-) -> None:
+def test_bound_rises_with_successes_and_falls_with_failures(counts: tuple[int, int], confidence: float) -> None:
     successes, n = counts
     bound = proportion_lower(successes, n, confidence)
     assert proportion_lower(successes + 1, n + 1, confidence) >= bound
     assert proportion_lower(successes, n + 1, confidence) <= bound
 
 
-def test_no_cases_bound_nothing() -> None:
+def test_bounds_without_cases_are_0_and_1() -> None:
     assert (proportion_lower(0, 0, 0.9), proportion_upper(0, 0, 0.9)) == (0.0, 1.0)
 
 
 @pytest.mark.parametrize("counts", [(-1, 3), (4, 3)])
-def test_impossible_counts_are_refused(counts: tuple[int, int]) -> None:
+def test_invalid_counts_are_rejected(counts: tuple[int, int]) -> None:
     with pytest.raises(ValueError, match="successes"):
         proportion_lower(*counts, 0.9)
 
 
 @pytest.mark.parametrize("confidence", [0.0, 1.0, -0.1, math.nan])
-def test_impossible_confidence_is_refused(confidence: float) -> None:
+def test_invalid_confidence_is_rejected(confidence: float) -> None:
     with pytest.raises(ValueError, match="confidence"):
         proportion_lower(1, 2, confidence)
 
 
 @pytest.mark.parametrize("true_rate", [0.5, 0.9, 0.99])
-def test_coverage_is_exactly_at_the_minimum_nominal(true_rate: float) -> None:
-    # Not sampled: the coverage is summed over all outcomes of 60 cases.
+def test_exact_coverage_is_not_below_nominal(true_rate: float) -> None:
+    # exact coverage: sum over all outcomes of 60 cases
     n, confidence = 60, 0.9
     outcomes = np.arange(n + 1)
     weights = stats.binom.pmf(outcomes, n, true_rate)
@@ -99,14 +98,16 @@ def test_coverage_is_exactly_at_the_minimum_nominal(true_rate: float) -> None:
     assert weights[upper >= true_rate].sum() >= confidence - 1e-12
 
 
-@pytest.mark.parametrize(("stated", "expected"), SAMPLE_SIZES.items())
-def test_sample_sizes_of_the_design(stated: tuple[float, float], expected: tuple[int, ...]) -> None:
-    assert tuple(minimum_sample_size(*stated, failures) for failures in range(4)) == expected
+@pytest.mark.parametrize(("reliability_and_confidence", "expected"), SAMPLE_SIZES.items())
+def test_sample_sizes_agree_with_the_table(
+    reliability_and_confidence: tuple[float, float], expected: tuple[int, ...]
+) -> None:
+    assert tuple(minimum_sample_size(*reliability_and_confidence, failures) for failures in range(4)) == expected
 
 
 @given(st.floats(0.5, 0.999), st.sampled_from([0.8, 0.9, 0.95]), st.integers(0, 5))
 def test_sample_size_is_the_smallest(reliability: float, confidence: float, failures: int) -> None:
-    # Second method: P(Bin(n, 1 - reliability) <= failures) falls to 1 - confidence at n and not before.
+    # independent method: n is the smallest with P(Bin(n, 1 - reliability) <= failures) <= 1 - confidence
     n = minimum_sample_size(reliability, confidence, failures)
     risk = 1 - confidence
     assert stats.binom.cdf(failures, n, 1 - reliability) <= risk * (1 + 1e-9)
@@ -114,12 +115,12 @@ def test_sample_size_is_the_smallest(reliability: float, confidence: float, fail
 
 
 @pytest.mark.parametrize("reliability", [0.0, 1.0, 1.5])
-def test_certainty_has_no_sample_size(reliability: float) -> None:
+def test_invalid_reliability_is_rejected(reliability: float) -> None:
     with pytest.raises(ValueError, match="reliability"):
         minimum_sample_size(reliability, 0.9)
 
 
-def test_negative_failures_are_refused() -> None:
+def test_negative_failures_are_rejected() -> None:
     with pytest.raises(ValueError, match="failures"):
         minimum_sample_size(0.9, 0.9, -1)
 
@@ -131,6 +132,6 @@ def test_additional_cases_needed() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 5, 400])
-def test_no_success_is_no_evidence(n: int) -> None:
+def test_consumer_risk_without_success_is_1(n: int) -> None:
     assert consumer_risk(0, n, 0.9) == 1.0
     assert 0.0 < consumer_risk(1, n, 0.9) <= 1.0

@@ -1,3 +1,5 @@
+"""Tests of statistics of samples: intervals of mean, standard deviation and quantiles."""
+
 from __future__ import annotations
 
 import math
@@ -10,15 +12,15 @@ from marsyard.reports.statistics.samples import mean_interval, quantile_bounds, 
 
 
 @pytest.mark.parametrize(("quantile", "confidence", "n"), [(0.95, 0.95, 59), (0.99, 0.9, 230), (0.99, 0.95, 299)])
-def test_wilks_sample_size_is_the_first_to_bound_a_quantile(quantile: float, confidence: float, n: int) -> None:
-    # Wilks 1941: the largest of n values bounds the quantile q from above once q ** n <= 1 - confidence.
+def test_quantile_bound_needs_the_sample_size_of_wilks(quantile: float, confidence: float, n: int) -> None:
+    # Wilks 1941: the largest of n values is an upper bound of the quantile q if q^n <= 1 - confidence
     sample = np.arange(float(n))
     assert quantile_bounds(sample, quantile, confidence)[1] == n - 1
     assert quantile_bounds(sample[:-1], quantile, confidence)[1] == math.inf
 
 
-def test_quantile_bounds_cover() -> None:
-    # 1,500 samples: one standard deviation of the coverage is 0.8 %.
+def test_quantile_bounds_have_nominal_coverage() -> None:
+    # 1500 samples: standard deviation of the coverage 0.8 %
     rng = np.random.default_rng(5)
     truth = stats.norm.ppf(0.9)
     bounds = np.array([quantile_bounds(rng.standard_normal(80), 0.9, 0.9) for _ in range(1500)])
@@ -26,8 +28,8 @@ def test_quantile_bounds_cover() -> None:
     assert np.mean(bounds[:, 1] >= truth) >= 0.9 - 0.024
 
 
-def test_mean_interval_covers() -> None:
-    # BCa on 40 exponential values: its coverage is below nominal by about 2 % (Efron 1987); 250 samples: sd 1.4 %.
+def test_mean_interval_has_nominal_coverage() -> None:
+    # BCa interval of 40 exponential values: about 2 % below nominal (Efron 1987); 250 samples: standard deviation 1.4 %
     rng = np.random.default_rng(6)
     intervals = np.array([mean_interval(rng.exponential(size=40), 0.95) for _ in range(250)])
     assert np.mean((intervals[:, 0] <= 1.0) & (intervals[:, 1] >= 1.0)) >= 0.95 - 0.02 - 3 * 0.014
@@ -63,23 +65,23 @@ def test_summary_of_too_few_values(sample: list[float]) -> None:
     assert all(quantile.upper == math.inf for quantile in summary.quantiles)
 
 
-def test_circular_error_of_a_normal_scatter() -> None:
-    # For two independent normal parts of unit deviation the median radius is sqrt(2 ln 2) = 1.1774.
+def test_radial_quantiles_of_normal_errors() -> None:
+    # median radius of two independent standard normal components: sqrt(2 ln 2) = 1.1774
     rng = np.random.default_rng(8)
     summary = summarize(np.hypot(*rng.standard_normal((2, 20000))))
     assert summary.quantiles[0].estimate == pytest.approx(math.sqrt(2 * math.log(2)), abs=0.03)
     assert summary.quantiles[1].estimate == pytest.approx(math.sqrt(2 * math.log(20)), abs=0.05)
 
 
-def test_spread_interval_covers() -> None:
-    # 250 samples: one standard deviation of the coverage is 1.4 %.
+def test_spread_interval_has_nominal_coverage() -> None:
+    # 250 samples: standard deviation of the coverage 1.4 %
     rng = np.random.default_rng(9)
     intervals = np.array([spread_interval(rng.normal(0.0, 2.0, 30), 0.95) for _ in range(250)])
     assert np.mean((intervals[:, 0] <= 2.0) & (intervals[:, 1] >= 2.0)) >= 0.95 - 3 * 0.014
 
 
-def test_spread_interval_of_a_large_normal_sample_is_that_of_chi_square() -> None:
-    # Second method: (n - 1) s^2 / chi2, exact for normal values.
+def test_spread_interval_of_normal_values_agrees_with_chi_square() -> None:
+    # independent method: (n - 1) s^2 / chi2, exact for normal values
     values = np.random.default_rng(10).normal(0.0, 3.0, 5000)
     squares = float(((values - values.mean()) ** 2).sum())
     exact = np.sqrt(squares / stats.chi2.ppf([0.975, 0.025], values.size - 1))

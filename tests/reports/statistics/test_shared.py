@@ -1,4 +1,4 @@
-"""Intervals of values on shared terrains: coverage by simulation, and closed forms where there are any."""
+"""Tests of intervals of values on shared terrains: coverage by simulation, and closed forms."""
 
 from __future__ import annotations
 
@@ -17,62 +17,61 @@ from marsyard.reports.statistics.samples import (
 )
 
 
-def _values(rng: np.random.Generator, terrains: int, correlation: float) -> tuple[np.ndarray, np.ndarray]:
-    """Standard normal values, 1 to 14 a terrain, those of a terrain so correlated."""
+def _draw_values(rng: np.random.Generator, terrains: int, correlation: float) -> tuple[np.ndarray, np.ndarray]:
+    """Standard normal values with 1 to 14 values per terrain and the given correlation within a terrain."""
     groups = np.repeat(np.arange(terrains), rng.integers(1, 15, terrains))
-    of_terrain, own = rng.normal(size=terrains)[groups], rng.normal(size=groups.size)
-    return math.sqrt(correlation) * of_terrain + math.sqrt(1.0 - correlation) * own, groups
+    terrain_part, case_part = rng.normal(size=terrains)[groups], rng.normal(size=groups.size)
+    return math.sqrt(correlation) * terrain_part + math.sqrt(1.0 - correlation) * case_part, groups
 
 
 @pytest.mark.parametrize(("terrains", "correlation"), [(12, 0.3), (60, 0.9)])
-def test_intervals_of_mean_and_spread_cover(terrains: int, correlation: float) -> None:
-    # 200 samples at 95 %: sd of the coverage 1.5 %.
+def test_intervals_of_mean_and_spread_have_nominal_coverage(terrains: int, correlation: float) -> None:
+    # 200 samples at 95 %: standard deviation of the coverage 1.5 %
     rng = np.random.default_rng(1)
-    means, spreads, naive = 0, 0, 0
+    n_mean, n_spread, n_naive = 0, 0, 0
     for _ in range(200):
-        values, groups = _values(rng, terrains, correlation)
+        values, groups = _draw_values(rng, terrains, correlation)
         lower, upper = mean_interval(values, 0.95, groups)
-        means += lower <= 0.0 <= upper
+        n_mean += lower <= 0.0 <= upper
         lower, upper = spread_interval(values, 0.95, groups)
-        spreads += lower <= 1.0 <= upper
+        n_spread += lower <= 1.0 <= upper
         lower, upper = stats.t.interval(0.95, values.size - 1, values.mean(), stats.sem(values))
-        naive += lower <= 0.0 <= upper
-    assert min(means, spreads) / 200 >= 0.95 - 3 * 0.015
-    assert naive / 200 < 0.85
+        n_naive += lower <= 0.0 <= upper
+    assert min(n_mean, n_spread) / 200 >= 0.95 - 3 * 0.015
+    assert n_naive / 200 < 0.85
 
 
 @pytest.mark.parametrize(("terrains", "correlation"), [(20, 0.3), (60, 0.3), (60, 0.9)])
-def test_bounds_of_a_quantile_cover(terrains: int, correlation: float) -> None:
-    # 400 samples at 90 %: sd of the coverage 1.5 %.
+def test_quantile_bounds_have_nominal_coverage(terrains: int, correlation: float) -> None:
+    # 400 samples at 90 %: standard deviation of the coverage 1.5 %
     rng = np.random.default_rng(2)
     truth = stats.norm.ppf(0.9)
     bounds = []
     for _ in range(400):
-        values, groups = _values(rng, terrains, correlation)
+        values, groups = _draw_values(rng, terrains, correlation)
         bounds.append(quantile_bounds(values, 0.9, 0.9, groups))
     lower, upper = np.array(bounds).T
     assert np.mean(lower <= truth) >= 0.9 - 3 * 0.015
     assert np.mean(upper >= truth) >= 0.9 - 3 * 0.015
 
 
-def test_a_quantile_takes_as_many_terrains_as_independent_values() -> None:
-    # Wilks 1941: 59 for 95 % at 95 %; values that are alike on a terrain are worth one.
-    for terrains, bounded in ((58, False), (59, True)):
+def test_quantile_bound_needs_59_terrains() -> None:
+    # Wilks 1941: 59 values for 95 % at 95 %; equal values of a terrain count as one
+    for terrains, is_bounded in ((58, False), (59, True)):
         groups = np.repeat(np.arange(terrains), 10)
-        assert math.isfinite(quantile_bounds(groups.astype(np.float64), 0.95, 0.95, groups)[1]) is bounded
+        assert math.isfinite(quantile_bounds(groups.astype(np.float64), 0.95, 0.95, groups)[1]) is is_bounded
 
 
 def test_identical_values_of_a_terrain_count_once() -> None:
-    # A terrain's value ten times over tells as much as once.
     values = np.random.default_rng(3).normal(size=100)
     groups = np.repeat(np.arange(100), 10)
-    once, often = mean_interval(values, 0.95), mean_interval(np.repeat(values, 10), 0.95, groups)
-    assert often == pytest.approx(once, abs=0.02)
-    once, often = spread_interval(values, 0.95), spread_interval(np.repeat(values, 10), 0.95, groups)
-    assert often == pytest.approx(once, rel=0.06)
+    single, repeated = mean_interval(values, 0.95), mean_interval(np.repeat(values, 10), 0.95, groups)
+    assert repeated == pytest.approx(single, abs=0.02)
+    single, repeated = spread_interval(values, 0.95), spread_interval(np.repeat(values, 10), 0.95, groups)
+    assert repeated == pytest.approx(single, rel=0.06)
 
 
-def test_terrains_of_one_value_each_change_nothing() -> None:
+def test_one_value_per_terrain_equals_independent_values() -> None:
     values = np.random.default_rng(4).normal(size=40)
     assert summarize(values, groups=np.arange(40)) == summarize(values)
 

@@ -1,4 +1,4 @@
-"""Made-up rows and products of tracking cases, with known contents."""
+"""Synthetic rows and products of tracking cases."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from marsyard.reports.section import Block, Section, Subject
 from marsyard.reports.stored import StoredRun
 
 
-def rows(cases: int, **columns: Any) -> pd.DataFrame:
-    """Completed, tracked runs from 10 m to 2 m at selectable targets; `columns` change them."""
-    own: dict[str, Any] = {
+def make_rows(cases: int, **columns: Any) -> pd.DataFrame:
+    """Completed, tracked runs from 10 m to 2 m at selectable targets; `columns` replace values."""
+    defaults: dict[str, Any] = {
         "case": np.arange(cases),
         "outcome": "COMPLETED",
         **dict.fromkeys(("answered", "tracked", "true_track", "selectable", "clear_sky"), True),
@@ -38,46 +38,50 @@ def rows(cases: int, **columns: Any) -> pd.DataFrame:
         "autonav_updates": 0,
         "rock_height_m": 0.4,
     }
-    return pd.DataFrame(own | columns, index=range(cases))
+    return pd.DataFrame(defaults | columns, index=range(cases))
 
 
-def subject(frame: pd.DataFrame, name: str = "a-campaign", legs: Sequence[Mapping[str, Any]] | None = None) -> Subject:
-    """A report's subject of these rows, as of a campaign of this name whose shared drive has these legs."""
+def make_subject(
+    frame: pd.DataFrame, name: str = "a-campaign", legs: Sequence[Mapping[str, Any]] | None = None
+) -> Subject:
+    """Subject of a report on these rows, for a campaign with this name and these legs."""
     parameters = {"drive": {"legs": legs}} if legs else {}
     record = {"name": name, "configuration": {"parameters": parameters}}
     return Subject(StoredRun(Path("run"), frame, frame, record, ()), "position_error_m", 0.03)
 
 
-def put(frame: pd.DataFrame, index: int, **values: Any) -> None:
-    """Set values of a row."""
+def set_values(frame: pd.DataFrame, index: int, **values: Any) -> None:
+    """Set values of one row."""
     for name, value in values.items():
         frame.loc[index, name] = value
 
 
-def table(section: Section | None, block: int = 0) -> list[dict[str, str]]:
-    """The rows of a section's table, each by its headings; the first column is called by its own name or ''."""
+def read_table(section: Section | None, block: int = 0) -> list[dict[str, str]]:
+    """Rows of a section's table as dictionaries from heading to cell."""
     assert section is not None
-    grids = [one.grid for one in section.blocks if isinstance(one, Block) and one.grid is not None]
+    grids = [part.grid for part in section.blocks if isinstance(part, Block) and part.grid is not None]
     return [dict(zip(grids[block].head, row, strict=True)) for row in grids[block].rows]
 
 
-def products(stops: int = 3) -> dict[str, Any]:
-    """A case whose target is at (80, 70) of subframes of 161 px that begin at (400, 300); lost at the last stop."""
+def make_products(stops: int = 3) -> dict[str, Any]:
+    """A case with the target at (80, 70) of subframes of 161 px with origin (400, 300); lost at the last stop."""
     rng = np.random.default_rng(3)
-    kept: dict[str, Any] = {"template_px": 21}
+    case_products: dict[str, Any] = {"template_px": 21}
     for number in range(1, stops + 1):
-        lost = number == stops
-        kept[f"stop_{number}_left"] = rng.integers(500, 3000, (161, 161)).astype(np.uint16)
-        kept[f"stop_{number}_right"] = rng.integers(500, 3000, (105, 161)).astype(np.uint16)
-        kept[f"stop_{number}_corners"] = np.array([[400.0, 300.0], [380.0, 302.0]])
-        kept[f"stop_{number}_window"] = np.array([410.0, 310.0, 141.0, 141.0])
-        kept[f"stop_{number}_found"] = np.full((2, 2), np.nan) if lost else np.array([[480.0, 370.0], [450.0, 371.0]])
-        kept[f"stop_{number}_point"] = np.array([481.5, 369.0])
+        is_lost = number == stops
+        case_products[f"stop_{number}_left"] = rng.integers(500, 3000, (161, 161)).astype(np.uint16)
+        case_products[f"stop_{number}_right"] = rng.integers(500, 3000, (105, 161)).astype(np.uint16)
+        case_products[f"stop_{number}_corners"] = np.array([[400.0, 300.0], [380.0, 302.0]])
+        case_products[f"stop_{number}_window"] = np.array([410.0, 310.0, 141.0, 141.0])
+        case_products[f"stop_{number}_found"] = (
+            np.full((2, 2), np.nan) if is_lost else np.array([[480.0, 370.0], [450.0, 371.0]])
+        )
+        case_products[f"stop_{number}_point"] = np.array([481.5, 369.0])
     east = np.linspace(0.0, 8.0, stops)
     rover = np.column_stack([east, np.zeros(stops), np.zeros(stops)])
     believed = np.full((stops, 3), np.nan)
     believed[:-1] = np.column_stack([10.0 + 0.03 * np.arange(stops - 1), np.zeros(stops - 1), np.zeros(stops - 1)])
-    return kept | {
+    return case_products | {
         "figures": {
             "range_m": 10.0 - east,
             "azimuth_deg": np.full(stops, -0.04),

@@ -1,4 +1,4 @@
-"""A velocity estimator of a user's own, for tests: it believes the inertial unit."""
+"""Custom velocity estimators for tests: they return the inertial velocity."""
 
 import time
 
@@ -7,18 +7,18 @@ from marsyard.sim.measurements import DescentMeasurements
 
 
 class Inertial:
-    """The inertial velocity over the second pair."""
+    """Return the inertial velocity over the second pair."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """Always an answer."""
+        """Return a valid velocity in each case."""
         return VelocityEstimate(VelocityOutcome.VALID, measurements.interval_velocities_m_s[1, :2].copy())
 
 
 class SlowInertial(Inertial):
-    """The same, after a while: long enough to be late on the flight computer."""
+    """Return the same velocity after a delay that exceeds the deadline of the flight computer."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """Always an answer."""
+        """Return a valid velocity after the delay."""
         until = time.process_time() + 0.1
         while time.process_time() < until:
             pass

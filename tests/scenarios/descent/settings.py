@@ -1,4 +1,4 @@
-"""What tests of descents share: a small world, a descent, and instruments without errors."""
+"""Settings of descent tests: a small world, a descent, and ideal instruments."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,7 +8,7 @@ from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 
-#: A small world that is built in a moment.
+#: A small world that is built quickly.
 WORLD: dict[str, Any] = {"terrain": {"samples": 1024, "spacing_m": 3.0}, "location": {"bank": 1}}
 FLAT = {"samples": 1024, "spacing_m": 3.0, "rms_slope_deg": 0.0, "craters_per_km2": 0.0}
 DESCENT = {
@@ -42,7 +42,7 @@ PERFECT: Mapping[str, Mapping[str, Any]] = {
         "clock": _NO_CLOCK,
     },
 }
-#: A detector whose noise does not show: a million times the light and the well of the flight camera's.
+#: A detector with negligible noise: a million times the light and full well of the flight camera.
 NOISELESS = {
     "responsivity_e_s": 1.019e13,
     "full_well_e": 1.7e11,
@@ -53,10 +53,10 @@ NOISELESS = {
 
 
 def parameters(**parts: Any) -> DescentScenarioParameters:
-    """Parameters of a descent over the small world."""
+    """Return parameters of a descent over the small world."""
     return DescentScenarioParameters.model_validate(WORLD | {"descent": DESCENT} | parts)
 
 
 def run(case: int = 0, /, **parts: Any) -> CaseResult:
-    """One descent over the small world."""
+    """Run one descent over the small world."""
     return DescentScenario().run(parameters(**parts), Streams(1, "test", case))

@@ -1,4 +1,4 @@
-"""How right DIMES is where only geometry stands between it and the truth: no noise, exact instruments."""
+"""Tests of the geometric accuracy of DIMES without noise and with ideal instruments."""
 
 from typing import Any
 
@@ -16,13 +16,13 @@ from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 from tests.scenarios.descent.settings import FLAT, NOISELESS, PERFECT, parameters
 
-#: Swell of 200 m from trough to crest under ground that is rough on all scales.
+#: A swell of 200 m from trough to crest under ground that is rough on all scales.
 RELIEF = {"samples": 1024, "spacing_m": 4.0, "rms_slope_deg": 1.0, "swell": {"relief_m": 200.0}}
 CASES = 5
 
 
-def _tracked(case: int, **parts: Any) -> tuple[list[Track], list[State], DescentMeasurements, Surface]:
-    """A descent dispersed over the whole range of motions, and the tracks that passed DIMES' checks."""
+def _run_descent(case: int, **parts: Any) -> tuple[list[Track], list[State], DescentMeasurements, Surface]:
+    """Run a descent with the full dispersion of motions and return the tracks that passed DIMES' checks."""
     rng = np.random.default_rng(case)
     motion = {
         "wind_east_m_s": rng.uniform(-21.0, 21.0),
@@ -35,70 +35,70 @@ def _tracked(case: int, **parts: Any) -> tuple[list[Track], list[State], Descent
     }
     p = parameters(**PERFECT, descent=motion, detector=NOISELESS, **parts)
     world, streams = World.of(p), Streams(5, "accuracy", case)
-    flown = create_flight(p, world.surface, streams)
-    states = picture_states(p, flown)
+    flight = create_flight(p, world.surface, streams)
+    states = picture_states(p, flight)
     optics = camera_optics(p.camera)
-    detector = Detector.drawn(optics.fall_off, p.detector, streams.generator("detector response"))
+    detector = Detector.draw(optics.fall_off, p.detector, streams.generator("detector response"))
     pictures = [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
-    instruments = Instruments.draw(p, world, flown, streams)
-    measurements = measure(p, world, flown.motion, pictures, detector, instruments, streams)
+    instruments = Instruments.draw(p, world, flight, streams)
+    measurements = measure(p, world, flight.motion, pictures, detector, instruments, streams)
     details = DimesEstimator().estimate(measurements).details
     assert isinstance(details, DimesDetails)
     return [track for track in details.tracks if track.valid], states, measurements, world.surface
 
 
-def _errors(tracks: list[Track], states: list[State]) -> np.ndarray:
+def _velocity_errors(tracks: list[Track], states: list[State]) -> np.ndarray:
     true = mean_velocities(states)[:, :2]
     return np.array([track.velocity_m_s - true[track.pair] for track in tracks]).reshape(-1, 2)
 
 
-def test_over_flat_ground_velocities_are_right_to_15_cm_s() -> None:
-    """Bar: 0.15 m/s rms; each track counts, whether reported or not."""
-    errors = np.concatenate([_errors(*_tracked(case, terrain=FLAT)[:2]) for case in range(CASES)])
+def test_flat_ground_velocity_error_is_within_15_cm_s() -> None:
+    """Requirement: 0.15 m/s rms over all tracks, reported or not."""
+    errors = np.concatenate([_velocity_errors(*_run_descent(case, terrain=FLAT)[:2]) for case in range(CASES)])
     assert len(errors) >= 3 * CASES
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.15
 
 
-def test_over_relief_errors_are_those_of_geometry() -> None:
-    """Bar: 200 m of relief, errors as the formula says to 0.2 m/s rms.
-
-    A point at height h over an altimeter's plane, whose ray meets that plane at the horizontal offset rho from the
-    camera, truly lies at ``rho (1 - h / H)``. The displacement that a pair of pictures shows is wrong by ``h1 rho1 / H1
-    - h2 rho2 / H2``. A template covers points of many heights: what correlation finds is their mean, weighted by the
-    contrast in each direction.
+def test_relief_errors_match_geometric_prediction() -> None:
+    """Requirement: errors agree with the formula to 0.2 m/s rms over 200 m of relief. A point at height h above the
+    altimeter's plane, seen at the horizontal offset rho, is at ``rho (1 - h / H)``. The displacement of a pair is
+    wrong by ``h1 rho1 / H1 - h2 rho2 / H2``. A template covers many heights: correlation finds their mean, weighted
+    by the contrast in each direction.
     """
     errors, expected = [], []
     for case in range(CASES):
-        tracks, states, measurements, surface = _tracked(
+        tracks, states, measurements, surface = _run_descent(
             case, terrain=RELIEF, location={"bank": 1, "east_m": 511.0 * case}
         )
-        errors.append(_errors(tracks, states))
-        expected += [_formula(track, states, measurements, surface) for track in tracks]
+        errors.append(_velocity_errors(tracks, states))
+        expected += [_predict_error(track, states, measurements, surface) for track in tracks]
     measured, reported = np.concatenate(errors), np.array(expected)
     assert len(measured) >= 3 * CASES
     assert np.sqrt(np.mean(np.sum((measured - reported) ** 2, axis=1))) < 0.2
-    # there was something to explain
+    # The relief causes significant errors.
     assert np.sqrt(np.mean(np.sum(measured**2, axis=1))) > 0.4
 
 
-def _formula(track: Track, states: list[State], measurements: DescentMeasurements, surface: Surface) -> np.ndarray:
-    """Error of a track's velocity by the formula, m/s."""
+def _predict_error(
+    track: Track, states: list[State], measurements: DescentMeasurements, surface: Surface
+) -> np.ndarray:
+    """Predicted velocity error of a track, m/s."""
     first, second = states[track.pair], states[track.pair + 1]
     altitude_1, altitude_2 = altitudes_at_images(measurements)[track.pair : track.pair + 2]
     side = len(track.template)
     gsd = altitude_2 * 4.0 * 12e-6 / 14.67e-3
     steps = gsd * (np.arange(side) - 0.5 * (side - 1))
-    # rows run south
+    # Rows run south.
     offsets = np.stack([np.tile(steps, side), np.repeat(-steps, side)], axis=1)
     rho_1 = track.ground_m + offsets
-    share = np.ones(len(rho_1))
+    weight = np.ones(len(rho_1))
     for _ in range(60):
-        places = first.position_m[:2] + share[:, None] * rho_1
-        share = (first.position_m[2] - surface.height(places[:, 0], places[:, 1])) / altitude_1
-    heights = first.position_m[2] - share * altitude_1
+        positions = first.position_m[:2] + weight[:, None] * rho_1
+        weight = (first.position_m[2] - surface.height(positions[:, 0], positions[:, 1])) / altitude_1
+    heights = first.position_m[2] - weight * altitude_1
     above_1 = heights - (first.position_m[2] - altitude_1)
     above_2 = heights - (second.position_m[2] - altitude_2)
-    true_offset = first.position_m[:2] + share[:, None] * rho_1 - second.position_m[:2]
+    true_offset = first.position_m[:2] + weight[:, None] * rho_1 - second.position_m[:2]
     rho_2 = true_offset / (1.0 - above_2 / altitude_2)[:, None]
     shifts = above_1[:, None] * rho_1 / altitude_1 - above_2[:, None] * rho_2 / altitude_2
     south, east = np.gradient(track.template)

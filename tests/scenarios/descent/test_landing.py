@@ -1,4 +1,4 @@
-"""From the answer to the ground."""
+"""Tests of the touchdown velocity after steering with an estimated velocity."""
 
 import numpy as np
 import pytest
@@ -14,39 +14,38 @@ def _rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-def test_a_right_answer_takes_the_velocity_out() -> None:
-    landed = touchdown(EXACT, DRIFT, DRIFT.copy(), 17.0, _rng())
-    np.testing.assert_allclose(landed.with_answer, 0.0, atol=1e-12)
-    np.testing.assert_allclose(landed.without_answer, DRIFT)
+def test_correct_answer_cancels_the_velocity() -> None:
+    result = touchdown(EXACT, DRIFT, DRIFT.copy(), 17.0, _rng())
+    np.testing.assert_allclose(result.with_answer, 0.0, atol=1e-12)
+    np.testing.assert_allclose(result.without_answer, DRIFT)
 
 
-def test_steering_takes_out_no_more_than_it_can() -> None:
+def test_steering_is_limited_by_its_capability() -> None:
     fast = 2.0 * DRIFT
-    landed = touchdown(EXACT, fast, fast.copy(), 17.0, _rng())
-    np.testing.assert_allclose(np.hypot(*landed.with_answer), 30.0 - EXACT.max_steered_m_s)
+    result = touchdown(EXACT, fast, fast.copy(), 17.0, _rng())
+    np.testing.assert_allclose(np.hypot(*result.with_answer), 30.0 - EXACT.max_steered_m_s)
 
 
-def test_a_wrong_answer_does_harm() -> None:
-    """Steered by the opposite of its velocity the lander goes twice as fast."""
-    landed = touchdown(EXACT, DRIFT, -DRIFT, 17.0, _rng())
-    np.testing.assert_allclose(landed.with_answer, 2.0 * DRIFT)
+def test_wrong_answer_increases_the_velocity() -> None:
+    """Steering with the negated velocity doubles the velocity."""
+    result = touchdown(EXACT, DRIFT, -DRIFT, 17.0, _rng())
+    np.testing.assert_allclose(result.with_answer, 2.0 * DRIFT)
 
 
 @pytest.mark.parametrize(
-    ("believed", "available_s"),
-    [(None, 17.0), (DRIFT, EXACT.computation_s - 0.1), (np.array([3.0, -4.0]), 17.0)],
+    ("estimate", "available_s"), [(None, 17.0), (DRIFT, EXACT.computation_s - 0.1), (np.array([3.0, -4.0]), 17.0)]
 )
-def test_without_an_answer_in_time_nothing_is_steered(believed: np.ndarray | None, available_s: float) -> None:
-    landed = touchdown(EXACT, DRIFT, believed, available_s, _rng())
-    np.testing.assert_array_equal(landed.with_answer, landed.without_answer)
-    assert landed.punctual == (available_s >= EXACT.computation_s)
+def test_late_or_missing_answer_disables_steering(estimate: np.ndarray | None, available_s: float) -> None:
+    result = touchdown(EXACT, DRIFT, estimate, available_s, _rng())
+    np.testing.assert_array_equal(result.with_answer, result.without_answer)
+    assert result.punctual == (available_s >= EXACT.computation_s)
 
 
-def test_errors_of_burn_and_steering_have_their_size() -> None:
+def test_burn_and_steering_errors_have_specified_spread() -> None:
     p = LandingParameters(steering_error=0.1, burn_error_m_s=1.0)
-    landed = [touchdown(p, DRIFT, DRIFT.copy(), 17.0, np.random.default_rng(seed)) for seed in range(2000)]
-    without = np.stack([one.without_answer for one in landed]) - DRIFT
-    steered = np.stack([one.with_answer - one.without_answer for one in landed]) + DRIFT
-    # 4000 draws tell a standard deviation to 1.1 %
+    result = [touchdown(p, DRIFT, DRIFT.copy(), 17.0, np.random.default_rng(seed)) for seed in range(2000)]
+    without = np.stack([samples.without_answer for samples in result]) - DRIFT
+    steered = np.stack([samples.with_answer - samples.without_answer for samples in result]) + DRIFT
+    # 4000 draws determine a standard deviation to 1.1 %.
     assert without.std() == pytest.approx(1.0, rel=0.05)
     assert steered.std() == pytest.approx(1.5, rel=0.05)

@@ -1,4 +1,4 @@
-"""Descents of any number of pictures: what whom is given, and what is true of what is answered."""
+"""Tests of descents with any number of images: inputs of each algorithm and truth of each answer."""
 
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,12 @@ from marsyard.sim.measurements import DescentFrame, DescentMeasurements
 from tests.scenarios.descent.settings import DESCENT, PERFECT, parameters, run
 
 STREAM = "tests.scenarios.descent.test_many_pictures:Inertial"
-#: The three pictures of a descent as flown, among nine.
+#: Nine images of a descent that contain the three images of a standard descent.
 NINE: dict[str, Any] = {"pictures": 9, "descent": DESCENT | {"interval_s": 3.75 / 4}}
 
 
 class Inertial:
-    """Answers the inertial velocity: of the last interval, of the first half, and at last of the last instant."""
+    """Return the inertial velocity: of the last interval for each image, of the last instant at the end."""
 
     def start(self) -> None:
         self.frames: list[DescentFrame] = []
@@ -42,7 +42,7 @@ class Inertial:
 
 
 class Halfway(Inertial):
-    """Answers the mean velocity of the first two intervals, from the middle of the first to the middle of the last."""
+    """Return a mean velocity with a span from the middle of the first interval to the last image."""
 
     def finish(self) -> VelocityEstimate:
         first, *_, last = (frame.image.time_s for frame in self.frames)
@@ -50,75 +50,75 @@ class Halfway(Inertial):
 
 
 @pytest.fixture(scope="module")
-def nine() -> CaseResult:
-    """Nine pictures with perfect instruments: what inertial navigation says is true."""
+def nine_images() -> CaseResult:
+    """Nine images with ideal instruments: the inertial velocity is exact."""
     return run(algorithm=STREAM, compared=["dimes"], **NINE, **PERFECT)
 
 
-def test_the_truth_is_of_what_the_answer_is_of(nine: CaseResult) -> None:
-    """The inertial unit makes no errors here, so that its velocities are true of every span."""
-    row: Any = nine.row
-    assert (nine.outcome, row["stream_pictures"], row["pictures_before_answer"]) == ("VALID", 9, 2)
+def test_truth_has_the_span_of_the_answer(nine_images: CaseResult) -> None:
+    """The inertial unit has no errors: its velocities are exact for each span."""
+    row: Any = nine_images.row
+    assert (nine_images.outcome, row["stream_pictures"], row["pictures_before_answer"]) == ("VALID", 9, 2)
     assert np.isnan(row["velocity_error_after_1_m_s"])
     after = [row[f"velocity_error_after_{number}_m_s"] for number in range(2, 10)]
-    # 400 Hz samples of a swinging descent, added up by the trapezoidal rule
+    # Trapezoidal integration of 400 Hz samples of a swinging descent.
     assert max(after) < 1e-3
     assert float(row["velocity_error_m_s"]) < 1e-3
     assert float(row["firing_velocity_error_m_s"]) < 2e-2
-    # of an instant, not of the interval before it: the swinging camera changes its velocity
-    means = nine.products["after_true_m_s"][-1]
-    assert np.hypot(*(means - nine.products["velocity_true_m_s"])) > 0.05
+    # The span is an instant, not the last interval: the camera swings and its velocity changes.
+    means = nine_images.products["after_true_m_s"][-1]
+    assert np.hypot(*(means - nine_images.products["velocity_true_m_s"])) > 0.05
 
 
-def test_an_estimator_of_three_gets_those_of_a_descent_of_three(nine: CaseResult) -> None:
+def test_three_image_estimator_gets_standard_images(nine_images: CaseResult) -> None:
     three = run(**PERFECT).row
-    assert [nine.row[f"altitude_{number}_m"] for number in (1, 5, 9)] == [
+    assert [nine_images.row[f"altitude_{number}_m"] for number in (1, 5, 9)] == [
         three[f"altitude_{number}_m"] for number in (1, 2, 3)
     ]
     for name in ("velocity_true_x_m_s", "velocity_true_y_m_s"):
-        assert nine.row[f"dimes.{name}"] == pytest.approx(three[name], rel=1e-12)
-    assert (nine.row["feasible_overlap_first_pair"], nine.row["feasible_overlap_second_pair"]) == (
+        assert nine_images.row[f"dimes.{name}"] == pytest.approx(three[name], rel=1e-12)
+    assert (nine_images.row["feasible_overlap_first_pair"], nine_images.row["feasible_overlap_second_pair"]) == (
         three["feasible_overlap_first_pair"],
         three["feasible_overlap_second_pair"],
     )
-    assert float(nine.row["dimes.velocity_error_m_s"]) < 1.0
-    assert "dimes.stream_pictures" not in nine.row
+    assert float(nine_images.row["dimes.velocity_error_m_s"]) < 1.0
+    assert "dimes.stream_pictures" not in nine_images.row
 
 
-def test_pictures_that_dimes_was_given_are_kept_for_its_figures() -> None:
+def test_dimes_input_images_are_stored_for_figures() -> None:
     case = run(compared=[STREAM], triple=[1, 2, 3], **NINE)
     assert [name for name in case.products if name.startswith("image_")] == ["image_1", "image_2", "image_3"]
     assert {"Inertial.stream_pictures", "Inertial.velocity_nees"} <= set(case.row)
 
 
-def test_a_span_between_pictures() -> None:
-    """A quarter of the way: between the pictures' true times in proportion, by the descent's own motion."""
+def test_span_between_images_is_interpolated() -> None:
+    """A quarter of an interval: interpolation between the true image times along the true motion."""
     spec = "tests.scenarios.descent.test_many_pictures:Halfway"
     two, nine = (
         run(algorithm=spec, pictures=pictures, descent=DESCENT | {"interval_s": 4.0 / (pictures - 1)}, **PERFECT)
         for pictures in (2, 9)
     )
-    # the same instants of the same flight, told by other pictures
+    # The same instants of the same flight with other images.
     for axis in "xy":
         assert two.row[f"velocity_true_{axis}_m_s"] == pytest.approx(nine.row[f"velocity_true_{axis}_m_s"], abs=1e-9)
     assert "feasible_overlap" not in two.row
     assert "velocity_change_error_m_s" not in two.row
 
 
-def test_a_case_of_many_pictures_is_a_function_of_its_parameters() -> None:
+def test_many_image_case_is_deterministic() -> None:
     errors: dict[str, Any] = {"pictures": 4, "descent": DESCENT | {"interval_s": 1.0}, "algorithm": STREAM}
-    first, again = run(**errors), run(**errors)
-    assert differing_columns(dict(first.row), dict(again.row)) == ()
+    first, repeated = run(**errors), run(**errors)
+    assert differing_columns(dict(first.row), dict(repeated.row)) == ()
 
 
-def test_pictures_are_written_down_for_others(tmp_path: Path) -> None:
+def test_exported_images_can_be_answered_offline(tmp_path: Path) -> None:
     run(algorithm=f"export:{tmp_path}", pictures=4, descent=DESCENT | {"interval_s": 1.0})
     written = read_case(tmp_path / "cases" / "000000")
     assert isinstance(written, DescentMeasurements)
     assert len(written.images) == len(written.attitudes) == len(written.altitudes) == 4
     assert written.interval_velocities_m_s.shape == (3, 3)
     assert written.inertial_velocities_m_s is not None
-    # an answer of a span of its own is scored over that
+    # An answer with its own span is scored over that span.
     start, end = written.tags_s[0], written.tags_s[2]
     table = tmp_path / "answers.csv"
     table.write_text(f"case,velocity_east_m_s,velocity_north_m_s,start_s,end_s\n0,1,2,{start!r},{end!r}\n")
@@ -140,16 +140,16 @@ def test_pictures_are_written_down_for_others(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_numbers_of_pictures_that_cannot_be(parts: dict[str, Any], message: str) -> None:
+def test_invalid_image_counts_are_rejected(parts: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parameters(**parts)
 
 
-@pytest.mark.parametrize(("pictures", "places"), [(3, (0, 1, 2)), (4, (1, 2, 3)), (5, (0, 2, 4)), (10, (1, 5, 9))])
-def test_three_as_far_apart_as_can_be(pictures: int, places: tuple[int, int, int]) -> None:
-    assert parameters(pictures=pictures).triple_indices == places
+@pytest.mark.parametrize(("pictures", "positions"), [(3, (0, 1, 2)), (4, (1, 2, 3)), (5, (0, 2, 4)), (10, (1, 5, 9))])
+def test_three_images_are_spread_evenly(pictures: int, positions: tuple[int, int, int]) -> None:
+    assert parameters(pictures=pictures).triple_indices == positions
 
 
-def test_no_picture_is_taken_after_the_firing() -> None:
+def test_no_image_is_captured_after_firing() -> None:
     with pytest.raises(ValueError, match=r"picture \d of 9 would be taken at .* s, after the thrusters' firing"):
         run(pictures=9)

@@ -1,4 +1,4 @@
-"""Flights from files: the simulated flight, written down and flown again, is the same case."""
+"""Tests of recorded flights: a simulated flight that is saved and read back gives the same case."""
 
 from __future__ import annotations
 
@@ -19,105 +19,109 @@ from marsyard.sim.dynamics.recorded import COLUMNS
 from marsyard.sim.streams import Streams
 from tests.scenarios.descent.settings import parameters, run
 
-#: OpenCV's camera axes in the body's: written by hand, as rows.
+#: OpenCV's camera axes in the body axes, as rows.
 CAMERA_IN_BODY = Rotation.from_matrix([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
 NED_FROM_ENU = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
 
 
-def _written(folder: Path, times: np.ndarray, positions: np.ndarray, attitudes: Rotation) -> str:
+def _write_poses(folder: Path, times: np.ndarray, positions: np.ndarray, attitudes: Rotation) -> str:
     path = folder / "flight.parquet"
     values = np.column_stack([times, positions, attitudes.as_quat()])
     pd.DataFrame(values, columns=list(COLUMNS)).to_parquet(path)
     return str(path)
 
 
-def _straight(folder: Path, **changes: Any) -> str:
-    """20 s of falling at 70 m/s from 2200 m, camera down, in the camera's axes."""
+def _write_vertical_fall(folder: Path, **changes: Any) -> str:
+    """20 s of fall at 70 m/s from 2200 m with the camera down, in camera axes."""
     times = np.arange(0.0, 25.0, 0.1)
     positions = np.column_stack([10.0 * times, 0.0 * times, changes.get("height", 2200.0) - 70.0 * times])
     down = Rotation.from_matrix([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
     tilt = Rotation.from_euler("x", changes.get("tilt_deg", 0.0), degrees=True)
-    return _written(folder, times, positions, Rotation.concatenate([tilt * down] * times.size))
+    return _write_poses(folder, times, positions, Rotation.concatenate([tilt * down] * times.size))
 
 
-def test_a_simulated_flight_from_its_file_is_the_same_case(tmp_path: Path) -> None:
-    """At 50 Hz, in north, east, down and the camera's axes, times counted from another zero."""
+def test_recorded_flight_equals_the_simulated_case(tmp_path: Path) -> None:
+    """50 Hz, north-east-down, camera axes and another time origin."""
     simulated, p = run(), parameters()
     world = World.of(p)
-    flown = create_flight(p, world.surface, Streams(1, "test", 0))
-    times = np.arange(-5.0, flown.firing_s + 1.0, 0.02)
-    truth = flown.motion.motion(times)
-    place = np.array(
+    flight = create_flight(p, world.surface, Streams(1, "test", 0))
+    times = np.arange(-5.0, flight.firing_s + 1.0, 0.02)
+    truth = flight.motion.motion(times)
+    position = np.array(
         [p.location.east_m, p.location.north_m, world.surface.height(p.location.east_m, p.location.north_m)]
     )
-    file = _written(
+    file = _write_poses(
         tmp_path,
         times + 1234.0,
-        NED_FROM_ENU.apply(truth.positions_m - place),
+        NED_FROM_ENU.apply(truth.positions_m - position),
         NED_FROM_ENU * truth.attitudes * CAMERA_IN_BODY.inv(),
     )
     recorded = run(flight={"file": file, "axes": "ned", "first_picture_s": 1234.0})
     assert recorded.outcome == simulated.outcome == "VALID"
     for name in ("velocity_true_x_m_s", "velocity_true_y_m_s", "altitude_1_m", "off_nadir_3_deg", "firing_after_s"):
         assert recorded.row[name] == pytest.approx(simulated.row[name], abs=1e-2), name
-    # the pictures differ by what 0.1 mm moves; the estimate by less than its own error
+    # Images differ by the effect of 0.1 mm of motion; the estimate differs by less than its error.
     for axis in "xy":
         name = f"velocity_estimated_{axis}_m_s"
         assert recorded.row[name] == pytest.approx(simulated.row[name], abs=0.05)
-    # instruments are laid over it with the same errors
+    # The instruments have the same errors.
     for name in ("attitude_error_common_deg", "altitude_error_2_m", "tag_error_1_s"):
         assert recorded.row[name] == pytest.approx(simulated.row[name], rel=0.02, abs=1e-4), name
     assert recorded.row["flight_file"] == file
     assert not any(name.startswith("descent_wind") for name in recorded.row)
 
 
-def test_a_flight_is_turned_and_moved_with_its_place(tmp_path: Path) -> None:
-    file = _straight(tmp_path)
+def test_flight_is_transformed_with_its_start(tmp_path: Path) -> None:
+    file = _write_vertical_fall(tmp_path)
     p = DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu", "turn_deg": 90.0}})
     assert isinstance(p.flight, FlightFile)
     motion = p.flight.motion(np.array([100.0, 200.0, 30.0]), 3.7)
-    # to the east becomes to the south
+    # East becomes south.
     assert np.allclose(motion.state(0.0).position_m, [100.0, 200.0 - 50.0, 30.0 + 2200.0 - 350.0])
     assert np.allclose(motion.state(0.0).velocity_m_s, [0.0, -10.0, -70.0])
     assert np.allclose(motion.state(0.0).specific_force_m_s2, [0.0, 0.0, 3.7], atol=1e-9)
-    # the body's -z looks down, its columns where east was
+    # The -z axis of the body points down; its columns point to the former east.
     assert np.allclose(motion.state(0.0).attitude.apply([0.0, 0.0, -1.0]), [0.0, 0.0, -1.0])
     assert np.allclose(motion.state(0.0).attitude.apply([1.0, 0.0, 0.0]), [0.0, -1.0, 0.0])
 
 
-def test_levers_and_mountings(tmp_path: Path) -> None:
-    """A vehicle whose axes are the world's, with a camera that looks along its -z, 2 m below."""
+def test_lever_arm_and_mounting_are_applied(tmp_path: Path) -> None:
+    """A vehicle with world axes and a camera 2 m below that looks along its -z axis."""
     times = np.arange(0.0, 20.0, 0.1)
     positions = np.column_stack([0.0 * times, 0.0 * times, 2000.0 - 50.0 * times])
-    file = _written(tmp_path, times, positions, Rotation.identity(times.size))
+    file = _write_poses(tmp_path, times, positions, Rotation.identity(times.size))
     quaternion = tuple(Rotation.from_matrix(np.diag([1.0, -1.0, -1.0])).as_quat().tolist())
-    stated = {"file": file, "axes": "enu", "mounting": quaternion, "lever_m": (0.0, 0.0, -2.0)}
-    p = DescentScenarioParameters.model_validate({"flight": stated})
+    settings = {"file": file, "axes": "enu", "mounting": quaternion, "lever_m": (0.0, 0.0, -2.0)}
+    p = DescentScenarioParameters.model_validate({"flight": settings})
     assert isinstance(p.flight, FlightFile)
     state = p.flight.motion(np.zeros(3), 3.7).state(0.0)
     assert np.allclose(state.attitude.as_matrix(), np.eye(3))
     assert state.position_m[2] == pytest.approx(2000.0 - 250.0 - 2.0)
 
 
-def test_what_cannot_be_flown_is_refused_when_the_campaign_is_read(tmp_path: Path) -> None:
-    def refused(match: str, file: str, **stated: Any) -> None:
+def test_invalid_flights_are_rejected_on_load(tmp_path: Path) -> None:
+    def expect_error(match: str, file: str, **settings: Any) -> None:
         with pytest.raises(ValidationError, match=match):
-            DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu"} | stated})
+            DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu"} | settings})
 
-    refused("at picture 1 the camera looks up, 60.0 deg above the horizon", _straight(tmp_path, tilt_deg=150.0))
-    refused("at picture 1 the camera looks up", _straight(tmp_path), attitude_of="body")
-    refused(r"at picture 3 the camera is 5.0 m below the ground", _straight(tmp_path, height=870.0))
-    refused(r"covers 0.000 to 24.900 s; pictures from 23.000 to", _straight(tmp_path), first_picture_s=23.0)
-    refused("flight.axes|axes", _straight(tmp_path), axes="xyz")
-    refused("no quaternion of length 1", _straight(tmp_path), mounting=(0.0, 0.0, 0.0, 2.0))
-    refused("absent.csv: cannot be read", "absent.csv")
+    expect_error(
+        "at picture 1 the camera looks up, 60.0 deg above the horizon", _write_vertical_fall(tmp_path, tilt_deg=150.0)
+    )
+    expect_error("at picture 1 the camera looks up", _write_vertical_fall(tmp_path), attitude_of="body")
+    expect_error(r"at picture 3 the camera is 5.0 m below the ground", _write_vertical_fall(tmp_path, height=870.0))
+    expect_error(
+        r"covers 0.000 to 24.900 s; pictures from 23.000 to", _write_vertical_fall(tmp_path), first_picture_s=23.0
+    )
+    expect_error("flight.axes|axes", _write_vertical_fall(tmp_path), axes="xyz")
+    expect_error("no quaternion of length 1", _write_vertical_fall(tmp_path), mounting=(0.0, 0.0, 0.0, 2.0))
+    expect_error("absent.csv: cannot be read", "absent.csv")
 
 
-def test_a_file_that_changed_is_no_longer_the_campaigns(tmp_path: Path) -> None:
-    file = _straight(tmp_path)
+def test_changed_flight_file_is_rejected(tmp_path: Path) -> None:
+    file = _write_vertical_fall(tmp_path)
     p = DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu"}})
     stored = p.model_dump(mode="json", round_trip=True)
     assert DescentScenarioParameters.model_validate(stored) == p
-    _straight(tmp_path, height=2300.0)
+    _write_vertical_fall(tmp_path, height=2300.0)
     with pytest.raises(ValidationError, match=r"flight.parquet: has changed since the campaign was made"):
         DescentScenarioParameters.model_validate(stored)

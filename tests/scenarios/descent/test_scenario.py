@@ -1,4 +1,4 @@
-"""Whole descents: truth, measurement and score hang together."""
+"""Tests of complete descents: truth, measurements and scores are consistent."""
 
 import math
 from pathlib import Path
@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.campaigns.definition.catalogue import catalogue
-from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.loading import catalogue, load_campaign
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 from tests.scenarios.descent.settings import DESCENT, FLAT, PERFECT, WORLD, run
@@ -19,30 +18,30 @@ def nominal() -> CaseResult:
     return run()
 
 
-def _timeless(row: Any) -> dict[str, Any]:
+def _drop_times(row: Any) -> dict[str, Any]:
     return {name: value for name, value in row.items() if "time" not in name}
 
 
-def test_a_case_is_a_function_of_its_parameters_and_streams(nominal: CaseResult) -> None:
+def test_case_is_deterministic(nominal: CaseResult) -> None:
     other = run(1)
-    again = run()
-    assert _timeless(again.row) == _timeless(nominal.row)
+    repeated = run()
+    assert _drop_times(repeated.row) == _drop_times(nominal.row)
     assert other.row["image_hash"] != nominal.row["image_hash"]
 
 
-def test_every_dispersion_of_the_catalogue_is_read_back() -> None:
-    """Each under the end of its path, from the objects that were simulated; the fault by its name and size."""
+def test_each_catalogue_dispersion_is_reported() -> None:
+    """Each column has the last part of the path as its name and the simulated value; a fault has name and size."""
     dispersed = load_campaign("dimes-gusev").draws(3)
-    drawn = {path: value for path, value in dispersed.items() if path != "location.terrain"}
+    samples = {path: value for path, value in dispersed.items() if path != "location.terrain"}
     tables: dict[str, Any] = {"location": dict(WORLD["location"]), "faults": {"late_s": 0.25}}
-    for path, value in drawn.items():
+    for path, value in samples.items():
         *names, last = path.split(".")
         table = tables
         for name in names:
             table = table.setdefault(name, {})
         table[last] = value
     row = run(**tables).row
-    for path, value in drawn.items():
+    for path, value in samples.items():
         column = path.replace(".", "_")
         assert row[column] == pytest.approx(value, rel=1e-9), path
     assert (row["fault"], row["fault_size"], row["terrain"]) == ("late_s", 0.25, 0)
@@ -52,7 +51,7 @@ def test_every_dispersion_of_the_catalogue_is_read_back() -> None:
 
 
 @pytest.mark.parametrize("name", ["velocity", "firing_velocity"])
-def test_the_error_is_the_estimate_less_the_truth(nominal: CaseResult, name: str) -> None:
+def test_velocity_error_is_estimate_minus_truth(nominal: CaseResult, name: str) -> None:
     row: Any = nominal.row
     assert nominal.answered
     for axis in "xy":
@@ -62,7 +61,7 @@ def test_the_error_is_the_estimate_less_the_truth(nominal: CaseResult, name: str
     assert row[f"{name}_error_m_s"] == pytest.approx(math.hypot(row[f"{name}_error_x_m_s"], row[f"{name}_error_y_m_s"]))
 
 
-def test_figures_are_drawn_from_what_was_scored(nominal: CaseResult) -> None:
+def test_figures_use_the_scored_data(nominal: CaseResult) -> None:
     row = nominal.row
     for kind in ("true", "estimated"):
         stored = [float(row[f"velocity_{kind}_{axis}_m_s"]) for axis in "xy"]
@@ -70,21 +69,20 @@ def test_figures_are_drawn_from_what_was_scored(nominal: CaseResult) -> None:
     assert all(nominal.products[f"image_{k}"].shape == (256, 1024) for k in (1, 2, 3))
 
 
-def test_truth_is_the_mean_velocity_of_the_camera() -> None:
-    """Without swing and gusts the lander drifts with the wind, which is even above its boundary layer of 500 m."""
-    still = {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "gust_intensity_m_s": 0.0}
-    row = run(descent=DESCENT | still).row
+def test_truth_is_mean_camera_velocity() -> None:
+    """Without swing and gusts the lander drifts with the wind, which is uniform above the boundary layer of 500 m."""
+    static = {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "gust_intensity_m_s": 0.0}
+    row = run(descent=DESCENT | static).row
     assert row["velocity_true_x_m_s"] == pytest.approx(14.0, abs=1e-6)
     assert row["velocity_true_y_m_s"] == pytest.approx(-9.0, abs=1e-6)
-    # in the boundary layer the wind falls off, and the canopy with it
+    # In the boundary layer the wind decreases, and the parachute follows.
     assert 0.0 < float(row["firing_velocity_true_x_m_s"]) < 14.0
 
 
 @pytest.mark.parametrize("wind", [(25.0, 0.0), (0.0, 25.0), (-18.0, -18.0)])
-def test_with_perfect_instruments_over_flat_ground_the_velocity_is_right(wind: tuple[float, float]) -> None:
-    """Signs and axes of the whole chain: 0.15 m/s is a tenth of a binned pixel over 3.75 s.
-
-    Carried to the thrusters' firing by a perfect inertial unit, the velocity is as right as it was.
+def test_ideal_instruments_over_flat_ground_give_exact_velocity(wind: tuple[float, float]) -> None:
+    """Signs and axes of the complete chain: 0.15 m/s is a tenth of a binned pixel over 3.75 s. Propagation to the
+    firing with an ideal inertial unit keeps the error.
     """
     east, north = wind
     descent = DESCENT | {"wind_east_m_s": east, "wind_north_m_s": north}
@@ -96,32 +94,31 @@ def test_with_perfect_instruments_over_flat_ground_the_velocity_is_right(wind: t
         assert row[f"firing_velocity_error_{axis}_m_s"] == pytest.approx(row[f"velocity_error_{axis}_m_s"], abs=0.01)
 
 
-def test_perfect_instruments_are_reported_to_be(nominal: CaseResult) -> None:
-    """Over flat ground nothing is left but the altitude's way from the radar's last reading to the picture."""
+def test_ideal_instruments_are_reported_without_errors(nominal: CaseResult) -> None:
+    """Over flat ground the only error is the altitude change between the last radar reading and the image."""
     row = run(**PERFECT, terrain=FLAT).row
     for name in ("attitude_error_common_deg", "attitude_error_independent_deg"):
         assert float(row[name]) < 1e-4 < float(nominal.row[name])
-    # a tenth of a second at 0.3 m/s2 and at half a swing's 2 m/s: 0.1 m of 1400
+    # A tenth of a second at 0.3 m/s2 and at a swing velocity of 2 m/s: 0.1 m of 1400 m.
     assert abs(float(row["altitude_error_common"])) < 1e-4 < abs(float(nominal.row["altitude_error_common"]))
     assert float(row["velocity_change_error_m_s"]) < 1e-3 < float(nominal.row["velocity_change_error_m_s"])
 
 
-def test_errors_of_instruments_are_of_their_class() -> None:
-    """Radar: 1 % is 3 sigma of all errors together; navigation: a tenth of a degree after 20 minutes at 1 deg/h."""
+def test_instrument_errors_have_the_specified_size() -> None:
+    """Radar: 1 % is 3 sigma of all errors. Navigation: a tenth of a degree after 20 minutes at 1 deg/h."""
     rows = [run(case).row for case in range(4)]
     altitude = np.array([float(row["altitude_error_common"]) for row in rows])
     attitude = np.array([float(row["attitude_error_common_deg"]) for row in rows])
-    own = np.array([float(row["attitude_error_independent_deg"]) for row in rows])
+    independent = np.array([float(row["attitude_error_independent_deg"]) for row in rows])
     assert np.abs(altitude).max() < 0.015
     assert 0.01 < attitude.max() < 0.5
-    # between pictures the gyros drift by little: tags that are off by 1 ms at 20 deg/s are most of it
-    assert own.max() < 0.1
+    # Gyro drift between images is small: a time tag error of 1 ms at 20 deg/s dominates.
+    assert independent.max() < 0.1
 
 
-def test_an_attitude_error_makes_the_velocity_error_it_must() -> None:
-    """An error of attitude common to all pictures turns the displacement that the pictures show, descent and all.
-
-    First order in the error b: ``b x v``. Tolerance: a template 20 deg from nadir adds 13 % to the descent's share.
+def test_attitude_error_causes_predicted_velocity_error() -> None:
+    """An attitude error common to all images rotates the observed displacement, including the descent. First order in
+    the error b: ``b x v``. Tolerance: a template 20 deg from nadir adds 13 % to the part of the descent.
     """
     steady = DESCENT | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0}
     errors, expected = [], []
@@ -139,15 +136,15 @@ def test_an_attitude_error_makes_the_velocity_error_it_must() -> None:
     assert np.abs(expected).max() > 1.0
 
 
-def test_an_altitude_error_common_to_all_pictures_scales_the_velocity() -> None:
-    """2 % too high: displacements come out 2 % too large, and so does the velocity."""
+def test_common_altitude_error_scales_the_velocity() -> None:
+    """An altitude error of +2 % makes displacements and velocity 2 % too large."""
     steady = DESCENT | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "wind_east_m_s": 25.0}
     row = run(**PERFECT, terrain=FLAT, descent=steady, faults={"altitude_error": 0.02}).row
     assert row["velocity_error_x_m_s"] == pytest.approx(0.02 * float(row["velocity_true_x_m_s"]), abs=0.12)
     assert row["altitude_error_common"] == pytest.approx(0.02, abs=1e-4)
 
 
-def test_conditions_are_read_from_the_simulated_objects(nominal: CaseResult) -> None:
+def test_conditions_come_from_simulated_objects(nominal: CaseResult) -> None:
     row: Any = nominal.row
     assert row["altitude_1_m"] == pytest.approx(2000.0, abs=20.0)
     assert row["altitude_1_m"] - row["altitude_3_m"] == pytest.approx(7.5 * row["descent_rate_m_s"], abs=40.0)
@@ -159,12 +156,12 @@ def test_conditions_are_read_from_the_simulated_objects(nominal: CaseResult) -> 
     assert row["descent_wind_east_m_s"] == 14.0
     assert row["descent_heading_deg"] == 70.0
     assert (row["fault"], row["fault_size"], row["site"]) == ("none", 0.0, "plain")
-    # 1300 m at about 72 m/s
+    # 1300 m at about 72 m/s.
     assert 15.0 < float(row["firing_after_s"]) < 21.0
 
 
-def test_no_room_for_a_template_is_an_outcome_without_velocity() -> None:
-    """Swinging from 42 deg to the other side the pictures do not share enough ground, by truth as by measurement."""
+def test_insufficient_overlap_gives_no_velocity() -> None:
+    """A swing from 42 deg to the opposite side: the images do not overlap enough in truth or measurement."""
     swinging = {"cone_angle_deg": 42.0, "cone_phase_deg": 0.0, "cone_minor_fraction": 0.0}
     result = run(descent=DESCENT | swinging)
     assert result.outcome == "NO_TEMPLATE_AREA"
@@ -175,30 +172,30 @@ def test_no_room_for_a_template_is_an_outcome_without_velocity() -> None:
         assert math.isfinite(float(result.row[f"{name}_true_x_m_s"]))
 
 
-def test_room_is_judged_by_truth_alone(nominal: CaseResult) -> None:
-    """Altitudes measured at half make DIMES look in the wrong places; the geometry has not changed."""
-    wrong = run(faults={"altitude_error": 0.4})
+def test_feasible_overlap_is_computed_from_truth(nominal: CaseResult) -> None:
+    """Half the true altitude makes DIMES search in the wrong areas; the true geometry is unchanged."""
+    low_altitude = run(faults={"altitude_error": 0.4})
     for name in ("feasible_overlap", "feasible_overlap_first_pair", "feasible_overlap_second_pair"):
-        assert wrong.row[name] == nominal.row[name]
+        assert low_altitude.row[name] == nominal.row[name]
     assert nominal.row["feasible_overlap"] is True
 
 
-def test_in_the_dark_nothing_is_reported() -> None:
+def test_darkness_gives_no_velocity() -> None:
     result = run(detector={"responsivity_e_s": 1.0})
     assert result.outcome == "NO_VALID_TRACK"
     assert not result.answered
 
 
-def test_over_a_site_the_velocity_is_right() -> None:
+def test_velocity_over_a_site_is_accurate() -> None:
     result = run(site="gusev", **PERFECT)
     assert result.outcome == "VALID"
     assert result.row["site"] == "gusev"
-    # relief of 2 deg slopes moves a template against the plane below the lander, by 1 m/s at worst here
+    # Slopes of 2 deg shift a template against the plane below the lander, by at most 1 m/s here.
     assert float(result.row["velocity_error_m_s"]) < 1.0
 
 
-def test_real_terrain_can_be_descended_on(tmp_path: Path) -> None:
-    """A terrain model from a file in the site's surround; the pictures are of it."""
+def test_descent_over_imported_terrain(tmp_path: Path) -> None:
+    """A terrain model from a file in the surround of a site appears in the images."""
     heights = 30.0 * np.sin(np.arange(200) / 9.0)[:, None] * np.cos(np.arange(200) / 7.0)
     np.savez(tmp_path / "dtm.npz", dem=heights, dem_gsd=8.0)
     middle = {"location": {"bank": 1, "east_m": 1536.0, "north_m": 1536.0}}
@@ -207,19 +204,19 @@ def test_real_terrain_can_be_descended_on(tmp_path: Path) -> None:
     without = run(site="gusev", **middle)
     assert result.outcome == "VALID"
     assert result.row["image_hash"] != without.row["image_hash"]
-    # crests and hollows of 30 m up to 500 m aside
+    # Crests and hollows of 30 m up to 500 m away.
     assert float(result.row["velocity_error_m_s"]) < 4.0
 
 
-def test_another_algorithm_is_given_the_same() -> None:
+def test_compared_algorithm_gets_the_same_inputs() -> None:
     result = run(algorithm="tests.scenarios.descent.guesses:Inertial")
     assert result.outcome == "VALID"
     assert result.row["velocity_estimated_x_m_s"] == pytest.approx(14.0, abs=8.0)
     assert "tracks" not in result.products
 
 
-def test_a_slow_algorithm_is_late_at_the_firing() -> None:
-    """Its measured time decides, by the flight computer's factor: 0.1 s are 60 s there, and 14 to 24 s are left."""
+def test_slow_algorithm_misses_the_firing() -> None:
+    """The measured time is scaled by the flight computer's factor: 0.1 s become 60 s, but 14 to 24 s are available."""
     slow = run(algorithm="tests.scenarios.descent.guesses:SlowInertial").row
     quick = run(algorithm="tests.scenarios.descent.guesses:Inertial").row
     assert float(slow["estimation_time_s"]) >= 0.1
@@ -228,6 +225,6 @@ def test_a_slow_algorithm_is_late_at_the_firing() -> None:
     assert unhurried["answer_in_time"] is True
 
 
-def test_dimes_time_is_asked_of_the_measured_time() -> None:
-    asked = {one.id: one for one in load_campaign("dimes-landing").configuration.requirements}
-    assert asked["DIMES-TIME"].metric == "answer_in_time"
+def test_dimes_run_time_requirement_uses_measured_time() -> None:
+    requested = {one.id: one for one in load_campaign("dimes-landing").configuration.requirements}
+    assert requested["DIMES-TIME"].metric == "answer_in_time"

@@ -1,4 +1,4 @@
-"""Faults of a flight, as the instruments show them."""
+"""Tests of flight faults in the readings of the instruments."""
 
 from __future__ import annotations
 
@@ -6,58 +6,64 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from marsyard.scenarios.faults import faulty_detector
-from marsyard.scenarios.landing.faults import Faults, arrived_numbers, faulty_helicopter, faulty_ranges, stuck_range_m
+from marsyard.scenarios.conditions import faulty_detector
 from marsyard.scenarios.landing.helicopter import HelicopterParameters, Transit
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.parameters import (
+    Faults,
+    LandingScenarioParameters,
+    draw_arrivals,
+    faulty_helicopter,
+    faulty_ranges,
+    stuck_range_m,
+)
 from marsyard.sim.sensor import preset
 from marsyard.sim.streams import Streams
 
 HELICOPTER = HelicopterParameters.model_validate({"transit": {"hover_s": 8.0}})
 
 
-def test_an_outage_lasts_from_before_the_pictures_until_after_the_landing() -> None:
-    """The filter starts as ever, and coasts from then on: its errors grow by metres in 40 s."""
+def test_outage_covers_images_and_landing() -> None:
+    """The filter starts normally and then coasts: its errors grow by metres in 40 s."""
     off: dict[float, list[float]] = {0.0: [], 40.0: []}
     for outage, errors in off.items():
-        flown = faulty_helicopter(Faults(gps_outage_s=outage), HELICOPTER)
+        flight = faulty_helicopter(Faults(gps_outage_s=outage), HELICOPTER)
         for case in range(6):
-            transit = Transit.flown(flown, np.array([0.0, 0.0, 10.0]), 0.5, 0.5, 9.8, Streams(7, "outage", case))
-            believed = np.array(transit.pose(0).world_from_body.translation)
-            errors.append(float(np.hypot(*(believed - transit.state(0).position_m)[:2])))
+            transit = Transit.fly(flight, np.array([0.0, 0.0, 10.0]), 0.5, 0.5, 9.8, Streams(7, "outage", case))
+            estimate = np.array(transit.pose(0).world_from_body.translation)
+            errors.append(float(np.hypot(*(estimate - transit.state(0).position_m)[:2])))
             known = np.isfinite(transit.navigated.solutions.positions_m[:, 0])
             assert known.all() if not outage else not known[transit.navigated.fix_times_s >= -outage].any()
             assert known[transit.navigated.fix_times_s < -outage].all()
     assert np.median(off[40.0]) > 10.0 * np.median(off[0.0])
 
 
-def test_a_stuck_altimeter_repeats_a_range_of_a_greater_height() -> None:
+def test_stuck_altimeter_repeats_an_earlier_range() -> None:
     ranges = np.array([9.0, 10.0, 11.0])
     np.testing.assert_array_equal(faulty_ranges(Faults(), ranges, 10.0), ranges)
     np.testing.assert_allclose(faulty_ranges(Faults(laser_stuck=0.2), ranges, 10.0), 12.0)
     assert np.isnan(faulty_ranges(Faults(laser_silent=1), ranges, 10.0)).all()
-    # which never is below the height at which the landing slows down
+    # This height is always above the height at which the landing slows down.
     assert stuck_range_m(Faults(laser_silent=1), 10.0) == np.inf
     assert stuck_range_m(Faults(), 10.0) is None
 
 
-def test_lost_pictures_leave_two_at_the_minimum() -> None:
+def test_two_images_always_remain() -> None:
     rng = np.random.default_rng(0)
-    assert len(arrived_numbers(Faults(), 40, rng)) == 40
-    some = arrived_numbers(Faults(lost_pictures=0.75), 40, rng)
-    assert len(np.unique(some)) == 10
-    assert np.all(np.diff(some) > 0)
-    assert len(arrived_numbers(Faults(lost_pictures=1.0), 40, rng)) == 2
+    assert len(draw_arrivals(Faults(), 40, rng)) == 40
+    subset = draw_arrivals(Faults(lost_pictures=0.75), 40, rng)
+    assert len(np.unique(subset)) == 10
+    assert np.all(np.diff(subset) > 0)
+    assert len(draw_arrivals(Faults(lost_pictures=1.0), 40, rng)) == 2
 
 
 @pytest.mark.parametrize("fault", [{"lost_pictures": 0.5}, {"gps_outage_s": 5.0}])
-def test_faults_of_a_flight_need_one(fault: dict[str, float]) -> None:
+def test_flight_faults_require_a_flight(fault: dict[str, float]) -> None:
     LandingScenarioParameters.model_validate({"faults": fault, "helicopter": {}})
     with pytest.raises(ValidationError, match="helicopter"):
         LandingScenarioParameters.model_validate({"faults": fault})
 
 
-def test_bad_pixels_are_listed_or_not() -> None:
+def test_bad_pixels_can_be_listed() -> None:
     detector = preset("xc-55").detector
     plain, listed = (
         faulty_detector(Faults.model_validate({name: 0.01}), detector).defects

@@ -1,4 +1,4 @@
-"""What a flight's row says of an answer, against ground whose truth is known."""
+"""Tests of the score of a flight's answer against known ground truth."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import Fate, HdaDetails, Matches
-from marsyard.algorithms.hda.view import View
+from marsyard.algorithms.hda.motion import View
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
@@ -28,18 +28,17 @@ SAFE_SITE, UNSAFE_SITE = np.array([-3.0, 0.0, 0.0]), np.array([3.0, 0.0, 0.0])
 REPORTED, REFUSED = SiteOutcome.SAFE_SITE, SiteOutcome.NO_SAFE_SITE
 
 
-def flight() -> Flight:
-    """A flight whose navigation is exact."""
+def make_flight() -> Flight:
+    """A flight with exact navigation."""
     states = motion().state(0.0), motion().state(3.75)
     first, second = (PoseMeasurement(rigid(one.attitude, one.position_m), one.time_s) for one in states)
     return Flight(states, (first, second), np.array([0.0, 0.0, 1.0]))
 
 
-def truth(safe_places: int) -> GroundTruth:
-    """Ground of 12 m that is level in the west and steeper than the limit in the east, on a lattice of 1 m.
-
-    As many places as stated are safe, side by side in the middle: a square of 5 x 5 has one with a lander's radius of
-    1 m of safe places about it, three in a row have none.
+def make_truth(safe_places: int) -> GroundTruth:
+    """Return 12 m of ground, level in the west and too steep in the east, on a lattice of 1 m. The given number of
+    safe positions is at the centre. A square of 5 x 5 has one position with a margin of one lander radius; three in
+    a row have none.
     """
     x, _ = np.meshgrid(np.arange(-6.0, 6.0, 0.1), np.arange(-6.0, 6.0, 0.1))
     line = np.linspace(-4.0, 4.0, 9)
@@ -49,8 +48,8 @@ def truth(safe_places: int) -> GroundTruth:
         safe[2:7, 2:7] = True
     else:
         safe[4, 3 : 3 + safe_places] = True
-    still = np.zeros(safe.shape)
-    footprints = Footprints(still, still, still, safe)
+    static = np.zeros(safe.shape)
+    footprints = Footprints(static, static, static, safe)
     return GroundTruth(
         Relief(np.maximum(x, 0.0), -6.0, -6.0, 0.1), Limits(2.0, 0.26, 0.2), places_m, footprints, safe | True, 1.0
     )
@@ -59,46 +58,46 @@ def truth(safe_places: int) -> GroundTruth:
 @pytest.mark.parametrize(
     ("safe_places", "population"), [(0, "no_safe_site_exists"), (3, "narrow_site_exists"), (25, "wide_site_exists")]
 )
-def test_every_flight_is_in_one_population(safe_places: int, population: str) -> None:
-    row = site_populations(truth(safe_places))
+def test_each_flight_is_in_one_population(safe_places: int, population: str) -> None:
+    row = site_populations(make_truth(safe_places))
     populations = ("no_safe_site_exists", "narrow_site_exists", "wide_site_exists")
     assert [name for name in populations if row[name]] == [population]
 
 
 @pytest.mark.parametrize(
-    ("outcome", "site", "right"),
+    ("outcome", "site", "is_correct"),
     [
         (REPORTED, SAFE_SITE, True),
         (REPORTED, UNSAFE_SITE, False),
         (REFUSED, None, True),
-        # the a-priori site is kept where the algorithm does not converge: that it is safe is luck
+        # The a-priori site stays if the algorithm does not converge; it is safe by chance.
         (SiteOutcome.NO_MOTION, SAFE_SITE, False),
     ],
 )
-def test_a_safe_site_or_no_safe_site_is_right(outcome: SiteOutcome, site: np.ndarray | None, right: bool) -> None:
-    row = site_row(SiteEstimate(outcome, site), flight(), truth(3))
-    assert row["safe_or_no_site_reported"] is right
+def test_safe_site_or_refusal_is_correct(outcome: SiteOutcome, site: np.ndarray | None, is_correct: bool) -> None:
+    row = site_row(SiteEstimate(outcome, site), make_flight(), make_truth(3))
+    assert row["safe_or_no_site_reported"] is is_correct
 
 
-def test_no_ground_is_judged_where_nothing_landed() -> None:
+def test_flight_without_landing_has_no_touchdown_score() -> None:
     p, streams = LandingScenarioParameters(), Streams(1, "landing", 0)
-    row = landing_row(p, SiteEstimate(REFUSED, None), flight(), truth(3), streams)
+    row = landing_row(p, SiteEstimate(REFUSED, None), make_flight(), make_truth(3), streams)
     assert row["landed"] is False
     assert "touchdown_safe" not in row
-    # a first case that lands nowhere does not stop a campaign that asks where helicopters stand
+    # A first case without a landing does not stop a campaign with touchdown requirements.
     check_metrics(load_campaign("hda-benign").configuration, {**row, "answered": True}, Path())
 
 
-def test_every_hazardous_flight_has_a_requirement_on_its_answer() -> None:
-    asked = load_campaign("hda-hazardous").configuration.requirements
-    populations = {one.population for one in asked}
+def test_each_hazardous_population_has_a_requirement() -> None:
+    requirements = load_campaign("hda-hazardous").configuration.requirements
+    populations = {one.population for one in requirements}
     assert {"no_safe_site_exists", "narrow_site_exists", "wide_site_exists"} <= populations
-    (narrow,) = [one for one in asked if one.population == "narrow_site_exists"]
-    # a verdict by confidence: "met" must be shown, not seen
+    (narrow,) = [one for one in requirements if one.population == "narrow_site_exists"]
+    # The verdict uses confidence: "met" needs a confidence bound.
     assert (narrow.metric, narrow.decide_by) == ("safe_or_no_site_reported", "confidence")
 
 
-def test_every_match_is_counted_by_what_became_of_it() -> None:
+def test_matches_are_counted_by_outcome() -> None:
     fates = np.repeat(np.array(list(Fate), dtype=np.uint8), [50, 4, 3, 2])
     pixels, nothing = np.zeros((59, 2)), np.zeros(59)
     matches = Matches(pixels, pixels, pixels, pixels, nothing, nothing, fates, np.zeros((50, 3)))

@@ -1,4 +1,4 @@
-"""The light of a landing, and what its campaign builds before its flights."""
+"""Tests of the light of a landing and of the terrain bank built before a campaign."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from marsyard.sim.terrain import site
 
 
 @pytest.mark.parametrize(("site_name", "camera"), [("gusev", "mer-descent-flown"), ("heli-hazardous", "xc-55")])
-def test_a_camera_at_the_place_that_it_is_stated_for_sees_that_places_sun(site_name: str, camera: str) -> None:
-    # Mars at 1.5 AU has 0.44 of Earth's sun, whose square is what was counted before.
+def test_camera_at_its_specified_planet_has_unit_sun_factor(site_name: str, camera: str) -> None:
+    # Mars at 1.5 AU has 0.44 of Earth's sunlight; the factor must not be applied twice.
     air = site(site_name).environment
     assert air.solar_irradiance / preset(camera).detector.sunlight == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_detectors_electrons_do_not_depend_on_where_the_sun_stood_in_its_datasheet() -> None:
-    """Responsivity is stated in proportion to the sunlight that is stated with it."""
+def test_electron_count_is_independent_of_datasheet_sun() -> None:
+    """Responsivity scales with the sunlight stated in the datasheet."""
     small = {"terrain": {"samples": 256}, "location": {"bank": 1}}
     electrons = []
     for sun_au in (1.0, 1.5, 3.0):
@@ -30,6 +30,6 @@ def test_a_detectors_electrons_do_not_depend_on_where_the_sun_stood_in_its_datas
 
 
 @pytest.mark.parametrize(("bank", "built"), [(1, 1), (KEPT_GROUNDS, KEPT_GROUNDS), (KEPT_GROUNDS + 1, 0), (10_000, 0)])
-def test_terrains_of_a_bank_too_large_to_keep_are_built_by_their_flights(bank: int, built: int) -> None:
+def test_large_bank_terrains_are_built_per_flight(bank: int, built: int) -> None:
     parameters = LandingScenarioParameters.model_validate({"location": {"bank": bank}})
     assert LandingScenario().shared_inputs(parameters) == tuple(range(built))

@@ -1,4 +1,4 @@
-"""Folders of pictures as users lay them out, made from measurements whose truth is known."""
+"""Image folders in the user format, made from measurements with known truth."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BITS = 12
 def velocity_folder(
     folder: Path, cases: Mapping[str, DescentMeasurements], truth: Mapping[str, np.ndarray], *, ned: bool = False
 ) -> Path:
-    """A folder of descents; in north, east, down and the camera's axes where asked, else in our own."""
+    """Write a folder of descents, in north-east-down and camera axes if requested, else in Marsyard's axes."""
     rows = []
     for name, one in cases.items():
         for number, image in enumerate(one.images):
@@ -42,21 +42,21 @@ def velocity_folder(
                 row |= {"true_vx_m_s": x, "true_vy_m_s": y}
             rows.append(row)
     first = next(iter(cases.values())).images[0]
-    return _written(folder, "velocity", first, rows, ned=ned)
+    return _write_campaign(folder, "velocity", first, rows, ned=ned)
 
 
 def landing_folder(folder: Path, one: LandingMeasurements, task: str, *, true_poses: bool = False) -> Path:
-    """A folder of one flight, for landing or for matching."""
+    """Write a folder of one flight, for landing or matching."""
     rows = []
     for number, (image, pose) in enumerate(zip(one.images, one.poses, strict=True)):
-        turn, place = pose.world_from_body.rotation, pose.world_from_body.translation
-        row = _row(folder, "hover", number, image, turn, ned=False) | _numbers("{}_m", place)
+        turn, position = pose.world_from_body.rotation, pose.world_from_body.translation
+        row = _row(folder, "hover", number, image, turn, ned=False) | _numbers("{}_m", position)
         if task == "landing" and number == 0:
             row["slant_range_m"] = one.slant_range_m
         if true_poses:
-            row |= _numbers("true_{}_m", place) | _quaternion("true_", turn)
+            row |= _numbers("true_{}_m", position) | _quaternion("true_", turn)
         rows.append(row)
-    return _written(folder, task, one.images[0], rows, ned=False)
+    return _write_campaign(folder, task, one.images[0], rows, ned=False)
 
 
 def _row(
@@ -81,7 +81,9 @@ def _numbers(form: str, values: np.ndarray) -> dict[str, float]:
     return {form.format(axis): float(value) for axis, value in zip("xyz", values, strict=True)}
 
 
-def _written(folder: Path, task: str, image: DetectorImage, rows: Sequence[Mapping[str, Any]], *, ned: bool) -> Path:
+def _write_campaign(
+    folder: Path, task: str, image: DetectorImage, rows: Sequence[Mapping[str, Any]], *, ned: bool
+) -> Path:
     known = image.calibration
     write_cahvor(image.camera, folder / "camera.cahvor")
     np.save(folder / "flat.npy", known.flat_field)
@@ -108,7 +110,7 @@ flat_field = "flat.npy"
 
 
 def write_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Writes `pictures.csv`."""
+    """Write `pictures.csv`."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
     with (folder / "pictures.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, columns)
@@ -119,13 +121,13 @@ def write_rows(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def read_rows(folder: Path) -> list[dict[str, str]]:
-    """The rows of `pictures.csv` as texts."""
+    """Read the rows of `pictures.csv` as text."""
     with (folder / "pictures.csv").open(newline="") as file:
         return list(csv.DictReader(file))
 
 
 def write_texts(folder: Path, rows: Sequence[Mapping[str, str]]) -> None:
-    """Writes rows of texts as they are."""
+    """Write rows of text without changes."""
     with (folder / "pictures.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()

@@ -1,4 +1,4 @@
-"""Every file of a camera that is written states the frame of its vectors, and all of pictures state the same one."""
+"""Tests that each written camera file states the frame of its vectors, and that all images state the same frame."""
 
 from __future__ import annotations
 

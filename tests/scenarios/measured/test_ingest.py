@@ -1,4 +1,4 @@
-"""Folders that cannot be used are refused, by file and line; the Opportunity frames and other formats are read."""
+"""Tests of ingested folders: invalid input is rejected with file and line; supported formats are read."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.scenarios.measured.folders import landing_folder, read_rows, velocity
 Rows = list[dict[str, str]]
 
 
-def refused(folder: Path, tmp_path: Path) -> str:
+def ingest_and_expect_error(folder: Path, tmp_path: Path) -> str:
     out = tmp_path / "out"
     out.mkdir()
     with pytest.raises(ValueError, match=str(tmp_path)) as caught:
@@ -30,38 +30,38 @@ def refused(folder: Path, tmp_path: Path) -> str:
     return str(caught.value)
 
 
-def changed(rows: Rows, place: int, **cells: str) -> Rows:
-    return [row | cells if number == place else row for number, row in enumerate(rows)]
+def change_cells(rows: Rows, position: int, **cells: str) -> Rows:
+    return [row | cells if number == position else row for number, row in enumerate(rows)]
 
 
-def without(rows: Rows, *names: str) -> Rows:
+def drop_columns(rows: Rows, *names: str) -> Rows:
     return [{name: cell for name, cell in row.items() if name not in names} for row in rows]
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda rows: changed(rows, 1, file="lost.png"), "lost.png: No such file"),
-        (lambda rows: changed(rows, 1, qx="nan"), "line 3: qx is 'nan'; allowed: a finite number"),
-        (lambda rows: changed(rows, 1, qw="2.0"), "line 3: the quaternion qx to qw has the length"),
-        (lambda rows: changed(rows, 1, qw=""), "line 3: qx is given, but qw is not"),
-        (lambda rows: changed(rows, 2, time_s="100.0"), "line 4: time goes from 103.75 to 100 s"),
-        (lambda rows: changed(rows, 0, altitude_m="-3"), "line 2: altitude_m is -3; allowed: above 0"),
-        (lambda rows: changed(rows, 0, altitude_m=""), "line 2: altitude_m is empty"),
-        (lambda rows: changed(rows, 0, qx="1", qy="0", qz="0", qw="0"), "line 2: the camera looks up, 90.0 deg"),
+        (lambda rows: change_cells(rows, 1, file="lost.png"), "lost.png: No such file"),
+        (lambda rows: change_cells(rows, 1, qx="nan"), "line 3: qx is 'nan'; allowed: a finite number"),
+        (lambda rows: change_cells(rows, 1, qw="2.0"), "line 3: the quaternion qx to qw has the length"),
+        (lambda rows: change_cells(rows, 1, qw=""), "line 3: qx is given, but qw is not"),
+        (lambda rows: change_cells(rows, 2, time_s="100.0"), "line 4: time goes from 103.75 to 100 s"),
+        (lambda rows: change_cells(rows, 0, altitude_m="-3"), "line 2: altitude_m is -3; allowed: above 0"),
+        (lambda rows: change_cells(rows, 0, altitude_m=""), "line 2: altitude_m is empty"),
+        (lambda rows: change_cells(rows, 0, qx="1", qy="0", qz="0", qw="0"), "line 2: the camera looks up, 90.0 deg"),
         (lambda rows: rows[:2], "line 2: case 'drop' has 2 pictures; allowed for velocity: 3"),
-        (lambda rows: without(rows, "vx_m_s", "vy_m_s", "vz_m_s"), "neither vx_m_s to vz_m_s nor positions"),
-        (lambda rows: without(rows, "sun_azimuth_deg", "sun_elevation_deg"), "line 2: no sun"),
-        (lambda rows: without(rows, "altitude_m"), "the column 'altitude_m' is missing"),
+        (lambda rows: drop_columns(rows, "vx_m_s", "vy_m_s", "vz_m_s"), "neither vx_m_s to vz_m_s nor positions"),
+        (lambda rows: drop_columns(rows, "sun_azimuth_deg", "sun_elevation_deg"), "line 2: no sun"),
+        (lambda rows: drop_columns(rows, "altitude_m"), "the column 'altitude_m' is missing"),
         (lambda rows: [{**row, "altitude_ft": "1"} for row in rows], "'altitude_ft' (did you mean 'altitude_m'?)"),
         (lambda rows: [{**row, "slant_range_m": "1"} for row in rows], "unknown column 'slant_range_m'"),
-        (lambda rows: changed(rows, 0, camera="none.cahvor"), "none.cahvor: file: cannot be read"),
+        (lambda rows: change_cells(rows, 0, camera="none.cahvor"), "none.cahvor: file: cannot be read"),
     ],
 )
-def test_tables_that_cannot_be_used(tmp_path: Path, change: Callable[[Rows], Rows], message: str) -> None:
+def test_invalid_tables_are_rejected(tmp_path: Path, change: Callable[[Rows], Rows], message: str) -> None:
     folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write_texts(folder, change(read_rows(folder)))
-    assert message in refused(folder, tmp_path)
+    assert message in ingest_and_expect_error(folder, tmp_path)
 
 
 def replace_by_pipe(path: Path) -> None:
@@ -79,14 +79,14 @@ def replace_by_pipe(path: Path) -> None:
         (lambda path: cv2.imwrite(str(path), np.full((256, 1024), 5000, np.uint16)), "bits = 12 allows 4095"),
         (lambda path: cv2.imwrite(str(path), np.zeros((256, 1024, 3), np.uint8)), "has 3 bands"),
         (lambda path: path.write_bytes(path.read_bytes()[:900]), "cannot be decoded"),
-        # a header alone of 6 gigapixels: nothing of it is decoded
+        # The header alone states 6 gigapixels: no pixel is decoded.
         (lambda path: path.write_bytes(b"P5 80000 80000 65535\n"), "has 80000 x 80000 pixels; its camera has"),
     ],
 )
-def test_pictures_that_cannot_be_used(tmp_path: Path, write: Callable[[Path], object], message: str) -> None:
+def test_invalid_images_are_rejected(tmp_path: Path, write: Callable[[Path], object], message: str) -> None:
     folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write(folder / "drop-1.png")
-    output = refused(folder, tmp_path)
+    output = ingest_and_expect_error(folder, tmp_path)
     assert "drop-1.png" in output
     assert message in output
 
@@ -103,32 +103,32 @@ def test_pictures_that_cannot_be_used(tmp_path: Path, write: Callable[[Path], ob
         ("flat.npy", "camera.cahvor", "camera.cahvor: is no picture that is read"),
     ],
 )
-def test_settings_that_cannot_be_used(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_invalid_settings_are_rejected(tmp_path: Path, old: str, new: str, message: str) -> None:
     folder = velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     path = folder / "ingest.toml"
     path.write_text(path.read_text().replace(old, new))
-    assert message in refused(folder, tmp_path)
+    assert message in ingest_and_expect_error(folder, tmp_path)
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".pgm"])
-def test_other_formats_hold_the_same_counts(tmp_path: Path, suffix: str) -> None:
-    given = inputs.landing()
-    folder = landing_folder(tmp_path / "in", given, "matching")
+def test_image_formats_keep_the_counts(tmp_path: Path, suffix: str) -> None:
+    measurements = inputs.landing()
+    folder = landing_folder(tmp_path / "in", measurements, "matching")
     rows = read_rows(folder)
-    for row, image in zip(rows, given.images, strict=True):
+    for row, image in zip(rows, measurements.images, strict=True):
         row["file"] = Path(row["file"]).stem + suffix
         cv2.imwrite(str(folder / row["file"]), image.counts)
     write_texts(folder, rows)
     (tmp_path / "out").mkdir()
     path, stored = ingest(folder, tmp_path / "out")
     images = load_images(CasesFile(file=str(path)), stored.cases[0])
-    for image, original in zip(images, given.images, strict=True):
+    for image, original in zip(images, measurements.images, strict=True):
         assert np.array_equal(image.counts, original.counts)
         assert image.camera == original.camera
 
 
-def test_the_opportunity_frames(tmp_path: Path, shared_data: Path) -> None:
-    """Two frames of one place with the mast turned: their labels' cameras agree with what they show to a pixel."""
+def test_opportunity_frames_agree_with_their_labels(tmp_path: Path, shared_data: Path) -> None:
+    """Two frames of one position with different mast angles: the label cameras agree with the images to a pixel."""
     folder = tmp_path / "opportunity"
     folder.mkdir()
     frames = shared_data / "mer_opportunity"
@@ -143,18 +143,18 @@ def test_the_opportunity_frames(tmp_path: Path, shared_data: Path) -> None:
     assert row["matches"] >= 80
     assert 0.2 < row["residual_median_px"] < 1.0
     assert row["residual_90_percent_px"] < 2.0
-    # by the mast's encoders: azimuth from -0.340 to 0.254 rad, elevation from -0.110 to -0.209
+    # From the mast encoders: azimuth from -0.340 to 0.254 rad, elevation from -0.110 to -0.209 rad.
     assert 33.0 < row["max_rotation_deg"] < 36.0
     assert np.isclose(row["max_translation_m"], 0.0671, atol=1e-3)
-    # the label says when: 143 s apart; and the fisheye's single frame cannot be a case of its own
+    # The label times are 143 s apart. One fisheye frame alone is not a case.
     assert np.isclose(row["duration_s"], 143.258)
     (folder / "pictures.csv").write_text(f"case,file\nhazcam,{frames}/{hazcam}\n")
     with pytest.raises(IngestError, match="case 'hazcam' has 1 pictures; allowed for matching: 2 to 50"):
         ingest(folder, tmp_path / "out")
 
 
-def test_the_hazcam_frame_with_the_attitude_of_its_label_looks_down(tmp_path: Path, shared_data: Path) -> None:
-    """One frame of a fisheye, given twice: no residual is left between a picture and itself."""
+def test_hazcam_frame_with_label_attitude_looks_down(tmp_path: Path, shared_data: Path) -> None:
+    """The same fisheye frame twice: the residual of an image with itself is zero."""
     folder = tmp_path / "hazcam"
     folder.mkdir()
     frame = shared_data / "mer_opportunity" / "1F483288473EFFCMUFP1214L0M1.IMG"

@@ -1,4 +1,4 @@
-"""Descents flown, measured and scored by a user's own parts: what they give is what the case is made of."""
+"""Tests of descents with custom motions, instruments and scores."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from marsyard.scenarios.descent.exposure import World
 from marsyard.scenarios.descent.flight import create_flight
 from marsyard.scenarios.descent.measurement import Instruments
 from marsyard.scenarios.parts import DescentPlace, InstrumentReadings, InstrumentTruth, Poses, ScoredDescent
-from marsyard.scenarios.parts.scores import scored
+from marsyard.scenarios.parts.scores import compute_scores
 from marsyard.sim.streams import Streams
 from tests.scenarios.descent.settings import FLAT, PERFECT, parameters, run
 
@@ -22,7 +22,7 @@ HERE = f"{__name__}:"
 
 @dataclass(frozen=True)
 class Falling:
-    """Falls at an even rate while it turns about the vertical; `wrong` spoils one thing."""
+    """Falls at a constant rate while it rotates about the vertical; `wrong` selects one error."""
 
     random: ClassVar[bool] = True
 
@@ -52,7 +52,7 @@ class Falling:
 
 @dataclass(frozen=True)
 class Exact:
-    """Altitudes or attitudes off the truth by what is stated."""
+    """Altitudes or attitudes with a constant error."""
 
     quantity: ClassVar[str] = "altitude"
     random: ClassVar[bool] = False
@@ -66,7 +66,7 @@ class Exact:
 
 @dataclass(frozen=True)
 class Turned:
-    """Attitudes turned about the vertical."""
+    """Attitudes rotated about the vertical."""
 
     quantity: ClassVar[str] = "attitude"
     random: ClassVar[bool] = False
@@ -78,8 +78,8 @@ class Turned:
         return InstrumentReadings(truth.times_s, (turn * truth.motion.motion(truth.times_s).attitudes).as_quat())
 
 
-def handed(case: ScoredDescent) -> dict[str, float | bool]:
-    """What the case is made of, told so that it can be held against the row."""
+def record_inputs(case: ScoredDescent) -> dict[str, float | bool]:
+    """Return the inputs of the score for comparison with the row."""
     estimated = case.answer.velocity_m_s
     true = (case.states[2].position_m - case.states[1].position_m)[:2] / (case.states[2].time_s - case.states[1].time_s)
     return {
@@ -91,31 +91,31 @@ def handed(case: ScoredDescent) -> dict[str, float | bool]:
     }
 
 
-def clashing(case: ScoredDescent) -> dict[str, float]:
+def return_existing_column(case: ScoredDescent) -> dict[str, float]:
     return {"m_s": 1.0}
 
 
-velocity_error = clashing
+velocity_error = return_existing_column
 
 OWN: dict[str, Any] = {
     "flight": {"motion": f"{HERE}Falling", "attitude_of": "body"},
     "altimeter": {"instrument": f"{HERE}Exact", "options": {"off_m": 6.0}},
     "attitude_source": {"instrument": f"{HERE}Turned"},
-    "scores": [f"{HERE}handed"],
+    "scores": [f"{HERE}record_inputs"],
 }
 
 
-def test_a_case_is_flown_measured_and_scored_by_what_the_parts_give() -> None:
+def test_case_uses_custom_motion_instruments_and_score() -> None:
     made = {name: part for name, part in PERFECT.items() if name != "altimeter"}
     result = run(terrain=FLAT, **made, **OWN)
     row = result.row
     assert result.outcome == "VALID"
-    # the motion: the true velocity is what was flown, and the state when the thrusters fire is 100 m above level ground
+    # The motion: the true velocity is that of the flight, and firing occurs 100 m above level ground.
     assert row["velocity_true_x_m_s"] == pytest.approx(11.0, abs=1e-6)
     assert row["velocity_true_y_m_s"] == pytest.approx(row["flight_north_m_s"], abs=1e-6)
     assert row["altitude_1_m"] == pytest.approx(2000.0, abs=1e-3)
-    assert row["handed_firing_s"] == pytest.approx(1900.0 / 75.0, abs=1e-4)
-    # the instruments: their errors are read back from what was delivered
+    assert row["record_inputs_firing_s"] == pytest.approx(1900.0 / 75.0, abs=1e-4)
+    # The instruments: the row reports their errors.
     for number in (1, 2, 3):
         assert row[f"altitude_error_{number}_m"] == pytest.approx(6.0, abs=1e-6)
         assert row[f"attitude_error_{number}_deg"] == pytest.approx(0.3, abs=1e-6)
@@ -125,14 +125,14 @@ def test_a_case_is_flown_measured_and_scored_by_what_the_parts_give() -> None:
         f"{HERE}Exact",
     )
     assert row["attitude_source_turn_deg"] == 0.3
-    # the score is handed what the algorithm was, its answer, and the truth
-    assert row["handed_altitude_m"] == pytest.approx(float(row["altitude_2_m"]) + 6.0, abs=1e-6)
-    assert row["handed_error_m_s"] == pytest.approx(row["velocity_error_m_s"], abs=1e-9)
-    assert row["handed_touchdown_m_s"] == row["touchdown_speed_corrected_m_s"]
-    assert row["handed_at_firing"] is True
+    # The score receives the algorithm, its answer and the truth.
+    assert row["record_inputs_altitude_m"] == pytest.approx(float(row["altitude_2_m"]) + 6.0, abs=1e-6)
+    assert row["record_inputs_error_m_s"] == pytest.approx(row["velocity_error_m_s"], abs=1e-9)
+    assert row["record_inputs_touchdown_m_s"] == row["touchdown_speed_corrected_m_s"]
+    assert row["record_inputs_at_firing"] is True
 
 
-def test_the_motion_of_a_case_is_its_own() -> None:
+def test_motion_is_deterministic_per_case() -> None:
     p = parameters(terrain=FLAT, **OWN)
     surface = World.of(p).surface
     first, again, other = (create_flight(p, surface, Streams(1, "test", case)).row for case in (0, 0, 1))
@@ -152,7 +152,7 @@ def test_the_motion_of_a_case_is_its_own() -> None:
         ("column", "reports the column height_m twice, or it is one of its options"),
     ],
 )
-def test_a_motion_that_is_none_is_reported(wrong: str, message: str) -> None:
+def test_invalid_motion_is_reported(wrong: str, message: str) -> None:
     flight = {**OWN["flight"], "options": {"wrong": wrong}}
     p = parameters(terrain=FLAT, flight=flight)
     with pytest.raises(ValueError, match=message):
@@ -160,8 +160,8 @@ def test_a_motion_that_is_none_is_reported(wrong: str, message: str) -> None:
 
 
 @pytest.mark.parametrize("lasts_s", [20.0, 20.05, 27.95, 28.0])
-def test_a_motion_that_ends_early_is_followed_to_its_end(lasts_s: float) -> None:
-    """To its last instant, whatever the sum of the times that lead there comes to."""
+def test_short_motion_is_followed_to_its_end(lasts_s: float) -> None:
+    """The last instant is reached for any rounding of the sum of times."""
     flight = {**OWN["flight"], "options": {"east_m_s": 0.0, "lasts_s": lasts_s, "height_m": 5000.0}}
     p = parameters(terrain=FLAT, flight=flight)
     world, streams = World.of(p), Streams(1, "test", 0)
@@ -170,14 +170,14 @@ def test_a_motion_that_ends_early_is_followed_to_its_end(lasts_s: float) -> None
     assert Instruments.draw(p, world, flown, streams).navigation.velocity(np.array([flown.firing_s])).shape == (1, 3)
 
 
-def test_a_motion_below_the_ground_is_reported() -> None:
+def test_motion_below_the_ground_is_reported() -> None:
     flight = {**OWN["flight"], "options": {"height_m": 500.0}}
     p = parameters(terrain=FLAT, flight=flight)
     with pytest.raises(ValueError, match=r"at picture 3 the camera is 62\.5 m below the ground"):
         create_flight(p, World.of(p).surface, Streams(1, "test", 0))
 
 
-def test_a_score_takes_no_column_that_is_there() -> None:
+def test_score_cannot_replace_a_column() -> None:
     spec = f"{HERE}velocity_error"
     with pytest.raises(ValueError, match="gives the column velocity_error_m_s, which the row has already"):
-        scored([spec], None, {"velocity_error_m_s"})  # type: ignore[arg-type]
+        compute_scores([spec], None, {"velocity_error_m_s"})  # type: ignore[arg-type]

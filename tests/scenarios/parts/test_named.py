@@ -1,4 +1,4 @@
-"""Parts are found by a path or an entry point, made from their options, and refused in one message."""
+"""Tests of custom parts: lookup by path or entry point, options, and error messages."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, problems_of
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, validation_problems
 from marsyard.campaigns.definition.identity import custom_sources, list_parts
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.parts import named
@@ -31,11 +31,11 @@ def _examples(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES))
 
 
-def problem(**parts: Any) -> tuple[str, str]:
-    """Where the parameters of a descent are wrong, and what is said of it."""
+def find_problem(**parts: Any) -> tuple[str, str]:
+    """Return the invalid key of descent parameters and the message."""
     with pytest.raises(ValidationError) as caught:
         DescentScenarioParameters.model_validate(parts)
-    ((key, message),) = problems_of(caught.value, DescentScenarioParameters)
+    ((key, message),) = validation_problems(caught.value, DescentScenarioParameters)
     return ".".join(map(str, key)), message
 
 
@@ -74,19 +74,19 @@ def problem(**parts: Any) -> tuple[str, str]:
         ({"scores": ["custom_parts:sideways"] * 2}, "scores", "the score 'custom_parts:sideways' is named twice"),
     ],
 )
-def test_what_is_wrong_is_reported_where_it_stands(parts: dict[str, Any], key: str, message: str) -> None:
-    where, output = problem(**parts)
+def test_errors_are_reported_at_their_key(parts: dict[str, Any], key: str, message: str) -> None:
+    where, output = find_problem(**parts)
     assert where == key
     assert message in output
 
 
-def test_a_module_that_raises_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_module_that_raises_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "raises_at_import.py").write_text("raise RuntimeError('no licence')\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    assert "RuntimeError: no licence" in problem(flight={"motion": "raises_at_import:Any"})[1]
+    assert "RuntimeError: no licence" in find_problem(flight={"motion": "raises_at_import:Any"})[1]
 
 
-def test_options_are_filled_in_and_can_be_dispersed() -> None:
+def test_options_have_defaults_and_can_be_dispersed() -> None:
     p = DescentScenarioParameters.model_validate(
         {"flight": {"motion": "custom_parts:Glider", "options": {"glide_ratio": 0.25}}}
     )
@@ -96,7 +96,7 @@ def test_options_are_filled_in_and_can_be_dispersed() -> None:
     assert DescentScenarioParameters.model_validate(p.model_dump(mode="json")) == p
 
 
-def test_an_entry_point_names_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_part_is_found_by_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         named, "installed", lambda group: {"glider": "custom_parts:Glider"} if group in DYNAMICS.group else {}
     )
@@ -107,7 +107,7 @@ def test_an_entry_point_names_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
         SCORE.load("glider")
 
 
-def test_a_score_tells_by_its_annotation_what_it_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_score_annotation_determines_its_inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "scores_here.py").write_text(
         "from marsyard.scenarios.parts import ScoredDescent, ScoredFlight, ScoredLanding\n"
         "def any_case(case): return {}\n"
@@ -124,7 +124,7 @@ def test_a_score_tells_by_its_annotation_what_it_takes(tmp_path: Path, monkeypat
     assert taken["any_case"] == SCORED
     assert taken["two"] == (ScoredDescent, ScoredLanding)
     assert taken["landing"] == taken["kept"] == (ScoredLanding,)
-    # what holds more is taken as well
+    # Annotations that include more types are accepted.
     assert taken["flown"] == (ScoredFlight, ScoredDescent)
     with pytest.raises(ValueError, match="scores ScoredLanding; allowed here: ScoredDescent"):
         load_score("scores_here:landing", ScoredDescent)
@@ -142,13 +142,13 @@ def test_a_score_tells_by_its_annotation_what_it_takes(tmp_path: Path, monkeypat
         ({"a": None}, "gives a as a NoneType"),
     ],
 )
-def test_columns_that_cannot_be(reported: object, message: str) -> None:
+def test_invalid_columns_are_rejected(reported: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         check_columns("x:y", reported, texts=False)
 
 
 def test_the_identity_covers_the_modules_of_parts() -> None:
-    """Those that are stated, and those that a dispersion chooses, alone or with their table."""
+    """Modules of stated parts and of parts in a dispersion, alone or in a table."""
     configuration = CampaignConfiguration.model_validate(
         {
             "name": "parts",

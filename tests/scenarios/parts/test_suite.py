@@ -1,4 +1,4 @@
-"""The suite passes the examples, and names what bad parts do."""
+"""Tests of the conformance suite for parts: the examples pass, and defects are reported."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def poses(place, east=0.0):
 """
 
 
-def findings(spec: str, *only: str) -> dict[str, Finding]:
+def run_suite(spec: str, *only: str) -> dict[str, Finding]:
     subject = Subject(spec, determine_task(spec), 60.0)
     names = [name for name, _ in check_names(subject)]
     return {name: run_check(subject, names.index(name)) for name in (only or names)}
@@ -37,13 +37,13 @@ def findings(spec: str, *only: str) -> dict[str, Finding]:
 def test_the_examples_conform(name: str, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(EXAMPLES))
     assert determine_task(f"custom_parts:{name}") == kind
-    found = findings(f"custom_parts:{name}")
-    assert {check: one.problem for check, one in found.items() if not one.passed} == {}
-    assert ("random" in found) == (kind != "score")
+    result = run_suite(f"custom_parts:{name}")
+    assert {check: one.problem for check, one in result.items() if not one.passed} == {}
+    assert ("random" in result) == (kind != "score")
 
 
-def bad(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
-    """A module whose name is its own, as modules are kept."""
+def write_bad_part(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
+    """Write a module with a unique name, as Python caches modules."""
     name = f"bad_part_{abs(hash(body))}"
     (folder / f"{name}.py").write_text(HEAD + textwrap.dedent(body))
     monkeypatch.syspath_prepend(str(folder))
@@ -87,14 +87,14 @@ def bad(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
         ("columns", False, "return Poses(*poses(place), {'a b': 1.0})", "names a column 'a b'"),
     ],
 )
-def test_what_a_motion_must_not_do(
+def test_motion_defects_are_reported(
     check: str, random: bool, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     body = f"class Bad:\n    random = {random}\n    def fly(self, place, rng):\n" + textwrap.indent(lines, " " * 8)
-    name = bad(tmp_path, monkeypatch, body)
-    (found,) = findings(f"{name}:Bad", check).values()
-    assert problem in found.problem
-    assert found.next_step
+    name = write_bad_part(tmp_path, monkeypatch, body)
+    (result,) = run_suite(f"{name}:Bad", check).values()
+    assert problem in result.problem
+    assert result.next_step
 
 
 @pytest.mark.parametrize(
@@ -122,13 +122,13 @@ def test_what_a_motion_must_not_do(
         ),
     ],
 )
-def test_what_an_instrument_must_not_do(
+def test_instrument_defects_are_reported(
     check: str, quantity: str, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     head = f"class Bad:\n    random = False\n    quantity = '{quantity}'\n    def read(self, truth, rng):\n"
-    name = bad(tmp_path, monkeypatch, head + textwrap.indent(lines, " " * 8))
-    (found,) = findings(f"{name}:Bad", check).values()
-    assert problem in found.problem
+    name = write_bad_part(tmp_path, monkeypatch, head + textwrap.indent(lines, " " * 8))
+    (result,) = run_suite(f"{name}:Bad", check).values()
+    assert problem in result.problem
 
 
 @pytest.mark.parametrize(
@@ -146,17 +146,17 @@ def test_what_an_instrument_must_not_do(
         ),
     ],
 )
-def test_what_a_score_must_not_do(
+def test_score_defects_are_reported(
     check: str, annotation: str, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     body = f"def bad(case: {annotation}):\n" + textwrap.indent(lines, " " * 4)
-    name = bad(tmp_path, monkeypatch, body)
-    (found,) = findings(f"{name}:bad", check).values()
-    assert problem in found.problem
+    name = write_bad_part(tmp_path, monkeypatch, body)
+    (result,) = run_suite(f"{name}:bad", check).values()
+    assert problem in result.problem
 
 
-def test_the_suites_nearest_ground_is_the_planes() -> None:
-    """Against rays cast at the plane from a fan over the cone."""
+def test_nearest_ground_of_suite_matches_the_plane() -> None:
+    """Compare with rays over the cone that are intersected with the plane."""
     apex = np.array([30.0, -20.0, 500.0])
     tilt = 0.4
     axis = np.array([np.sin(tilt), 0.0, -np.cos(tilt)])

@@ -1,10 +1,10 @@
-"""A run that tests can afford."""
+"""Parameters of a short rover run for tests."""
 
 from __future__ import annotations
 
 from typing import Any
 
-#: A short approach, two legs of 0.3 m, over a small, nearly bare ground.
+#: A short approach with two legs of 0.3 m over a small, almost bare ground.
 SHORT: dict[str, Any] = {
     "world": {"samples": 1024, "rock_abundance": 0.005, "bank": 1},
     "start": {"distance_m": 3.6},

@@ -1,4 +1,4 @@
-"""Custom cameras on the mast: a stereo pair from calibration files, a detector from its datasheet."""
+"""Tests of custom mast cameras: a stereo pair from calibration files, a detector from its datasheet."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OPENCV = (
     "image_width: 640\nimage_height: 480\ncamera_matrix: {data: [640, 0, 321, 0, 640, 238, 0, 0, 1]}\n"
     "distortion_coefficients: {data: [-0.1, 0.02, 0, 0]}\n"
 )
-#: A sensor of a machine vision camera, used on Earth.
+#: A machine vision sensor, specified on Earth.
 SHEET = (
     "pixel_pitch_um = 4.8\nfull_well_e = 10000\nread_noise_e = 5\nbits = 10\nquantum_efficiency = 0.5\n"
     "dark_current_e_s = 20\ndark_temperature_c = 20\nrows = 480\nreadout_s = 0.02\nsun_au = 1.0\n"
@@ -33,47 +33,47 @@ SHEET = (
 @pytest.mark.parametrize(
     ("name", "baseline_m", "toe_in_deg"), [("mer-navcam", 0.20, 0.0), ("research-pancam", 0.30, 1.0)]
 )
-def test_a_presets_pair_by_its_files_is_the_preset(
+def test_pair_from_preset_files_equals_the_preset(
     name: str, baseline_m: float, toe_in_deg: float, tmp_path: Path
 ) -> None:
-    """Wherever the files put the cameras, as labels put them on a rover that stands somewhere."""
+    """The pair is equal for any position of the cameras in the files."""
     anywhere = rigid(Rotation.from_euler("xyz", [20.0, -50.0, 130.0], degrees=True), np.array([3.0, -8.0, 1.5]))
     for side, camera in zip(("left", "right"), preset(name).cameras(), strict=True):
-        write_cahvor(camera.moved(anywhere), tmp_path / f"{side}.cahvor")
+        write_cahvor(camera.transform(anywhere), tmp_path / f"{side}.cahvor")
     files = {side: str(tmp_path / f"{side}.cahvor") for side in ("left", "right")}
-    placed = {"baseline_m": baseline_m, "toe_in_deg": toe_in_deg}
-    found, expected = (
-        CameraParameters.model_validate({"preset": name, "custom": files | placed}).mast(),
+    move_pair = {"baseline_m": baseline_m, "toe_in_deg": toe_in_deg}
+    result, expected = (
+        CameraParameters.model_validate({"preset": name, "custom": files | move_pair}).mast(),
         stereo_mast(name),
     )
     points = np.array([[2.0, 0.3, -0.2], [4.0, -0.5, 0.4], [30.0, 1.0, 1.0]])
-    for one, other in ((found.left, expected.left), (found.right, expected.right)):
+    for one, other in ((result.left, expected.left), (result.right, expected.right)):
         assert np.allclose(one.project(points)[0], other.project(points)[0], rtol=0.0, atol=1e-4)
-    assert found.geometry is expected.geometry
+    assert result.geometry is expected.geometry
 
 
-def test_a_target_is_tracked_through_a_custom_pair(tmp_path: Path) -> None:
+def test_target_is_tracked_with_a_custom_pair(tmp_path: Path) -> None:
     camera, sheet = tmp_path / "cam0.yaml", tmp_path / "sensor.toml"
     camera.write_text(OPENCV)
     sheet.write_text(SHEET)
-    own = {"preset": "research-navcam", "custom": {"left": str(camera), "baseline_m": 0.24}, "detector": str(sheet)}
-    p = RoverScenarioParameters.model_validate({**SHORT, "camera": own})
-    # all that the files said is in the campaign
+    custom = {"preset": "research-navcam", "custom": {"left": str(camera), "baseline_m": 0.24}, "detector": str(sheet)}
+    p = RoverScenarioParameters.model_validate({**SHORT, "camera": custom})
+    # The campaign contains all calibration values.
     camera.unlink()
     sheet.unlink()
     p = RoverScenarioParameters.model_validate(p.model_dump(mode="json", round_trip=True))
     result = RoverScenario().run(p, Streams(1, "own pair", 0))
     row = dict(result.row)
     assert (result.outcome, row["camera"], row["navcam"]) == ("COMPLETED", str(camera), False)
-    # a pixel of disparity at 3.5 m is 8 cm here (Eq. 1); the calibration is wrong by up to half a pixel
+    # A pixel of disparity at 3.5 m is 8 cm here (Eq. 1); the calibration error is up to half a pixel.
     assert 0.0 < float(row["position_error_m"]) < 0.06
-    # ten bits, exposed by the light that is there
+    # Ten bits, exposed for the available light.
     counts = result.products["stop_1_left"]
     assert 200 < np.percentile(counts, 99) <= 1023
 
 
 @pytest.mark.parametrize(
-    ("stated", "message"),
+    ("settings", "message"),
     [
         ({"custom": {"left": "none.cahvor", "baseline_m": 0.2}}, "none.cahvor"),
         (
@@ -84,10 +84,10 @@ def test_a_target_is_tracked_through_a_custom_pair(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_pairs_are_refused(
-    stated: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    settings: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "small.yaml").write_text(OPENCV)
     (tmp_path / "large.yaml").write_text(OPENCV.replace("640\nimage_height", "800\nimage_height"))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValidationError, match=message):
-        CameraParameters.model_validate(stated)
+        CameraParameters.model_validate(settings)

@@ -1,4 +1,4 @@
-"""Light over a run: the sun moves, and a sky in view misleads the exposure of full frames."""
+"""Tests of light during a run: the sun moves, and a bright sky affects the exposure of full frames."""
 
 from typing import Any
 
@@ -11,24 +11,24 @@ from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT
 
 
-def run(**changes: Any) -> Run:
+def make_run(**changes: Any) -> Run:
     return run_case(RoverScenarioParameters.model_validate({**SHORT, **changes}), Streams(1, "rover tests", 0))
 
 
 def test_the_sun_rotates_westwards_about_the_pole() -> None:
-    # from the equator's zenith it sinks by its hour angle, into the west; 16 deg in the 66 minutes of Table IV
+    # At the equator the zenith sun moves west by its hour angle: 16 deg in the 66 minutes of Table IV.
     sun = SunParameters(azimuth_deg=0.0, elevation_deg=90.0, latitude_deg=0.0)
     for minutes in (0.0, 66.0, 132.0):
         angle = np.radians(16.0 * minutes / 66.0)
         np.testing.assert_allclose(sun.direction(60.0 * minutes), [-np.sin(angle), 0.0, np.cos(angle)], atol=1e-12)
 
 
-def test_pictures_of_a_run_are_lit_by_the_sun_of_their_time() -> None:
-    # an hour between two pictures: the second is another than without the sun's motion, the first the same
+def test_images_use_the_sun_at_their_time() -> None:
+    # One hour passes between the images: only the second differs from a run with a fixed sun.
     slow = {"timing": {"track_s": 3600.0}, "camera": {"detector_noise": False}}
-    still = {"sun": {**SHORT["sun"], "hour_angle_deg_min": 0.0}, "rover_shadow": False}
+    static = {"sun": {**SHORT["sun"], "hour_angle_deg_min": 0.0}, "rover_shadow": False}
     moving = {"sun": {**SHORT["sun"], "held_s": 1.0}, "rover_shadow": False}
-    under_one, under_moving = run(**slow, **still), run(**slow, **moving)
+    under_one, under_moving = make_run(**slow, **static), make_run(**slow, **moving)
     assert under_one.stops[1].time_s - under_one.stops[0].time_s >= 3600.0
     suns = [under_moving.world.scene(stop.time_s).sun.direction for stop in under_moving.stops[:2]]
     rotated = np.degrees(np.arccos(suns[0] @ suns[1]))
@@ -37,12 +37,13 @@ def test_pictures_of_a_run_are_lit_by_the_sun_of_their_time() -> None:
     np.testing.assert_allclose(fixed[0], fixed[1], atol=1e-12)
 
 
-def test_a_bright_sky_in_view_makes_full_frames_too_short() -> None:
-    """Section 4.5: exposed for the subframe, what is about the target keeps its contrast, whatever else is in view."""
+def test_bright_sky_underexposes_full_frames() -> None:
+    """Section 4.5: subframe exposure keeps the contrast at the target for any sky in the frame."""
     eastwards = {"start": {"distance_m": 9.0}, "legs": [{"motion": "approach", "goal_m": 8.5, "step_fraction": 0.1}]}
     sun_ahead = {"sun": {"azimuth_deg": 90.0, "elevation_deg": 30.0}}
     first = {
-        of: run(**eastwards, **sun_ahead, exposure={"of": of}).stops[0].pictures for of in ("subframe", "full-frame")
+        of: make_run(**eastwards, **sun_ahead, exposure={"of": of}).stops[0].pictures
+        for of in ("subframe", "full-frame")
     }
     shorter = first["full-frame"].exposure_s / first["subframe"].exposure_s
     assert shorter < 0.3

@@ -1,4 +1,4 @@
-"""Points of a rock: rays against triangles, outline, what hides and shades."""
+"""Tests of points on a rock: ray intersection, outline, occlusion and shadow."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def sphere() -> np.ndarray:
     return np.asarray(np.asarray(mesh.triangles, dtype=np.float64) + np.array([5.0, 0.0, 0.5]))
 
 
-def test_distances_are_those_to_a_sphere(sphere: np.ndarray) -> None:
+def test_ray_distances_match_a_sphere(sphere: np.ndarray) -> None:
     eye = np.array([0.0, 0.0, 1.5])
     rng = np.random.default_rng(1)
     aims = np.array([5.0, 0.0, 0.5]) + 0.35 * rng.uniform(-1.0, 1.0, (40, 3))
@@ -29,23 +29,23 @@ def test_distances_are_those_to_a_sphere(sphere: np.ndarray) -> None:
     offset = eye - np.array([5.0, 0.0, 0.5])
     b = directions @ offset
     exact = -b - np.sqrt(b * b - offset @ offset + 0.25)
-    # Flat triangles of 512 th of a sphere lie up to 0.1 % of the radius inside; seen obliquely, a few times as much.
+    # The 512 flat triangles are up to 0.1 % of the radius inside the sphere; oblique rays increase the error.
     np.testing.assert_allclose(ray_distances(sphere, eye, directions), exact, atol=4e-3)
     assert np.isinf(ray_distances(sphere, eye, -directions[:1])[0])
 
 
-def test_points_lie_on_the_face_that_is_seen(sphere: np.ndarray) -> None:
+def test_points_lie_on_the_visible_face(sphere: np.ndarray) -> None:
     eye = np.array([0.0, 0.0, 1.5])
     sight = RockOutline.of(sphere, eye, 0.0)
     middle = sight.point(0.0, 0.5)
     assert np.linalg.norm(middle - [5.0, 0.0, 0.5]) == pytest.approx(0.5, abs=1e-3)
     assert middle[0] < 4.6
-    # To the right seen along +x is -y.
+    # Right of the view along +x is -y.
     assert sight.point(0.8, 0.5)[1] < -0.3 < 0.3 < sight.point(-0.8, 0.5)[1]
     assert sight.point(0.0, 0.9)[2] > middle[2] > sight.point(0.0, 0.1)[2]
 
 
-def test_the_far_side_is_hidden_and_the_lee_in_shadow(sphere: np.ndarray) -> None:
+def test_far_side_is_hidden_and_shadow_side_is_dark(sphere: np.ndarray) -> None:
     near, far = np.array([4.5, 0.0, 0.5]), np.array([5.5, 0.0, 0.5])
     points, eye = np.stack([near, far]), np.array([0.0, 0.0, 1.5])
     assert self_occluded(sphere, points, eye).tolist() == [False, True]
@@ -53,18 +53,18 @@ def test_the_far_side_is_hidden_and_the_lee_in_shadow(sphere: np.ndarray) -> Non
     assert self_shadowed(sphere, points, west).tolist() == [False, True]
 
 
-def test_the_surface_faces_where_the_sphere_does(sphere: np.ndarray) -> None:
+def test_normals_match_the_sphere(sphere: np.ndarray) -> None:
     eye, middle = np.array([0.0, 0.0, 0.5]), np.array([5.0, 0.0, 0.5])
     sight = RockOutline.of(sphere, eye, 0.0)
     for across in (-0.9, -0.5, 0.0, 0.7):
         point = sight.point(across, 0.5)
         normal = patch_normal(sphere, eye, point, 0.01)
         assert np.linalg.norm(normal) == pytest.approx(1.0)
-        # a triangle of the sphere is 3.5 deg wide
+        # A triangle of the sphere is 3.5 deg wide.
         assert normal @ (point - middle) / np.linalg.norm(point - middle) > np.cos(np.radians(3.5))
 
 
-def test_what_lies_about_a_line_is_all_that_its_rays_can_meet(sphere: np.ndarray) -> None:
+def test_selection_near_a_ray_contains_all_hits(sphere: np.ndarray) -> None:
     eye, reach = np.array([0.0, 0.0, 0.5]), 0.03
     rng = np.random.default_rng(2)
     for point in RockOutline.of(sphere, eye, 0.0).point(0.4, 0.7), np.array([5.0, 0.4, 0.8]):

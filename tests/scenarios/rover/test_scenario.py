@@ -1,4 +1,4 @@
-"""Runs of the closed loop: what is driven, seen, tracked, scored and stored."""
+"""Tests of closed-loop rover runs: drive, images, tracking, scores and stored products."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -22,82 +22,83 @@ from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT
 
 
-def parameters(**changes: object) -> RoverScenarioParameters:
+def make_parameters(**changes: object) -> RoverScenarioParameters:
     return RoverScenarioParameters.model_validate({**SHORT, **changes})
 
 
-def streams(case: int = 0) -> Streams:
+def make_streams(case: int = 0) -> Streams:
     return Streams(1, "rover tests", case)
 
 
-def test_a_run_is_tracked_scored_and_the_same_again() -> None:
-    scenario, p = RoverScenario(), parameters(score={"stored_updates": 2})
-    result = scenario.run(p, streams())
+def test_run_is_tracked_scored_and_deterministic() -> None:
+    scenario, p = RoverScenario(), make_parameters(score={"stored_updates": 2})
+    result = scenario.run(p, make_streams())
     row: dict[str, Any] = dict(result.row)
     assert (result.outcome, result.answered) == ("COMPLETED", True)
     assert row["tracked"]
     assert row["true_track"]
     assert not row["not_tracked"]
-    # A pixel of disparity at 3.5 m is 5 cm (Eq. 1); the calibration is wrong by up to half a pixel.
+    # A pixel of disparity at 3.5 m is 5 cm (Eq. 1); the calibration error is up to half a pixel.
     assert 0.0 < row["position_error_m"] < 0.04
     assert row["position_error_m"] ** 2 == pytest.approx(row["range_error_m"] ** 2 + row["cross_error_m"] ** 2)
     assert row["drift_px"] < 1.0
     assert row["range_end_m"] < row["range_start_m"] < 4.1
     assert abs(row["disparity_error_goal_px"]) <= 0.55
     assert row["update_2_magnification"] == pytest.approx(row["magnification_max"], rel=0.05)
-    again = dict(scenario.run(p, streams()).row)
+    repeated = dict(scenario.run(p, make_streams()).row)
     timed = {name for name in row if "time" in name}
-    assert {k: v for k, v in again.items() if k not in timed} == pytest.approx(
+    assert {k: v for k, v in repeated.items() if k not in timed} == pytest.approx(
         {k: v for k, v in row.items() if k not in timed}, abs=0.0, nan_ok=True
     )
     stops = int(row["updates"])
-    kept = result.products
-    assert kept["rover_true_m"].shape == (stops, 3)
-    assert kept["stop_1_left"].dtype == np.uint16
-    assert kept["figures"]["match_score"].shape == (stops,)
+    stored = result.products
+    assert stored["rover_true_m"].shape == (stops, 3)
+    assert stored["stop_1_left"].dtype == np.uint16
+    assert stored["figures"]["match_score"].shape == (stops,)
 
 
-def test_the_designated_point_is_where_the_picture_shows_it() -> None:
-    """The renderer's own truth, pixel by pixel, against the point that the score projects."""
-    p = parameters(camera={"detector_noise": False})
-    run = run_case(p, streams(1))
+def test_designated_point_agrees_with_rendered_pixels() -> None:
+    """Compare the pixel truth of the renderer with the projected point of the score."""
+    p = make_parameters(camera={"detector_noise": False})
+    run = run_case(p, make_streams(1))
     stop = run.stops[-1]
     column, row = (round(value) for value in stop.point_px)
-    camera = run.rig.left.cropped(column - 4, row - 4, (9, 9))
+    camera = run.rig.left.crop(column - 4, row - 4, (9, 9))
     frame = process_renderer(p.backend).render(run.world.base, PixelRays.of(camera), stop.world_from_head)
     around = frame.points_world()[3:6, 3:6].reshape(-1, 3)
     assert (frame.body[4, 4]) >= 0
-    # A pixel is 3 mm here, on a face seen obliquely a few times as much.
+    # A pixel is 3 mm here; the face is oblique and increases this.
     assert np.linalg.norm(around - run.target.point_world, axis=1).min() < 0.008
 
 
 @pytest.mark.parametrize("diameter_m", [0.07, 1.2])
-def test_the_start_is_as_far_from_the_point_as_is_asked(diameter_m: float) -> None:
-    """From the mast to the designated point, however large its rock is; the run ends as far from it as is asked."""
+def test_start_has_the_specified_distance(diameter_m: float) -> None:
+    """The distance from mast to designated point does not depend on rock size; the final distance is also met."""
     target = {**SHORT["target"], "diameter_m": diameter_m, "across": 0.3, "up": 0.5}
-    run = run_case(parameters(target=target), streams(4))
+    run = run_case(make_parameters(target=target), make_streams(4))
     first, last = run.stops[0], run.stops[-1]
     mast = first.stance.world_from_rover.apply(np.append(run.rig.calibrated.geometry.base_m[:2], 0.0))
-    # to the side of the line it is a little further
+    # Positions off the line are slightly farther away.
     assert np.hypot(*(run.target.point_world - mast)[:2]) == pytest.approx(3.6, abs=0.06)
     assert np.hypot(*(run.target.point_world - last.stance.world_from_rover.translation)[:2]) == pytest.approx(
         3.3, abs=0.06
     )
 
 
-def test_targets_may_be_on_small_rocks_but_on_no_occluding_edge() -> None:
-    """The template reaches over a rock of 7 cm at 3.6 m, but shows the ground close behind; over a large rock's top it
-    shows what lies far behind, over its foot the ground before it."""
+def test_targets_on_occluding_edges_are_rejected() -> None:
+    """The template extends beyond a rock of 7 cm at 3.6 m to ground just behind it. Over a large rock it shows the far
+    background at the top and the near ground at the foot.
+    """
     chosen = {
         (diameter, up): run_case(
-            parameters(target={**SHORT["target"], "diameter_m": diameter, "up": up}), streams(5)
+            make_parameters(target={**SHORT["target"], "diameter_m": diameter, "up": up}), make_streams(5)
         ).target.on_edge
         for diameter, up in ((0.07, 0.5), (1.2, 0.5), (1.2, 0.97), (1.2, 0.03))
     }
     assert chosen == {(0.07, 0.5): False, (1.2, 0.5): False, (1.2, 0.97): True, (1.2, 0.03): False}
 
 
-def test_exact_instruments_leave_the_match_alone() -> None:
+def test_ideal_instruments_leave_only_match_error() -> None:
     exact = {
         "camera": {"detector_noise": False},
         "stereo": dict.fromkeys(
@@ -105,24 +106,24 @@ def test_exact_instruments_leave_the_match_alone() -> None:
         ),
         "pointing": dict.fromkeys(("zero_deg", "backlash_deg", "settling_deg", "count_deg"), 0.0),
     }
-    row: Mapping[str, Any] = RoverScenario().run(parameters(**exact), streams(2)).row
+    row: Mapping[str, Any] = RoverScenario().run(make_parameters(**exact), make_streams(2)).row
     assert row["disparity_error_goal_px"] == 0.0
-    # A tenth of a pixel of disparity, and as much across.
+    # A tenth of a pixel of disparity and of lateral position.
     assert row["position_error_m"] < 0.008
     assert row["drift_px"] < 0.3
 
 
 @pytest.mark.parametrize("designation", ["rover", "site"])
-def test_targets_may_be_given_by_position(designation: str) -> None:
-    run = run_case(parameters(target={**SHORT["target"], "designation": designation}), streams(3))
+def test_targets_can_be_designated_by_position(designation: str) -> None:
+    run = run_case(make_parameters(target={**SHORT["target"], "designation": designation}), make_streams(3))
     assert run.outcome.name == "COMPLETED"
-    # The mast moves to where it points then: 0.1 deg of backlash is 2.1 px an axis; half of the epipolar error, 0.2 px.
+    # The mast then points at the position. A backlash of 0.1 deg is 2.1 px per axis; half the epipolar error is 0.2 px.
     assert np.linalg.norm(run.stops[0].found_px(run.rig.calibrated) - run.stops[0].point_px) < 3.5
 
 
-def test_a_wrong_target_reported_as_tracked_is_counted_as_harm() -> None:
-    p = parameters(algorithm="tests.scenarios.rover.trackers:Confident")
-    result = RoverScenario().run(p, streams())
+def test_wrong_target_reported_as_tracked_is_a_false_track() -> None:
+    p = make_parameters(algorithm="tests.scenarios.rover.trackers:Confident")
+    result = RoverScenario().run(p, make_streams())
     assert result.answered
     assert not result.row["tracked"]
     assert not result.row["true_track"]
@@ -130,56 +131,56 @@ def test_a_wrong_target_reported_as_tracked_is_counted_as_harm() -> None:
     assert result.row["position_error_m"] == pytest.approx(0.3, abs=0.04)
 
 
-def test_a_lost_target_is_no_answer() -> None:
-    result = RoverScenario().run(parameters(algorithm="tests.scenarios.rover.trackers:Blind"), streams())
+def test_lost_target_is_not_a_valid_answer() -> None:
+    result = RoverScenario().run(make_parameters(algorithm="tests.scenarios.rover.trackers:Blind"), make_streams())
     assert (result.outcome, result.answered) == ("LOST", False)
     assert np.isnan(result.row["position_error_m"])
     assert result.row["true_track"]
     assert result.row["losses"] == "LOW_MATCH_SCORE"
 
 
-def test_an_answer_that_is_none_is_the_trackers_fault() -> None:
-    result = RoverScenario().run(parameters(algorithm="tests.scenarios.rover.trackers:Wordless"), streams())
+def test_missing_answer_is_a_tracker_error() -> None:
+    result = RoverScenario().run(make_parameters(algorithm="tests.scenarios.rover.trackers:Wordless"), make_streams())
     assert (result.outcome, result.answered) == ("BAD_ANSWER", False)
     assert result.failure is not None
     assert "the answer is a NoneType; allowed: a TargetUpdate" in result.failure.error
 
 
-def test_unknown_trackers_and_cameras_are_refused() -> None:
+def test_unknown_trackers_and_cameras_are_rejected() -> None:
     with pytest.raises(ValueError, match=r"unknown algorithm 'vt'.*did you mean 'vtt'"):
-        parameters(algorithm="vt")
+        make_parameters(algorithm="vt")
     with pytest.raises(ValueError, match="no mast carries cameras called 'xc-55'"):
-        parameters(camera={"preset": "xc-55"})
+        make_parameters(camera={"preset": "xc-55"})
 
 
-def test_trackers_share_the_pictures_of_a_drive() -> None:
+def test_trackers_share_the_images_of_a_drive() -> None:
     scenario = SharedDriveScenario()
-    stated: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "drive": {**SHORT, "legs": [{"motion": "circle", "step_deg": 5.0, "steps": 2}]},
         "variants": [{"diameter_m": 0.8, "height_m": 0.5, "shape": 8, "yaw_deg": 30.0, "sun_azimuth_deg": 260.0}],
         "targets": [{"across": 0.0, "up": 0.5}, {"across": 0.4, "up": 0.5}],
         "bands": [{"name": "at_10_deg", "min": 10.0, "max": 10.0}],
     }
     wordless = "tests.scenarios.rover.trackers:Wordless"
-    stated["drive"] = {**stated["drive"], "compared": ["pure-ncc", wordless]}
-    fine, coarse = (SharedDriveParameters.model_validate({**stated, "skip": skip}) for skip in (0, 1))
+    settings["drive"] = {**settings["drive"], "compared": ["pure-ncc", wordless]}
+    fine, coarse = (SharedDriveParameters.model_validate({**settings, "skip": skip}) for skip in (0, 1))
     assert (fine.step, coarse.step) == (5.0, 10.0)
-    results = [scenario.run(one, streams(case)) for case, one in enumerate((fine, coarse))]
+    results = [scenario.run(one, make_streams(case)) for case, one in enumerate((fine, coarse))]
     assert [result.row["updates"] for result in results] == [3, 2]
     assert [result.row["at_10_deg"] for result in results] == [False, True]
     assert all(result.row["tracked"] for result in results)
     assert all(result.row["pure_ncc.updates"] == result.row["updates"] for result in results)
     assert all(result.row["Wordless.outcome"] == "BAD_ANSWER" for result in results)
     assert [result.failure for result in results] == [None, None]
-    # a scenario object without the drive in its cache gives the same row
-    cold = SharedDriveScenario().run(fine, streams(0)).row
-    assert _without_times(cold) == _without_times(results[0].row)
-    # all steps see the same arc; a target is on the face where no stop sees it more obliquely than is said
+    # A new scenario object without a cached drive gives the same row.
+    cold = SharedDriveScenario().run(fine, make_streams(0)).row
+    assert _drop_times(cold) == _drop_times(results[0].row)
+    # All steps observe the same arc; a target is valid if no stop exceeds the allowed viewing angle.
     row = results[0].row
     assert [result.row["obliquity_max_deg"] for result in results] == [row["obliquity_max_deg"]] * 2
     assert isinstance(row["obliquity_max_deg"], float)
     within, beyond = (
-        scenario.run(SharedDriveParameters.model_validate({**stated, "face_deg": limit}), streams(0)).row
+        scenario.run(SharedDriveParameters.model_validate({**settings, "face_deg": limit}), make_streams(0)).row
         for limit in (row["obliquity_max_deg"] + 0.1, row["obliquity_max_deg"] - 0.1)
     )
     assert [(one["in_view"], one["on_face"]) for one in (row, within, beyond)] == [
@@ -187,20 +188,20 @@ def test_trackers_share_the_pictures_of_a_drive() -> None:
         (True, True),
         (True, False),
     ]
-    drive = render_drive(DriveKey.of(fine, streams(0)))
-    other = track_views(SharedDriveParameters.model_validate({**stated, "target": 1}), drive)
+    drive = render_drive(DriveKey.of(fine, make_streams(0)))
+    other = track_views(SharedDriveParameters.model_validate({**settings, "target": 1}), drive)
     assert other.stops[0].point_px[0] > drive.views[0].pictures.left.corner[0]
     assert other.stops[0].pictures is drive.views[0].pictures
-    # The camera keeps its distance from the targets' middle and goes around it.
+    # The camera circles the centre of the targets at a constant distance.
     ranges = [stop.range_m for stop in other.stops]
     assert np.ptp(ranges) < 0.15
 
 
-def _without_times(row: Mapping[str, Scalar]) -> dict[str, str]:
+def _drop_times(row: Mapping[str, Scalar]) -> dict[str, str]:
     return {name: repr(value) for name, value in row.items() if "time" not in name}
 
 
 @pytest.mark.parametrize(("bank", "built"), [(8, 8), (100_000, 0)])
-def test_only_small_banks_are_built_ahead(bank: int, built: int) -> None:
-    p = parameters(world={**SHORT["world"], "bank": bank})
+def test_only_small_banks_are_built_in_advance(bank: int, built: int) -> None:
+    p = make_parameters(world={**SHORT["world"], "bank": bank})
     assert RoverScenario().shared_inputs(p) == tuple(range(built))

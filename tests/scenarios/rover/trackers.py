@@ -1,4 +1,4 @@
-"""Trackers of a user: one that is wrong and does not know it, one that never finds anything, one without answers."""
+"""Custom trackers for tests: a biased tracker, a tracker that loses the target, and a tracker without answers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from marsyard.sim.measurements import MastCalibration, RoverMeasurements, Target
 
 
 class Confident:
-    """The paper's tracker, but for a position that is 0.3 m too far to the left: reported as tracked."""
+    """The paper's tracker with a position error of 0.3 m to the left, reported as tracked."""
 
     def __init__(self) -> None:
         self.inner = VisualTargetTracker()
@@ -44,7 +44,7 @@ class Confident:
 
 
 class Blind(Confident):
-    """Sees the target once and never again."""
+    """Finds the target only in the first update."""
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """See `TargetTracker`."""
@@ -55,7 +55,7 @@ class Blind(Confident):
 
 
 class Wordless(Confident):
-    """Answers nothing at all."""
+    """Returns None for each update."""
 
     def update(self, measurements: RoverMeasurements) -> Any:
         """See `TargetTracker`."""

@@ -1,4 +1,4 @@
-"""Opportunity's cameras, with the numbers of their labels, so that they are tested without the products themselves."""
+"""Opportunity's cameras with the values of their labels, for tests without the products."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
 
 
 def _navcam_376() -> Cahvor:
-    """The left navcam as labelled in 1N491020376ILFCNY9P0706L0M1."""
+    """Return the left navcam as labelled in 1N491020376ILFCNY9P0706L0M1."""
     return Cahvor(
         c=np.array([0.442604, -0.0611635, -1.25106]),
         a=np.array([0.93995, -0.338133, 0.0464979]),
@@ -22,7 +22,7 @@ def _navcam_376() -> Cahvor:
 
 
 def _navcam_519() -> Cahvor:
-    """The left navcam as labelled in 1N491020519ILFCNY9P0706L0M1."""
+    """Return the left navcam as labelled in 1N491020519ILFCNY9P0706L0M1."""
     return Cahvor(
         c=np.array([0.508813, -0.0504884, -1.24881]),
         a=np.array([0.958735, 0.244186, 0.145611]),
@@ -35,7 +35,7 @@ def _navcam_519() -> Cahvor:
 
 
 def _hazcam() -> Cahvore:
-    """The left front hazcam as labelled in 1F483288473EFFCMUFP1214L0M1; model type 3."""
+    """Return the left front hazcam as labelled in 1F483288473EFFCMUFP1214L0M1; model type 3."""
     return Cahvore(
         c=np.array([0.609331, -0.041064, -0.233849]),
         a=np.array([0.703447, -0.005161, 0.710729]),
@@ -50,7 +50,7 @@ def _hazcam() -> Cahvore:
 
 
 def _pinhole() -> Cahv:
-    """The navcam without its lens."""
+    """Return the navcam without lens distortion."""
     navcam = _navcam_376()
     return Cahv(navcam.c, navcam.a, navcam.h, navcam.v, navcam.size)
 
@@ -72,7 +72,7 @@ def pinhole() -> Cahv:
 
 @pytest.fixture
 def labelled() -> dict[str, CameraModel]:
-    """The cameras by their product's name."""
+    """Return the cameras by product name."""
     return {
         "1N491020376ILFCNY9P0706L0M1.IMG": _navcam_376(),
         "1N491020519ILFCNY9P0706L0M1.IMG": _navcam_519(),

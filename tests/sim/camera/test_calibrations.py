@@ -1,4 +1,4 @@
-"""Calibrations of other programs, as found in public repositories, against OpenCV's own projection."""
+"""Tests of calibration files of other programs, as published, against OpenCV's projection."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from marsyard.sim.camera import (
     read_cameras,
 )
 
-#: As OpenCV's sample calibration.cpp wrote it for a web camera (blog.csdn.net, article of 23 August 2015).
+#: Written by OpenCV's sample calibration.cpp for a web camera (blog.csdn.net, article of 23 August 2015).
 OPENCV = """%YAML:1.0
 calibration_time: "08/21/15 16:54:26"
 image_width: 640
@@ -47,8 +47,8 @@ distortion_coefficients: !!opencv-matrix
 avg_reprojection_error: 4.4034956116049290e-001
 """
 
-#: A telephone's camera as ROS publishes it (README of a repository that streams Tango to ROS): rational, k4 to k6 left
-#: out.
+#: A telephone camera as published by ROS (README of a repository that streams Tango to ROS): rational model without k4
+#: to k6.
 ROS = """image_width: 1920
 image_height: 1080
 camera_name: camera_color
@@ -72,7 +72,7 @@ projection_matrix:
     0.0, 0.0, 1.0, 0.0]
 """
 
-#: A wide camera calibrated with a lens model that does not reach its corners (README of a driver for Kodak's PIXPRO).
+#: A wide-angle camera with a lens model that does not reach its corners (README of a driver for Kodak's PIXPRO).
 KODAK = """image_width: 1440
 image_height: 1440
 camera_name: kodak
@@ -87,7 +87,7 @@ distortion_coefficients:
   data: [-0.1710342568253523, 0.01562344385534763, -0.006842079559350427, 0.005880933792022186, 0]
 """
 
-#: The EuRoC cameras as MSCKF's configuration has them, in Kalibr's format, with its chain cut to what the test reads.
+#: The EuRoC cameras from the MSCKF configuration in Kalibr's format, reduced to the fields that the test reads.
 KALIBR = """cam0:
   T_cam_imu:
   - [0.014865542981794, 0.999557249008346, -0.025774436697440, 0.065222909535531]
@@ -114,7 +114,7 @@ cam1:
   rostopic: /cam1/image_raw
 """
 
-#: The same first camera with Kalibr's equidistant lens (a README of a visual odometry).
+#: The same first camera with Kalibr's equidistant model (README of a visual odometry).
 EQUIDISTANT = """cam0:
   camera_model: pinhole
   distortion_coeffs: [-0.0016509958435871643, 0.02437222940989351, -0.03582816956989852,
@@ -125,7 +125,7 @@ EQUIDISTANT = """cam0:
   rostopic: /cam0/image_raw
 """
 
-#: EuRoC's own sensor.yaml of its first camera.
+#: EuRoC's sensor.yaml of its first camera.
 EUROC = """# General sensor definitions.
 sensor_type: camera
 comment: VI-Sensor cam0 (MT9M034)
@@ -149,100 +149,103 @@ distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
 """
 
 
-def written(folder: Path, text: str, name: str = "calibration.yaml") -> Path:
+def write_file(folder: Path, text: str, name: str = "calibration.yaml") -> Path:
     path = folder / name
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def off_opencv(
+def max_opencv_distance_px(
     camera: CameraModel, matrix: np.ndarray, distortion: list[float], pose: RigidTransform | None = None
 ) -> float:
-    """Most distance, over the frame, between our pixels and those of OpenCV's own projection of the same far points."""
+    """Maximum distance over the frame between Marsyard's pixels and OpenCV's projection of the same far points."""
     columns, rows = (np.linspace(-0.5, extent - 0.5, 25) for extent in camera.size)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     points = camera.c + 1e5 * camera.rays(pixels)[1]
     pose = RigidTransform.identity() if pose is None else pose
     turn, shift = pose.rotation.as_rotvec(), np.asarray(pose.translation)
-    there, _ = cv2.projectPoints(points.reshape(-1, 1, 3), turn, shift, matrix, np.array(distortion))
-    return float(np.max(np.linalg.norm(there.reshape(-1, 2) - pixels, axis=1)))
+    reference, _ = cv2.projectPoints(points.reshape(-1, 1, 3), turn, shift, matrix, np.array(distortion))
+    return float(np.max(np.linalg.norm(reference.reshape(-1, 2) - pixels, axis=1)))
 
 
-def matrix_of(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def test_opencvs_own_file_projects_as_opencv_does(tmp_path: Path) -> None:
-    path = written(tmp_path, OPENCV)
+def test_opencv_file_projects_like_opencv(tmp_path: Path) -> None:
+    path = write_file(tmp_path, OPENCV)
     (read,) = read_calibrations(path)
     assert isinstance(read.camera, Cahvor)
     assert read.camera.size == (640, 480)
-    # OpenCV reads its file itself
+    # OpenCV reads its own file.
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     matrix = storage.getNode("camera_matrix").mat()
     distortion = storage.getNode("distortion_coefficients").mat().ravel()
-    off = off_opencv(read.camera, matrix, distortion)
-    # what is stated, with what lies between the samples over which it is stated
+    off = max_opencv_distance_px(read.camera, matrix, distortion)
+    # The stated residual, with a margin for positions between its samples.
     assert off < 1.1 * read.residual.max_px
-    # less than the calibration itself left of its points: 0.44 px
+    # Less than the reprojection error of the calibration: 0.44 px.
     assert 0.0 < read.residual.rms_px < 0.2
     assert read_camera(path) == read.camera
 
 
-def test_a_file_that_opencv_writes_now(tmp_path: Path) -> None:
+def test_file_of_current_opencv_is_read(tmp_path: Path) -> None:
     path = tmp_path / "written.yml"
-    matrix, distortion = matrix_of(812.5, 810.25, 401.0, 299.5), np.array([-0.21, 0.045, 0.0, 0.0, 0.0])
+    matrix, distortion = camera_matrix(812.5, 810.25, 401.0, 299.5), np.array([-0.21, 0.045, 0.0, 0.0, 0.0])
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     for name, value in (("image_width", 800), ("image_height", 600), ("camera_matrix", matrix)):
         storage.write(name, value)
     storage.write("distortion_coefficients", distortion)
     storage.release()
     (read,) = read_calibrations(path)
-    # k1 and k2 alone are CAHVOR's: exact
+    # CAHVOR represents k1 and k2 exactly.
     assert read.residual.max_px < 1e-9
-    assert off_opencv(read.camera, matrix, [*distortion]) < 1e-6
+    assert max_opencv_distance_px(read.camera, matrix, [*distortion]) < 1e-6
 
 
-def test_json_of_opencv_is_read_too(tmp_path: Path) -> None:
+def test_opencv_json_is_read(tmp_path: Path) -> None:
     path = tmp_path / "written.json"
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     for name, value in (("image_width", 800), ("image_height", 600)):
         storage.write(name, value)
-    storage.write("camera_matrix", matrix_of(812.5, 810.25, 401.0, 299.5))
+    storage.write("camera_matrix", camera_matrix(812.5, 810.25, 401.0, 299.5))
     storage.write("distortion_coefficients", np.array([-0.21, 0.045, 0.0, 0.0]))
     storage.release()
     json.loads(path.read_text())
     assert read_camera(path).focal_lengths == pytest.approx((812.5, 810.25))
 
 
-def test_ros_camera_info(tmp_path: Path) -> None:
-    (read,) = read_calibrations(written(tmp_path, ROS))
+def test_ros_camera_info_is_read(tmp_path: Path) -> None:
+    (read,) = read_calibrations(write_file(tmp_path, ROS))
     assert read.name == "camera_color"
     data = yaml.safe_load(ROS)
     matrix = np.reshape(data["camera_matrix"]["data"], (3, 3))
-    off = off_opencv(read.camera, matrix, data["distortion_coefficients"]["data"])
+    off = max_opencv_distance_px(read.camera, matrix, data["distortion_coefficients"]["data"])
     assert off < 1.1 * read.residual.max_px
     assert read.residual.rms_px < 0.2
 
 
-def test_rational_lens_of_ros(tmp_path: Path) -> None:
-    """The eight coefficients of an Azure Kinect's colour camera, scaled to this telephone's view."""
+def test_ros_rational_lens_is_fitted(tmp_path: Path) -> None:
+    """The eight coefficients of an Azure Kinect colour camera, scaled to the field of view of this telephone."""
     coefficients = [0.52, -2.6, 4e-4, -2e-4, 1.5, 0.40, -2.4, 1.45]
     text = ROS.replace("[0.09370951394834764, -0.1640721737187069, 0.0, 0.0, 0.1224192868301668]", str(coefficients))
-    (read,) = read_calibrations(written(tmp_path, text.replace("cols: 5", "cols: 8")))
+    (read,) = read_calibrations(write_file(tmp_path, text.replace("cols: 5", "cols: 8")))
     matrix = np.reshape(yaml.safe_load(ROS)["camera_matrix"]["data"], (3, 3))
-    assert off_opencv(read.camera, matrix, coefficients) < 1.1 * read.residual.max_px
+    assert max_opencv_distance_px(read.camera, matrix, coefficients) < 1.1 * read.residual.max_px
 
 
-def test_kalibrs_chain(tmp_path: Path) -> None:
-    left, right = read_calibrations(written(tmp_path, KALIBR))
+def test_kalibr_camera_chain_is_read(tmp_path: Path) -> None:
+    left, right = read_calibrations(write_file(tmp_path, KALIBR))
     data = yaml.safe_load(KALIBR)
     pose = RigidTransform.from_matrix(np.array(data["cam1"]["T_cn_cnm1"]))
     coefficients = [[-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05], data["cam1"]["distortion_coeffs"]]
     assert (left.name, right.name) == ("cam0", "cam1")
-    assert off_opencv(left.camera, matrix_of(458.654, 457.296, 367.215, 248.375), coefficients[0]) < 0.5
-    assert off_opencv(right.camera, matrix_of(457.587, 456.134, 379.999, 255.238), coefficients[1], pose) < 0.5
-    # EuRoC's stereo baseline is 11 cm; the second camera is to the right of the first
+    assert max_opencv_distance_px(left.camera, camera_matrix(458.654, 457.296, 367.215, 248.375), coefficients[0]) < 0.5
+    assert (
+        max_opencv_distance_px(right.camera, camera_matrix(457.587, 456.134, 379.999, 255.238), coefficients[1], pose)
+        < 0.5
+    )
+    # EuRoC's stereo baseline is 11 cm; the second camera is right of the first.
     assert np.linalg.norm(right.camera.c - left.camera.c) == pytest.approx(0.11, abs=0.001)
     assert right.camera.c[0] > 0.1
     with pytest.raises(CameraFileError, match="2 of them"):
@@ -250,33 +253,33 @@ def test_kalibrs_chain(tmp_path: Path) -> None:
     assert len(read_cameras(tmp_path / "calibration.yaml")) == 2
 
 
-def test_eurocs_sensor_is_the_same_camera(tmp_path: Path) -> None:
-    (euroc,) = read_calibrations(written(tmp_path, EUROC, "sensor.yaml"))
-    assert euroc.camera == read_calibrations(written(tmp_path, KALIBR))[0].camera
+def test_euroc_sensor_file_equals_kalibr_camera(tmp_path: Path) -> None:
+    (euroc,) = read_calibrations(write_file(tmp_path, EUROC, "sensor.yaml"))
+    assert euroc.camera == read_calibrations(write_file(tmp_path, KALIBR))[0].camera
 
 
-def test_equidistant_lens_projects_as_opencvs_fisheye(tmp_path: Path) -> None:
-    (read,) = read_calibrations(written(tmp_path, EQUIDISTANT))
+def test_equidistant_lens_projects_like_opencv_fisheye(tmp_path: Path) -> None:
+    (read,) = read_calibrations(write_file(tmp_path, EQUIDISTANT))
     assert isinstance(read.camera, Cahvore)
     assert read.residual.max_px < 0.5
     columns, rows = (np.linspace(-0.5, extent - 0.5, 25) for extent in read.camera.size)
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     points = 1e5 * read.camera.rays(pixels)[1]
     data = yaml.safe_load(EQUIDISTANT)["cam0"]
-    there, _ = cv2.fisheye.projectPoints(
+    reference, _ = cv2.fisheye.projectPoints(
         points.reshape(-1, 1, 3),
         np.zeros(3),
         np.zeros(3),
-        matrix_of(*data["intrinsics"]),
+        camera_matrix(*data["intrinsics"]),
         np.array(data["distortion_coeffs"]),
     )
-    off = np.linalg.norm(there.reshape(-1, 2) - pixels, axis=1)
+    off = np.linalg.norm(reference.reshape(-1, 2) - pixels, axis=1)
     assert off.max() < 1.1 * read.residual.max_px
 
 
 def test_fisheye_of_two_terms_is_exact_beyond_a_right_angle() -> None:
-    """Directions by Kannala and Brandt's own formula, inverted by hand where k1 = k2 = 0: theta = r / f."""
-    matrix, size = matrix_of(300.0, 300.0, 499.5, 499.5), (1000, 1000)
+    """Directions from the formula of Kannala and Brandt, inverted by hand for k1 = k2 = 0: theta = r / f."""
+    matrix, size = camera_matrix(300.0, 300.0, 499.5, 499.5), (1000, 1000)
     camera, residual = from_opencv_fisheye(matrix, np.zeros(4), size)
     assert residual.max_px < 1e-9
     corner = camera.rays(np.array([-0.5, -0.5]))[1]
@@ -285,19 +288,19 @@ def test_fisheye_of_two_terms_is_exact_beyond_a_right_angle() -> None:
     assert residual.max_px < 1e-9
 
 
-def test_fisheye_in_a_world() -> None:
+def test_fisheye_pose_in_the_world() -> None:
     pose = RigidTransform.from_components([0.1, -0.2, 0.3], Rotation.from_rotvec([0.2, -0.1, 0.4]))
-    matrix, size = matrix_of(300.0, 310.0, 320.0, 240.0), (640, 480)
+    matrix, size = camera_matrix(300.0, 310.0, 320.0, 240.0), (640, 480)
     camera, _ = from_opencv_fisheye(matrix, np.array([0.01, -0.002, 0.0, 0.0]), size, pose)
     point = pose.inv().apply([0.3, -0.2, 1.0])
-    there, _ = cv2.fisheye.projectPoints(
+    reference, _ = cv2.fisheye.projectPoints(
         point.reshape(1, 1, 3),
         pose.rotation.as_rotvec(),
         np.asarray(pose.translation),
         matrix,
         np.array([0.01, -0.002, 0.0, 0.0]),
     )
-    assert np.allclose(camera.project(point)[0], there.ravel(), rtol=0, atol=1e-6)
+    assert np.allclose(camera.project(point)[0], reference.ravel(), rtol=0, atol=1e-6)
 
 
 FAULTS = [
@@ -321,23 +324,25 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("text", "old", "new", "fault"), FAULTS, ids=[f"{old!r} {new!r}" for _, old, new, _ in FAULTS])
-def test_faults_name_field_and_allowed_values(tmp_path: Path, text: str, old: str, new: str, fault: str) -> None:
+def test_errors_name_field_and_allowed_values(tmp_path: Path, text: str, old: str, new: str, fault: str) -> None:
     assert old in text
-    path = written(tmp_path, text.replace(old, new, 1), "faulty.yaml")
+    path = write_file(tmp_path, text.replace(old, new, 1), "faulty.yaml")
     with pytest.raises(CameraFileError, match=fault) as raised:
         read_cameras(path)
     assert "faulty.yaml" in str(raised.value)
     assert "allowed" in str(raised.value)
 
 
-def test_lens_beyond_cahvor_is_refused(tmp_path: Path) -> None:
-    """Strong decentring is no shift of an axis: some per cent of tangential distortion are pixels off whatever O is."""
+def test_lens_not_representable_by_cahvor_is_rejected(tmp_path: Path) -> None:
+    """Strong decentring is not a shift of the axis: some percent of tangential distortion cause errors of pixels for
+    any O.
+    """
     text = OPENCV.replace("2.1257384355991209e-003", "0.05").replace("-3.9487502777272009e-004", "-0.04")
     with pytest.raises(CameraFileError, match=r"px at most; allowed: 0.3 and 3 px; crop the picture"):
-        read_calibrations(written(tmp_path, text))
+        read_calibrations(write_file(tmp_path, text))
 
 
-def test_large_files_are_refused_unread(tmp_path: Path) -> None:
+def test_large_files_are_rejected_unread(tmp_path: Path) -> None:
     path = tmp_path / "large.yaml"
     with path.open("wb") as file:
         file.write(b"image_width: 640\n")

@@ -1,4 +1,4 @@
-"""Motion, changes of the image, linear stand-ins, construction and what makes a camera a value."""
+"""Tests of camera motion, image changes, linear cameras, construction and immutability."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def transforms(draw: st.DrawFn) -> RigidTransform:
 
 
 def points_before(camera: CameraModel) -> np.ndarray:
-    """Points all over the frame, 4 m off."""
+    """Return points over the complete frame at a distance of 4 m."""
     origins, directions = camera.rays(camera.pixel_grid()[::100, ::100])
     return np.asarray(origins + 4 * directions)
 
@@ -38,27 +38,30 @@ def vectors(camera: CameraModel) -> np.ndarray:
 # ----- rigid motion: a group acts -----
 
 
-def test_moved_camera_sees_moved_points_as_before(camera: CameraModel) -> None:
+def test_moved_camera_projects_moved_points_equally(camera: CameraModel) -> None:
     motion = RigidTransform.from_components([100.0, -20.0, 5.0], Rotation.from_rotvec([0.4, -1.2, 2.0]))
     points = points_before(camera)
     moved_points = motion.apply(points.reshape(-1, 3)).reshape(points.shape)
-    # Points 100 m off are rounded to 1e-14 m, of 4 m and 1200 px/rad: 4e-12 px.
-    assert np.allclose(camera.moved(motion).project(moved_points)[0], camera.project(points)[0], rtol=0, atol=1e-10)
+    # Points 100 m away are rounded to 1e-14 m; at 4 m and 1200 px/rad this is 4e-12 px.
+    assert np.allclose(camera.transform(motion).project(moved_points)[0], camera.project(points)[0], rtol=0, atol=1e-10)
 
 
 @given(transforms(), transforms())
 def test_motions_compose(first: RigidTransform, second: RigidTransform) -> None:
     camera = Cahv.from_field_of_view(0.8, (64, 48), axis=(0, 0, -1), right=(1, 0, 0), centre=(1, 2, 3))
-    # Coordinates reach 4000 m, so that 1e-11 is a few roundings.
+    # Coordinates reach 4000 m: 1e-11 is a few roundings.
     assert np.allclose(
-        vectors(camera.moved(first).moved(second)), vectors(camera.moved(second * first)), rtol=0, atol=1e-11
+        vectors(camera.transform(first).transform(second)),
+        vectors(camera.transform(second * first)),
+        rtol=0,
+        atol=1e-11,
     )
-    assert np.allclose(vectors(camera.moved(first).moved(first.inv())), vectors(camera), rtol=0, atol=1e-11)
+    assert np.allclose(vectors(camera.transform(first).transform(first.inv())), vectors(camera), rtol=0, atol=1e-11)
 
 
 def test_motion_rotates_the_lens(hazcam: Cahvore) -> None:
     turn = Rotation.from_rotvec([0.3, 0.2, 0.1])
-    moved = hazcam.moved(RigidTransform.from_rotation(turn))
+    moved = hazcam.transform(RigidTransform.from_rotation(turn))
     assert np.allclose(moved.o, turn.apply(np.array(hazcam.o)), atol=1e-15)
     assert np.array_equal(moved.r, hazcam.r)
     assert np.array_equal(moved.e, hazcam.e)
@@ -66,17 +69,17 @@ def test_motion_rotates_the_lens(hazcam: Cahvore) -> None:
     assert moved.size == hazcam.size
 
 
-def test_several_motions_at_once_are_refused(navcam: Cahvor) -> None:
+def test_multiple_motions_are_rejected(navcam: Cahvor) -> None:
     with pytest.raises(ValueError, match="single transform"):
-        navcam.moved(RigidTransform.identity(2))
+        navcam.transform(RigidTransform.identity(2))
 
 
 # ----- changes of the image -----
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(1, 1), (2, 2), (4, 1), (1, 4), (32, 64)])
-def test_binning_puts_blocks_at_their_middle(camera: CameraModel, columns: int, rows: int) -> None:
-    binned = camera.binned(columns, rows)
+def test_binned_pixel_is_at_block_centre(camera: CameraModel, columns: int, rows: int) -> None:
+    binned = camera.bin(columns, rows)
     assert binned.size == (1024 // columns, 1024 // rows)
     points = points_before(camera)
     factors = np.array([columns, rows])
@@ -85,60 +88,60 @@ def test_binning_puts_blocks_at_their_middle(camera: CameraModel, columns: int, 
 
 
 def test_binning_agrees_with_averaged_rays(navcam: Cahvor) -> None:
-    """The middle of four pixels looks between their directions (exactly, but for the curvature over half a pixel)."""
+    """The centre of four pixels looks between their directions, exact except for curvature over half a pixel."""
     grid = navcam.pixel_grid()[500:502, 300:302].reshape(-1, 2)
     between = navcam.rays(grid)[1].mean(axis=0)
-    direction = navcam.binned(2, 2).rays(np.array([150.0, 250.0]))[1]
+    direction = navcam.bin(2, 2).rays(np.array([150.0, 250.0]))[1]
     assert np.allclose(between / np.linalg.norm(between), direction, atol=1e-9)
 
 
-def test_scaling_keeps_the_frames_edges(camera: CameraModel) -> None:
+def test_scaling_keeps_the_frame_edges(camera: CameraModel) -> None:
     points = points_before(camera)
     for factor in (0.5, 0.25, 2, 1.7):
-        scaled = camera.scaled(factor)
+        scaled = camera.scale(factor)
         expected = (camera.project(points)[0] + 0.5) * factor - 0.5
         assert np.allclose(scaled.project(points)[0], expected, rtol=0, atol=1e-9)
         assert scaled.size == (round(1024 * factor), round(1024 * factor))
-    assert np.allclose(vectors(camera.scaled(0.25)), vectors(camera.binned(4, 4)), rtol=0, atol=1e-12)
+    assert np.allclose(vectors(camera.scale(0.25)), vectors(camera.bin(4, 4)), rtol=0, atol=1e-12)
 
 
 def test_cropping_moves_the_origin(camera: CameraModel) -> None:
-    cropped = camera.cropped(100, 37, (512, 256))
+    cropped = camera.crop(100, 37, (512, 256))
     points = points_before(camera)
     assert cropped.size == (512, 256)
     assert np.allclose(cropped.project(points)[0], camera.project(points)[0] - [100, 37], rtol=0, atol=1e-10)
 
 
 @given(st.integers(0, 20), st.integers(0, 30), st.sampled_from([1, 2, 4]), st.sampled_from([1, 2, 4]))
-def test_crop_then_bin_is_bin_then_crop(column: int, row: int, columns: int, rows: int) -> None:
+def test_cropping_and_binning_commute(column: int, row: int, columns: int, rows: int) -> None:
     camera = Cahv.from_field_of_view(1.0, (256, 256), axis=(0, 0, -1), right=(1, 0, 0))
-    one = camera.cropped(column * columns, row * rows, (32 * columns, 16 * rows)).binned(columns, rows)
-    other = camera.binned(columns, rows).cropped(column, row, (32, 16))
+    one = camera.crop(column * columns, row * rows, (32 * columns, 16 * rows)).bin(columns, rows)
+    other = camera.bin(columns, rows).crop(column, row, (32, 16))
     assert one.size == other.size
     assert np.allclose(vectors(one), vectors(other), rtol=0, atol=1e-12)
 
 
 def test_changes_keep_the_lens(hazcam: Cahvore) -> None:
-    changed = hazcam.cropped(1, 2, (512, 256)).binned(2, 2).scaled(3)
+    changed = hazcam.crop(1, 2, (512, 256)).bin(2, 2).scale(3)
     for name in "caore":
         assert np.array_equal(getattr(changed, name), getattr(hazcam, name))
     assert changed.linearity == hazcam.linearity
 
 
-def test_impossible_changes_are_refused(navcam: Cahvor) -> None:
+def test_invalid_changes_are_rejected(navcam: Cahvor) -> None:
     for columns, rows in ((3, 1), (1, 7), (0, 1), (-2, 1), (2048, 1)):
         with pytest.raises(ValueError, match="cannot bin"):
-            navcam.binned(columns, rows)
+            navcam.bin(columns, rows)
     for factor in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(ValueError, match="positive, finite"):
-            navcam.scaled(factor)
+            navcam.scale(factor)
     with pytest.raises(ValueError, match="size"):
-        navcam.scaled(1e-6)
+        navcam.scale(1e-6)
     for column, row, size in ((-1, 0, (4, 4)), (0, 1020, (4, 5)), (1024, 0, (1, 1))):
         with pytest.raises(ValueError, match="leaves the frame"):
-            navcam.cropped(column, row, size)
+            navcam.crop(column, row, size)
     with pytest.raises(ValueError, match="size"):
-        navcam.cropped(0, 0, (0, 4))
+        navcam.crop(0, 0, (0, 4))
 
 
 # ----- linear stand-ins -----
@@ -170,7 +173,7 @@ def test_camera_from_focal_length_and_pitch() -> None:
     assert pixel == pytest.approx([511.5 + 122.25, 511.5])
 
 
-def test_pitch_may_differ_along_columns_and_rows() -> None:
+def test_pixel_pitch_may_differ_between_axes() -> None:
     camera = Cahv.from_focal_length(
         0.01, (1e-5, 4e-5), (100, 25), axis=(0, 0, -2), right=(3, 0, 1), image_centre=(40, 10)
     )
@@ -180,7 +183,7 @@ def test_pitch_may_differ_along_columns_and_rows() -> None:
     assert np.allclose(camera.down, (0, -1, 0))
 
 
-def test_field_of_view_is_between_the_outer_edges() -> None:
+def test_field_of_view_includes_the_outer_edges() -> None:
     camera = Cahv.from_field_of_view(math.radians(60), (100, 50), axis=(0, 0, 1), right=(1, 0, 0))
     left, right = camera.rays(np.array([[-0.5, 24.5], [99.5, 24.5]]))[1]
     assert math.degrees(math.acos(left @ right)) == pytest.approx(60)
@@ -191,7 +194,7 @@ def test_field_of_view_is_between_the_outer_edges() -> None:
     assert np.allclose(both.boresight(), (0, 0, 1))
 
 
-def test_impossible_constructions_are_refused() -> None:
+def test_invalid_construction_is_rejected() -> None:
     with pytest.raises(ValueError, match="parallel"):
         Cahv.from_axes((1, 1), (4, 4), axis=(0, 0, 1), right=(0, 0, 2))
     with pytest.raises(ValueError, match="axis must be a finite vector"):
@@ -223,13 +226,13 @@ def test_impossible_constructions_are_refused() -> None:
         ({"r": np.array([-1.0, 0.0, 0.0])}, "r must begin with a number above -1"),
     ],
 )
-def test_impossible_fields_are_refused(navcam: Cahvor, change: dict[str, Any], fault: str) -> None:
+def test_invalid_fields_are_rejected(navcam: Cahvor, change: dict[str, Any], fault: str) -> None:
     with pytest.raises(ValueError, match=fault):
         dataclasses.replace(navcam, **change)
 
 
 @pytest.mark.parametrize("linearity", [1.01, -1.01, math.nan, math.inf])
-def test_impossible_linearity_is_refused(hazcam: Cahvore, linearity: float) -> None:
+def test_invalid_linearity_is_rejected(hazcam: Cahvore, linearity: float) -> None:
     with pytest.raises(ValueError, match="linearity must lie between -1 and 1"):
         dataclasses.replace(hazcam, linearity=linearity)
 
@@ -244,22 +247,22 @@ def test_cameras_are_immutable(camera: CameraModel) -> None:
         camera.c[0] = 1.0
 
 
-def test_cameras_do_not_share_the_callers_arrays(navcam: Cahvor) -> None:
+def test_cameras_copy_their_arrays(navcam: Cahvor) -> None:
     centre = np.array([1.0, 2.0, 3.0])
     camera = dataclasses.replace(navcam, c=centre)
     centre[:] = 0
     assert camera.c.tolist() == [1, 2, 3]
 
 
-def through_pickle(camera: CameraModel) -> CameraModel:
-    """As a worker process gets it."""
+def copy_by_pickle(camera: CameraModel) -> CameraModel:
+    """Return the camera as a worker process receives it."""
     copied: CameraModel = pickle.loads(pickle.dumps(camera))  # noqa: S301
     return copied
 
 
-@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, through_pickle])
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, copy_by_pickle])
 def test_copies_are_equal_and_immutable(camera: CameraModel, duplicate: Callable[[CameraModel], CameraModel]) -> None:
-    camera.rays(np.zeros(2))  # fills what is cached
+    camera.rays(np.zeros(2))  # fills the cache
     twin = duplicate(camera)
     assert twin == camera
     assert hash(twin) == hash(camera)
@@ -276,7 +279,7 @@ def test_different_cameras_differ(navcam: Cahvor, pinhole: Cahv) -> None:
 
 
 def test_derived_quantities_of_the_navcam(navcam: Cahvor) -> None:
-    """Against the formulas of cmod_cahv_internal, which take A for a unit vector (it is labelled to six digits)."""
+    """Compare with the formulas of cmod_cahv_internal, which assume a unit vector A (six digits in the label)."""
     hs, vs = navcam.focal_lengths
     hc, vc = navcam.image_centre
     assert hs == pytest.approx(np.linalg.norm(np.cross(navcam.a, navcam.h)), rel=2e-6)
@@ -287,7 +290,7 @@ def test_derived_quantities_of_the_navcam(navcam: Cahvor) -> None:
     assert navcam.theta == pytest.approx(math.atan2(np.cross(navcam.v, navcam.h) @ navcam.a, across @ along), abs=1e-8)
     assert np.allclose(hs * navcam.right + hc * navcam.a, navcam.h, atol=1e-2)
     half_angles = np.arccos(navcam.corner_rays()[1] @ navcam.boresight())
-    assert np.degrees(2 * half_angles.max()) == pytest.approx(61.4, abs=0.1)  # 45 x 45 degrees, across the corners
+    assert np.degrees(2 * half_angles.max()) == pytest.approx(61.4, abs=0.1)  # 45 x 45 degrees, along the diagonal
 
 
 def test_corner_rays_are_in_clockwise_order(camera: CameraModel) -> None:

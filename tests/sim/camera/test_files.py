@@ -1,4 +1,4 @@
-"""Camera files: Opportunity's labels as they are, round trips, and every fault named."""
+"""Tests of camera files: Opportunity's labels, round trips and error messages."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ END_GROUP                         = INSTRUMENT_STATE_PARMS
 END
 """
 
-# As cmod writes it: comment, covariances and derived lines included.
+# The format of cmod, with comment, covariances and derived lines.
 TEXT = """# navcam, left
 #
 
@@ -91,7 +91,7 @@ S internal =
 """
 
 
-def written(folder: Path, text: str, name: str = "camera.cahvor") -> Path:
+def write_file(folder: Path, text: str, name: str = "camera.cahvor") -> Path:
     path = folder / name
     path.write_bytes(text.encode("latin-1"))
     return path
@@ -100,44 +100,45 @@ def written(folder: Path, text: str, name: str = "camera.cahvor") -> Path:
 # ----- PDS3 labels -----
 
 
-def test_opportunitys_labels_read_as_they_are(labelled: dict[str, CameraModel], shared_data: Path) -> None:
+def test_opportunity_labels_are_read(labelled: dict[str, CameraModel], shared_data: Path) -> None:
     for name, expected in labelled.items():
         label = shared_data / "mer_opportunity" / name
         assert read_camera(label) == expected
         assert read_cameras(str(label)) == (expected,)
 
 
-def test_label_of_cahvore(tmp_path: Path, hazcam: Cahvore) -> None:
+def test_cahvore_label_is_read(tmp_path: Path, hazcam: Cahvore) -> None:
     expected = dataclasses.replace(hazcam, size=(1020, 1024))
-    assert read_camera(written(tmp_path, LABEL)) == expected
-    assert read_camera(written(tmp_path, LABEL.replace("\n", "\r\n"))) == expected
+    assert read_camera(write_file(tmp_path, LABEL)) == expected
+    assert read_camera(write_file(tmp_path, LABEL.replace("\n", "\r\n"))) == expected
     assert (
-        read_camera(written(tmp_path, "CCSD3ZF0000100000001NJPL3IF0PDS200000001\n/* a label */\n" + LABEL)) == expected
+        read_camera(write_file(tmp_path, "CCSD3ZF0000100000001NJPL3IF0PDS200000001\n/* a label */\n" + LABEL))
+        == expected
     )
-    assert read_camera(written(tmp_path, LABEL + "\0\xff END of nothing" * 1000)) == expected
+    assert read_camera(write_file(tmp_path, LABEL + "\0\xff END of nothing" * 1000)) == expected
 
 
 @pytest.mark.parametrize(("kind", "linearity"), [("1.0", 1.0), ("2", 0.0), ("3.0", 0.37)])
-def test_cahvores_types(tmp_path: Path, kind: str, linearity: float) -> None:
+def test_cahvore_types_set_linearity(tmp_path: Path, kind: str, linearity: float) -> None:
     text = LABEL.replace("MODEL_COMPONENT_8               = 3.0", f"MODEL_COMPONENT_8 = {kind}")
-    camera = read_camera(written(tmp_path, text))
+    camera = read_camera(write_file(tmp_path, text))
     assert isinstance(camera, Cahvore)
     assert camera.linearity == linearity
 
 
-def test_components_are_found_by_their_letters(tmp_path: Path, hazcam: Cahvore) -> None:
+def test_components_are_assigned_by_letter(tmp_path: Path, hazcam: Cahvore) -> None:
     text = (
         LABEL.replace("(C,A,H,V,O,R,E,T,P)", "(C,A,V,H,O,R,E,T,P)")
         .replace("_3 ", "_X ")
         .replace("_4 ", "_3 ")
         .replace("_X ", "_4 ")
     )
-    assert read_camera(written(tmp_path, text)) == dataclasses.replace(hazcam, size=(1020, 1024))
+    assert read_camera(write_file(tmp_path, text)) == dataclasses.replace(hazcam, size=(1020, 1024))
 
 
-def test_several_models_in_a_label(tmp_path: Path) -> None:
+def test_label_with_several_models_needs_a_selection(tmp_path: Path) -> None:
     start, end = LABEL.index("GROUP "), LABEL.index("GROUP                             = INSTRUMENT")
-    path = written(tmp_path, LABEL[:end] + LABEL[start:])
+    path = write_file(tmp_path, LABEL[:end] + LABEL[start:])
     cameras = read_cameras(path)
     assert len(cameras) == 2
     assert cameras[0] == cameras[1]
@@ -145,10 +146,10 @@ def test_several_models_in_a_label(tmp_path: Path) -> None:
         read_camera(path)
 
 
-def test_subframes_are_refused_unless_folded_in(tmp_path: Path) -> None:
+def test_subframes_are_rejected_unless_folded_in(tmp_path: Path) -> None:
     for field in ("  FIRST_LINE     ", "  FIRST_LINE_SAMPLE ", "  PIXEL_AVERAGING_HEIGHT", "  PIXEL_AVERAGING_WIDTH"):
         lines = [line[:-1] + "2" if line.startswith(field) else line for line in LABEL.splitlines()]
-        path = written(tmp_path, "\n".join(lines) + "\n")
+        path = write_file(tmp_path, "\n".join(lines) + "\n")
         with pytest.raises(CameraFileError, match=f"{field.strip()}: 2.*subframe_folded_in"):
             read_camera(path)
         assert read_pds3(path, subframe_folded_in=True)[0].size == (1020, 1024)
@@ -186,9 +187,9 @@ LABEL_FAULTS = [
 
 
 @pytest.mark.parametrize(("old", "new", "fault"), LABEL_FAULTS, ids=[f"{new!r}" for _, new, _ in LABEL_FAULTS])
-def test_label_faults_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
+def test_label_errors_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
     assert old in LABEL
-    path = written(tmp_path, LABEL.replace(old, new), "faulty.IMG")
+    path = write_file(tmp_path, LABEL.replace(old, new), "faulty.IMG")
     with pytest.raises(CameraFileError, match=fault) as raised:
         read_camera(path)
     assert "faulty.IMG" in str(raised.value)
@@ -198,8 +199,8 @@ def test_label_faults_name_field_and_allowed_values(tmp_path: Path, old: str, ne
 # ----- JPL text files -----
 
 
-def test_cmods_text_file(tmp_path: Path, navcam: Cahvor) -> None:
-    camera = read_cahvor(written(tmp_path, TEXT))
+def test_cmod_text_file_is_read(tmp_path: Path, navcam: Cahvor) -> None:
+    camera = read_cahvor(write_file(tmp_path, TEXT))
     assert isinstance(camera, Cahvor)
     assert camera.size == (1024, 1024)
     for name in "cahvor":  # %13f: six decimals
@@ -207,9 +208,11 @@ def test_cmods_text_file(tmp_path: Path, navcam: Cahvor) -> None:
 
 
 @pytest.mark.parametrize("ending", ["\n", "\r\n"])
-def test_text_may_be_spaced_and_ended_otherwise(tmp_path: Path, ending: str) -> None:
+def test_spacing_and_line_endings_may_differ(tmp_path: Path, ending: str) -> None:
     text = TEXT.replace("C =", "  C  =").replace("Dimensions = 1024 1024", "Dimensions=1024\t1024 # columns, rows")
-    assert read_camera(written(tmp_path, text.replace("\n", ending))) == read_cahvor(written(tmp_path, TEXT, "plain"))
+    assert read_camera(write_file(tmp_path, text.replace("\n", ending))) == read_cahvor(
+        write_file(tmp_path, TEXT, "plain")
+    )
 
 
 @pytest.mark.parametrize(
@@ -221,20 +224,20 @@ def test_text_may_be_spaced_and_ended_otherwise(tmp_path: Path, ending: str) -> 
         ("CAHVORE3, -0.5", -0.5),
     ],
 )
-def test_text_of_cahvore(tmp_path: Path, model: str, linearity: float) -> None:
+def test_cahvore_text_is_read(tmp_path: Path, model: str, linearity: float) -> None:
     text = TEXT.replace("CAHVOR = perspective, distortion", model).replace("\nS =", "E = 0.001 0.002 0.003\n\nS =")
-    camera = read_camera(written(tmp_path, text))
+    camera = read_camera(write_file(tmp_path, text))
     assert isinstance(camera, Cahvore)
     assert camera.linearity == linearity
     assert camera.e.tolist() == [0.001, 0.002, 0.003]
 
 
-def test_text_of_cahv(tmp_path: Path) -> None:
+def test_cahv_text_is_read(tmp_path: Path) -> None:
     text = TEXT.replace("CAHVOR = perspective, distortion", "CAHV = perspective, linear")
-    assert isinstance(read_camera(written(tmp_path, text)), Cahv)
+    assert isinstance(read_camera(write_file(tmp_path, text)), Cahv)
 
 
-def test_written_cameras_read_back_equal(tmp_path: Path, camera: CameraModel) -> None:
+def test_written_cameras_round_trip(tmp_path: Path, camera: CameraModel) -> None:
     path = tmp_path / "camera.txt"
     write_cahvor(camera, path, comment="the left one\nModel = NONE")
     assert read_cahvor(path) == camera
@@ -281,37 +284,37 @@ TEXT_FAULTS = [
 
 
 @pytest.mark.parametrize(("old", "new", "fault"), TEXT_FAULTS, ids=[f"{new!r}" for _, new, _ in TEXT_FAULTS])
-def test_text_faults_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
+def test_text_errors_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
     assert old in TEXT
-    path = written(tmp_path, TEXT.replace(old, new, 1), "faulty.cahvor")
+    path = write_file(tmp_path, TEXT.replace(old, new, 1), "faulty.cahvor")
     with pytest.raises(CameraFileError, match=fault) as raised:
         read_camera(path)
     assert "faulty.cahvor" in str(raised.value)
     assert "allowed" in str(raised.value)
 
 
-def test_missing_files_and_other_formats_are_refused(tmp_path: Path) -> None:
+def test_missing_files_and_unknown_formats_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(CameraFileError, match=r"absent.cahvor: file: cannot be read \(No such file"):
         read_camera(tmp_path / "absent.cahvor")
     with pytest.raises(CameraFileError, match="cannot be read"):
         read_camera(tmp_path)
     with pytest.raises(CameraFileError, match=r"is empty \(0 bytes\)"):
-        read_camera(written(tmp_path, ""))
+        read_camera(write_file(tmp_path, ""))
     with pytest.raises(CameraFileError, match="PDS_VERSION_ID: missing"):
-        read_pds3(written(tmp_path, TEXT))
+        read_pds3(write_file(tmp_path, TEXT))
 
 
 @settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from([TEXT, LABEL]), st.integers(0, 1700), st.binary(min_size=0, max_size=12), st.integers(0, 30))
 def test_damaged_files_never_crash_the_reader(tmp_path: Path, text: str, at: int, junk: bytes, removed: int) -> None:
-    whole = text.encode("latin-1")
+    full = text.encode("latin-1")
     path = tmp_path / "damaged"
-    path.write_bytes(whole[:at] + junk + whole[at + removed :])
+    path.write_bytes(full[:at] + junk + full[at + removed :])
     with contextlib.suppress(CameraFileError):
         assert len(read_cameras(path)) == 1
 
 
-#: Curiosity's: the head of a navigation camera's label (MSL_MMM EDR), its group and a part of the frame.
+#: Curiosity: the start of a navigation camera's label (MSL_MMM EDR), its model group and a part of the frame.
 CURIOSITY = (
     LABEL.replace("PDS_VERSION_ID                    = PDS3", "ODL_VERSION_ID                    = ODL3")
     .replace("^IMAGE                            = 3", '^IMAGE                            = ("NLB_0001.IMG", 9)')
@@ -321,12 +324,12 @@ CURIOSITY = (
 
 
 @pytest.mark.parametrize("ending", ["\n", "\r\n"])
-def test_curiositys_labels_are_read(tmp_path: Path, ending: str) -> None:
-    ours, theirs = tmp_path / "spirit.lbl", tmp_path / "curiosity.lbl"
-    ours.write_text(LABEL)
-    theirs.write_bytes(CURIOSITY.replace("\n", ending).encode())
-    (expected,), (found,) = read_cameras(ours), read_cameras(theirs)
-    assert found == expected
+def test_curiosity_labels_are_read(tmp_path: Path, ending: str) -> None:
+    actual, reference = tmp_path / "spirit.lbl", tmp_path / "curiosity.lbl"
+    actual.write_text(LABEL)
+    reference.write_bytes(CURIOSITY.replace("\n", ending).encode())
+    (expected,), (result,) = read_cameras(actual), read_cameras(reference)
+    assert result == expected
 
 
 @pytest.mark.parametrize(
@@ -337,7 +340,7 @@ def test_curiositys_labels_are_read(tmp_path: Path, ending: str) -> None:
         ("AVERAGING_WIDTH           = 1", "AVERAGING_WIDTH           = 2 <pixel>", "PIXEL_AVERAGING_WIDTH: 2"),
     ],
 )
-def test_curiositys_subframes_need_subframe_folded_in(tmp_path: Path, old: str, new: str, field: str) -> None:
+def test_curiosity_subframes_must_be_folded_in(tmp_path: Path, old: str, new: str, field: str) -> None:
     path = tmp_path / "curiosity.lbl"
     path.write_text(CURIOSITY.replace(old, new))
     with pytest.raises(CameraFileError, match=field):

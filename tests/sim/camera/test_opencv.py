@@ -1,4 +1,4 @@
-"""Conversion from OpenCV against OpenCV itself."""
+"""Tests of the conversion from OpenCV against OpenCV."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.sim.camera import Cahvor, CameraModel, from_opencv
 
 
-def far_points(camera: CameraModel, pixels: np.ndarray) -> np.ndarray:
+def make_far_points(camera: CameraModel, pixels: np.ndarray) -> np.ndarray:
     return camera.c + 1e4 * camera.rays(pixels)[1].reshape(-1, 3)
 
 
-def frame(camera: CameraModel) -> np.ndarray:
-    """The samples over which the residual is stated."""
+def sample_frame(camera: CameraModel) -> np.ndarray:
+    """Return the pixels for which the residual is stated."""
     columns, rows = (np.linspace(-0.5, extent - 0.5, 33) for extent in camera.size)
     return np.stack(np.meshgrid(columns, rows), axis=-1)
 
@@ -26,16 +26,16 @@ MATRIX = np.array([[900.0, 0.0, 630.0], [0.0, 905.0, 350.0], [0.0, 0.0, 1.0]])
 POSE = RigidTransform.from_components([0.5, -1.0, 2.0], Rotation.from_rotvec([0.4, -0.2, 1.0]))
 
 
-def from_opencv_distances(camera: Cahvor, matrix: np.ndarray, distortion: np.ndarray) -> np.ndarray:
-    pixels = frame(camera)
-    there, _ = cv2.projectPoints(
-        far_points(camera, pixels).reshape(-1, 1, 3),
+def opencv_distances_px(camera: Cahvor, matrix: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    pixels = sample_frame(camera)
+    reference, _ = cv2.projectPoints(
+        make_far_points(camera, pixels).reshape(-1, 1, 3),
         POSE.rotation.as_rotvec(),
         np.asarray(POSE.translation),
         matrix,
         distortion,
     )
-    return np.asarray(np.linalg.norm(np.asarray(there).reshape(-1, 2) - pixels.reshape(-1, 2), axis=-1))
+    return np.asarray(np.linalg.norm(np.asarray(reference).reshape(-1, 2) - pixels.reshape(-1, 2), axis=-1))
 
 
 @pytest.mark.parametrize("distortion", [[], [-0.2, 0.05, 0, 0], [0.1, -0.02, 0, 0, 0]])
@@ -44,19 +44,19 @@ def test_radial_distortion_from_opencv_is_exact(distortion: list[float]) -> None
     camera, residual = from_opencv(MATRIX, coefficients, (1280, 720), POSE)
     assert residual.max_px < 1e-9
     padded = np.concatenate([coefficients, np.zeros(5 - len(coefficients))])
-    # Points 1e4 m off are not quite at infinity, nor have they to be: both cameras have one centre.
-    assert np.max(from_opencv_distances(camera, MATRIX, padded)) < 1e-8
+    # Points 1e4 m away are not at infinity; both cameras have the same centre.
+    assert np.max(opencv_distances_px(camera, MATRIX, padded)) < 1e-8
 
 
 def test_full_distortion_from_opencv_is_fitted() -> None:
     distortion = np.array([-0.25, 0.08, 0.001, -0.0008, -0.005])
     camera, residual = from_opencv(MATRIX, distortion, (1280, 720), POSE)
-    there = from_opencv_distances(camera, MATRIX, distortion)
-    # Both are taken at the same samples of the frame, one along CAHVOR's rays and one along OpenCV's.
-    assert np.sqrt(np.mean(there**2)) == pytest.approx(residual.rms_px, rel=0.05)
+    reference = opencv_distances_px(camera, MATRIX, distortion)
+    # Both are sampled at the same pixels: along CAHVOR's rays and along OpenCV's rays.
+    assert np.sqrt(np.mean(reference**2)) == pytest.approx(residual.rms_px, rel=0.05)
     assert residual.rms_px < 0.2
     assert residual.max_px < 1.0
-    assert np.linalg.norm(camera.o - camera.a) > 1e-4  # the lens is tilted to make up for p1 and p2
+    assert np.linalg.norm(camera.o - camera.a) > 1e-4  # the lens axis is tilted to represent p1 and p2
 
 
 def test_skew_of_the_matrix_is_kept() -> None:
@@ -76,6 +76,6 @@ def test_skew_of_the_matrix_is_kept() -> None:
         (MATRIX, np.array([-2.0, 0.0, 0.0, 0.0]), "folds over"),
     ],
 )
-def test_impossible_opencv_cameras_are_refused(matrix: np.ndarray, distortion: np.ndarray, fault: str) -> None:
+def test_invalid_opencv_cameras_are_rejected(matrix: np.ndarray, distortion: np.ndarray, fault: str) -> None:
     with pytest.raises(ValueError, match=fault):
         from_opencv(matrix, distortion, (1280, 720))

@@ -1,4 +1,4 @@
-"""PDS4 labels: the camera model of a Mars 2020 navcam's label as it is, and every fault named."""
+"""Tests of PDS4 labels: the camera model of a Mars 2020 navcam and error messages."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 
 from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraFileError, read_camera, read_cameras, read_pds4
 
-#: Of NLF_0629_0722782785_631ECM_N0301344NCAM00427_06_095J01 (NASA PDS, mars2020_navcam_ops_raw): its camera model, the
-#: pointing and the fields of view that the label itself derives, the subframe and the axes; all else left out.
+#: From NLF_0629_0722782785_631ECM_N0301344NCAM00427_06_095J01 (NASA PDS, mars2020_navcam_ops_raw): the camera model,
+#: derived pointing and fields of view, the subframe and the axes.
 LABEL = """<?xml version="1.0" encoding="UTF-8"?>
 <Product_Observational
     xmlns="http://pds.nasa.gov/pds4/pds/v1"
@@ -92,14 +92,14 @@ LABEL = """<?xml version="1.0" encoding="UTF-8"?>
 WHOLE = LABEL.replace(">953<", ">1<").replace(">1273<", ">1<")
 
 
-def written(folder: Path, text: str) -> Path:
+def write_label(folder: Path, text: str) -> Path:
     path = folder / "label.xml"
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def test_navcam_of_mars_2020(tmp_path: Path) -> None:
-    camera = read_camera(written(tmp_path, LABEL), subframe_folded_in=True)
+def test_mars_2020_navcam_is_read(tmp_path: Path) -> None:
+    camera = read_camera(write_label(tmp_path, LABEL), subframe_folded_in=True)
     assert isinstance(camera, Cahvore)
     assert camera.size == (1296, 976)
     assert camera.linearity == 0.0
@@ -107,36 +107,37 @@ def test_navcam_of_mars_2020(tmp_path: Path) -> None:
     assert np.array_equal(camera.h, [-3229.43, 141.993, 229.563])
     assert np.array_equal(camera.r, [1.736e-06, 0.0501396, -0.0171254])
     assert np.array_equal(camera.e, [-8.0e-09, 1.0e-08, -2.9e-08])
-    # the label states what its subframe sees: both fields of view follow from the model, to what it counts as a width
+    # The label states the fields of view of the subframe; they follow from the model within the label's definition of
+    # width.
     middle = np.array([647.5, 487.5])
     for ends, stated_deg in (([[-0.5, 487.5], [1295.5, 487.5]], 24.7326), ([[647.5, -0.5], [647.5, 975.5]], 18.6047)):
         first, last = camera.rays(np.array(ends))[1]
         assert np.degrees(np.arccos(first @ last)) == pytest.approx(stated_deg, rel=0.02)
     assert np.all(np.isfinite(camera.rays(middle)[1]))
-    # folded in: with the subframe's first sample the image centre lies near the middle of a detector of 5120 x 3840
+    # Folded in, with the first sample of the subframe, the image centre is near the centre of the 5120 x 3840 detector.
     hc, vc = camera.image_centre
     assert hc + 1272 == pytest.approx(2560, rel=0.02)
     assert vc + 952 == pytest.approx(1920, rel=0.02)
 
 
-def test_subframes_are_refused_unless_folded_in(tmp_path: Path) -> None:
+def test_subframes_are_rejected_unless_folded_in(tmp_path: Path) -> None:
     with pytest.raises(CameraFileError, match=r"Subframe.first_line: 953.*subframe_folded_in = true"):
-        read_cameras(written(tmp_path, LABEL))
+        read_cameras(write_label(tmp_path, LABEL))
     binned = WHOLE.replace('<img:height_pixels unit="pixel">1', '<img:height_pixels unit="pixel">2')
     with pytest.raises(CameraFileError, match=r"Downsampling.height_pixels: 2"):
-        read_cameras(written(tmp_path, binned))
-    assert read_cameras(written(tmp_path, WHOLE))[0].size == (1296, 976)
+        read_cameras(write_label(tmp_path, binned))
+    assert read_cameras(write_label(tmp_path, WHOLE))[0].size == (1296, 976)
 
 
-def test_prefixes_do_not_matter(tmp_path: Path) -> None:
+def test_namespace_prefixes_are_ignored(tmp_path: Path) -> None:
     other = WHOLE.replace("geom:", "g:").replace("xmlns:g:", "xmlns:g").replace('xmlns:geom="', 'xmlns:g="')
-    assert read_camera(written(tmp_path, other)) == read_camera(written(tmp_path, WHOLE))
+    assert read_camera(write_label(tmp_path, other)) == read_camera(write_label(tmp_path, WHOLE))
 
 
-def test_cahvor_and_cahv(tmp_path: Path) -> None:
+def test_cahvor_and_cahv_are_read(tmp_path: Path) -> None:
     for name, kind in (("CAHVOR", Cahvor), ("CAHV", Cahv)):
         text = WHOLE.replace(">CAHVORE<", f">{name}<").replace("CAHVORE_Model", f"{name}_Model")
-        camera = read_camera(written(tmp_path, text))
+        camera = read_camera(write_label(tmp_path, text))
         assert isinstance(camera, kind)
         assert np.array_equal(camera.v, [-168.067, 400.716, 3088.89])
 
@@ -161,9 +162,9 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("old", "new", "fault"), FAULTS, ids=[f"{old!r} {new!r}" for old, new, _ in FAULTS])
-def test_faults_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
+def test_errors_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
     assert old in WHOLE
     with pytest.raises(CameraFileError, match=fault) as raised:
-        read_pds4(written(tmp_path, WHOLE.replace(old, new)))
+        read_pds4(write_label(tmp_path, WHOLE.replace(old, new)))
     assert "label.xml" in str(raised.value)
     assert "allowed" in str(raised.value)

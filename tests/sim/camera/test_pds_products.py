@@ -1,4 +1,4 @@
-"""Pictures in PDS3 products, against Opportunity's own statistics in their labels and against products made here."""
+"""Tests of images in PDS3 products, against the statistics in Opportunity's labels and synthetic products."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ END
 """
 
 
-def product(
+def write_product(
     folder: Path,
     sample: str = ">i2",
     pointer: str = "3",
@@ -39,7 +39,7 @@ def product(
     quaternion: str = "(0.8, 0.0, 0.0, 0.6)",
     counts: np.ndarray = COUNTS,
 ) -> Path:
-    """A product whose picture begins at its third record."""
+    """Write a product whose image begins at its third record."""
     path = folder / "made.img"
     label = LABEL.format(pointer=pointer, kind=kind, bits=bits, quaternion=quaternion).encode()
     path.write_bytes(label.ljust(1024, b" ") + counts.astype(sample).tobytes())
@@ -55,16 +55,16 @@ def product(
         ("u1", "3", "UNSIGNED_INTEGER", 8),
     ],
 )
-def test_samples_of_all_kinds(tmp_path: Path, sample: str, pointer: str, kind: str, bits: int) -> None:
+def test_all_sample_types_are_read(tmp_path: Path, sample: str, pointer: str, kind: str, bits: int) -> None:
     counts = COUNTS // 16 if bits == 8 else COUNTS
-    found = read_pds3_product(product(tmp_path, sample, pointer, kind, bits, counts=counts))
-    assert np.array_equal(found.counts, counts)
-    assert found.time_s == 100.5
-    assert found.site_from_rover is not None
-    # scalar first: a turn about down by 2 acos 0.8, to the right
-    forward = found.site_from_rover.rotation.apply(np.array([1.0, 0.0, 0.0]))
+    result = read_pds3_product(write_product(tmp_path, sample, pointer, kind, bits, counts=counts))
+    assert np.array_equal(result.counts, counts)
+    assert result.time_s == 100.5
+    assert result.site_from_rover is not None
+    # Scalar first: a right turn about the down axis by 2 acos 0.8.
+    forward = result.site_from_rover.rotation.apply(np.array([1.0, 0.0, 0.0]))
     assert np.allclose(forward, [0.8**2 - 0.6**2, 2 * 0.8 * 0.6, 0.0])
-    assert np.allclose(found.site_from_rover.translation, [1.0, 2.0, 3.0])
+    assert np.allclose(result.site_from_rover.translation, [1.0, 2.0, 3.0])
 
 
 @pytest.mark.parametrize(
@@ -79,31 +79,28 @@ def test_samples_of_all_kinds(tmp_path: Path, sample: str, pointer: str, kind: s
         ({"quaternion": "(1.0, 0.0)"}, "4 numbers"),
     ],
 )
-def test_products_that_cannot_be_used(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+def test_invalid_products_are_rejected(tmp_path: Path, changes: dict[str, object], message: str) -> None:
     with pytest.raises(CameraFileError, match=message) as caught:
-        read_pds3_product(product(tmp_path, **changes))  # type: ignore[arg-type]
+        read_pds3_product(write_product(tmp_path, **changes))  # type: ignore[arg-type]
     assert "made.img" in str(caught.value)
 
 
-def test_a_picture_that_is_cut_short_is_refused(tmp_path: Path) -> None:
-    path = product(tmp_path)
+def test_truncated_image_is_rejected(tmp_path: Path) -> None:
+    path = write_product(tmp_path)
     path.write_bytes(path.read_bytes()[:1030])
     with pytest.raises(CameraFileError, match="IMAGE: ends after 6 bytes"):
         read_pds3_product(path)
 
 
 @pytest.mark.parametrize(
-    ("name", "least", "most", "mean"),
-    [
-        ("1F483288473EFFCMUFP1214L0M1.IMG", 5, 4046, 840.053),
-        ("1N491020376ILFCNY9P0706L0M1.IMG", 517, 4029, 1421.71),
-    ],
+    ("name", "min_count", "max_count", "mean"),
+    [("1F483288473EFFCMUFP1214L0M1.IMG", 5, 4046, 840.053), ("1N491020376ILFCNY9P0706L0M1.IMG", 517, 4029, 1421.71)],
 )
-def test_opportunitys_pictures_have_their_labels_statistics(
-    shared_data: Path, name: str, least: int, most: int, mean: float
+def test_opportunity_images_match_label_statistics(
+    shared_data: Path, name: str, min_count: int, max_count: int, mean: float
 ) -> None:
     counts = read_pds3_product(shared_data / "mer_opportunity" / name).counts
-    assert (counts.shape, counts.min(), counts.max()) == ((1024, 1024), least, most)
+    assert (counts.shape, counts.min(), counts.max()) == ((1024, 1024), min_count, max_count)
     assert abs(counts.mean() - mean) < 0.005
 
 
@@ -116,18 +113,18 @@ def test_opportunitys_pictures_have_their_labels_statistics(
         ('"made_data.IMG"', 0),
     ],
 )
-def test_pictures_in_a_file_next_to_their_label(tmp_path: Path, pointer: str, before: int) -> None:
-    """Curiosity's pose group, too."""
+def test_images_with_detached_label_are_read(tmp_path: Path, pointer: str, before: int) -> None:
+    """The pose group of Curiosity is read as well."""
     label = LABEL.replace("PDS_VERSION_ID = PDS3", "ODL_VERSION_ID = ODL3")
     label = label.replace("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS")
     path = tmp_path / "made.LBL"
     path.write_text(label.format(pointer=pointer, kind="MSB_INTEGER", bits=16, quaternion="(1.0, 0.0, 0.0, 0.0)"))
     data = tmp_path / ("MADE_DATA.IMG" if "MADE" in pointer else "made_data.IMG")
     data.write_bytes(bytes(before) + COUNTS.astype(">i2").tobytes())
-    found = read_pds3_product(path)
-    assert np.array_equal(found.counts, COUNTS)
-    assert found.site_from_rover is not None
-    assert np.allclose(found.site_from_rover.translation, [1.0, 2.0, 3.0])
+    result = read_pds3_product(path)
+    assert np.array_equal(result.counts, COUNTS)
+    assert result.site_from_rover is not None
+    assert np.allclose(result.site_from_rover.translation, [1.0, 2.0, 3.0])
     data.write_bytes(bytes(before) + b"cut")
     with pytest.raises(CameraFileError, match="IMAGE: ends after 3 bytes"):
         read_pds3_product(path)
@@ -136,6 +133,6 @@ def test_pictures_in_a_file_next_to_their_label(tmp_path: Path, pointer: str, be
         read_pds3_product(path)
 
 
-def test_a_picture_elsewhere_is_refused(tmp_path: Path) -> None:
+def test_image_in_another_folder_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(CameraFileError, match=r"names '\.\./made\.img', a file elsewhere; allowed: a file next to"):
-        read_pds3_product(product(tmp_path, pointer='("../made.img", 3)'))
+        read_pds3_product(write_product(tmp_path, pointer='("../made.img", 3)'))

@@ -1,4 +1,4 @@
-"""Projection and rays: closure, the reference's scalar formulas, Jacobians, and what cannot be seen."""
+"""Tests of projection and rays: inversion, the scalar reference formulas, Jacobians and invisible points."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def cahv_cameras(draw: st.DrawFn) -> Cahv:
     )
 
 
-def tilted(axis: np.ndarray, tilt: np.ndarray) -> np.ndarray:
+def tilt_axis(axis: np.ndarray, tilt: np.ndarray) -> np.ndarray:
     moved = axis + tilt
     return np.asarray(moved / np.linalg.norm(moved))
 
@@ -42,7 +42,7 @@ radials = st.tuples(st.floats(-0.05, 0.05), st.floats(-0.08, 0.2), st.floats(-0.
 @st.composite
 def cahvor_cameras(draw: st.DrawFn) -> Cahvor:
     cahv = draw(cahv_cameras())
-    return Cahvor.from_cahv(cahv, r=draw(radials), o=tilted(cahv.a, draw(tilts)))
+    return Cahvor.from_cahv(cahv, r=draw(radials), o=tilt_axis(cahv.a, draw(tilts)))
 
 
 @st.composite
@@ -53,7 +53,7 @@ def cahvore_cameras(draw: st.DrawFn) -> Cahvore:
         r=draw(radials),
         e=draw(arrays(float, 3, elements=st.floats(-0.003, 0.003))),
         linearity=draw(st.sampled_from([-1.0, -0.5, 0.0, 0.37, 1.0]) | st.floats(-1, 1)),
-        o=tilted(cahv.a, draw(tilts)),
+        o=tilt_axis(cahv.a, draw(tilts)),
     )
 
 
@@ -61,7 +61,7 @@ cameras = st.one_of(cahv_cameras(), cahvor_cameras(), cahvore_cameras())
 fractions = arrays(float, (4, 2), elements=st.floats(0, 1))
 
 
-def pixels_of(camera: CameraModel, parts: np.ndarray) -> np.ndarray:
+def scale_to_pixels(camera: CameraModel, parts: np.ndarray) -> np.ndarray:
     return np.asarray(parts * np.array(camera.size) - 0.5)
 
 
@@ -69,40 +69,40 @@ def pixels_of(camera: CameraModel, parts: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("distance", [0.5, 10.0, 1e4])
-def test_real_cameras_close_over_the_whole_frame(camera: CameraModel, distance: float) -> None:
+def test_real_cameras_invert_over_the_frame(camera: CameraModel, distance: float) -> None:
     pixels = camera.pixel_grid()
     origins, directions = camera.rays(pixels)
-    again, visible = camera.project(origins + distance * directions)
+    repeated, visible = camera.project(origins + distance * directions)
     assert visible.all()
-    # The issue asks 1e-8 px of CAHVOR and 1e-3 px of CAHVORE. Newton ends at rounding: pixels near 1000 and points near
-    # 1e4 m leave about 1e3 * 2e-16 * 1e4 / 10 ~ 2e-12 px; measured 2e-12.
-    assert np.max(np.abs(again - pixels)) < 1e-10
+    # Requirement: 1e-8 px for CAHVOR and 1e-3 px for CAHVORE. Newton converges to rounding. Pixels near 1000 and points
+    # near 1e4 m leave about 1e3 * 2e-16 * 1e4 / 10 ~ 2e-12 px.
+    assert np.max(np.abs(repeated - pixels)) < 1e-10
 
 
 @given(cameras, fractions, st.floats(0.5, 1e5))
-def test_plausible_cameras_close(camera: CameraModel, parts: np.ndarray, distance: float) -> None:
-    pixels = pixels_of(camera, parts)
+def test_random_cameras_invert(camera: CameraModel, parts: np.ndarray, distance: float) -> None:
+    pixels = scale_to_pixels(camera, parts)
     origins, directions = camera.rays(pixels)
     reached = np.isfinite(directions).all(axis=-1)
-    again, visible = camera.project(origins + distance * directions)
+    repeated, visible = camera.project(origins + distance * directions)
     assert np.array_equal(visible, reached)
-    # C is up to 5000 m off: a point 0.5 m away is rounded by 1e-12 m, which 4e4 px/rad (2048 px in 0.05 rad) makes
-    # 1e-7 px. Near the end of the polynomial's range the inverse loses digits, but the pixel does not.
-    assert np.max(np.abs(again - pixels)[reached], initial=0) < 1e-6
+    # C is up to 5000 m away: a point at 0.5 m is rounded by 1e-12 m, or 1e-7 px for 4e4 px/rad (2048 px in 0.05 rad).
+    # Near the end of the polynomial's range the inverse direction loses digits, but the pixel does not.
+    assert np.max(np.abs(repeated - pixels)[reached], initial=0) < 1e-6
 
 
 @given(cameras, fractions)
 def test_directions_are_unit_vectors(camera: CameraModel, parts: np.ndarray) -> None:
-    directions = camera.rays(pixels_of(camera, parts))[1]
-    seen = directions[np.isfinite(directions).all(axis=-1)]
-    assert np.allclose(np.linalg.norm(seen, axis=-1), 1, rtol=0, atol=1e-15 * 4)
+    directions = camera.rays(scale_to_pixels(camera, parts))[1]
+    observed = directions[np.isfinite(directions).all(axis=-1)]
+    assert np.allclose(np.linalg.norm(observed, axis=-1), 1, rtol=0, atol=1e-15 * 4)
 
 
 def test_rays_of_cahvore_start_on_the_optical_axis(hazcam: Cahvore) -> None:
     origins, _ = hazcam.rays(hazcam.pixel_grid()[::64, ::64])
     shift = origins - hazcam.c
     along = shift @ hazcam.o
-    # O's length is 1 to 1e-6 only, as labelled, and the largest shift is about 10 mm.
+    # The length of O is 1 within 1e-6, as labelled; the largest shift is about 10 mm.
     assert np.allclose(shift, along[..., np.newaxis] * hazcam.o, atol=2e-8)
     assert along.max() > 1e-3
 
@@ -110,8 +110,8 @@ def test_rays_of_cahvore_start_on_the_optical_axis(hazcam: Cahvore) -> None:
 # ----- the reference: JPL's cmod, scalar and literal -----
 
 
-def cmod_cahvor(camera: Cahvor, point: np.ndarray) -> tuple[float, float]:
-    """cmod_cahvor_3d_to_2d: Gennery's omega, lambda, tau and mu."""
+def project_with_cmod_cahvor(camera: Cahvor, point: np.ndarray) -> tuple[float, float]:
+    """cmod_cahvor_3d_to_2d with Gennery's omega, lambda, tau and mu."""
     difference = point - camera.c
     omega = difference @ camera.o
     lambda_ = difference - omega * camera.o
@@ -122,8 +122,8 @@ def cmod_cahvor(camera: Cahvor, point: np.ndarray) -> tuple[float, float]:
     return beta / alpha, gamma / alpha
 
 
-def cmod_cahvore(camera: Cahvore, point: np.ndarray) -> tuple[float, float]:
-    """cmod_cahvore_3d_to_2d_general, its Newton on theta and all, but for the exit at 1e-8 which leaves 1e-16."""
+def project_with_cmod_cahvore(camera: Cahvore, point: np.ndarray) -> tuple[float, float]:
+    """cmod_cahvore_3d_to_2d_general with its Newton iteration on theta, but a limit of 1e-16 instead of 1e-8."""
     difference = point - camera.c
     zeta = float(difference @ camera.o)
     lambda3 = difference - zeta * camera.o
@@ -160,32 +160,36 @@ def cmod_cahvore(camera: Cahvore, point: np.ndarray) -> tuple[float, float]:
     return beta / alpha, gamma / alpha
 
 
-def cmod(camera: Cahvor | Cahvore, point: np.ndarray) -> tuple[float, float]:
-    return cmod_cahvor(camera, point) if isinstance(camera, Cahvor) else cmod_cahvore(camera, point)
+def project_with_cmod(camera: Cahvor | Cahvore, point: np.ndarray) -> tuple[float, float]:
+    return (
+        project_with_cmod_cahvor(camera, point)
+        if isinstance(camera, Cahvor)
+        else project_with_cmod_cahvore(camera, point)
+    )
 
 
 @given(st.one_of(cahvor_cameras(), cahvore_cameras()), fractions, st.floats(1, 1e4))
-def test_projection_is_cmods(camera: Cahvor | Cahvore, parts: np.ndarray, distance: float) -> None:
-    origins, directions = camera.rays(pixels_of(camera, parts))
+def test_projection_matches_cmod(camera: Cahvor | Cahvore, parts: np.ndarray, distance: float) -> None:
+    origins, directions = camera.rays(scale_to_pixels(camera, parts))
     points = (origins + distance * directions)[np.isfinite(directions).all(axis=-1)]
-    expected = np.array([cmod(camera, point) for point in points]).reshape(-1, 2)
-    # Rounding of points 5000 m off, as above.
+    expected = np.array([project_with_cmod(camera, point) for point in points]).reshape(-1, 2)
+    # Rounding of points 5000 m away, as above.
     assert np.max(np.abs(camera.project(points)[0] - expected), initial=0) < 1e-6
 
 
-def test_projection_of_real_cameras_is_cmods(navcam: Cahvor, hazcam: Cahvore) -> None:
+def test_projection_of_real_cameras_matches_cmod(navcam: Cahvor, hazcam: Cahvore) -> None:
     cameras: tuple[Cahvor | Cahvore, ...] = (navcam, hazcam)
     for camera in cameras:
         origins, directions = camera.rays(camera.pixel_grid()[::93, ::93].reshape(-1, 2))
         points = origins + 5 * directions
-        expected = np.array([cmod(camera, point) for point in points])
-        # cmod uses O as labelled, off unit length by up to 1e-6, which leaves 2e-6 of omega in lambda; with f = 1223 px
-        # and mu up to 0.03 that is 1e-4 px.
+        expected = np.array([project_with_cmod(camera, point) for point in points])
+        # cmod uses O as labelled, with a length error of 1e-6: 2e-6 of omega in lambda. For f = 1223 px and mu up to
+        # 0.03 this is 1e-4 px.
         assert np.max(np.abs(camera.project(points)[0] - expected)) < 2e-4
 
 
-def test_navcam_ray_from_the_papers_equations(pinhole: Cahv) -> None:
-    """The middle of CAHV's image plane looks along A, and a column to the right of it to the right by 1 / hs."""
+def test_navcam_rays_follow_the_papers_equations(pinhole: Cahv) -> None:
+    """The centre of CAHV's image plane looks along A; one column to the right adds 1 / hs."""
     hc, vc = pinhole.image_centre
     hs, _ = pinhole.focal_lengths
     straight, adjacent = pinhole.rays(np.array([[hc, vc], [hc + 1, vc]]))[1]
@@ -205,19 +209,19 @@ def test_points_behind_are_not_visible(camera: CameraModel) -> None:
     assert not camera.in_frame(pixels).any()
 
 
-def test_the_centre_of_projection_and_nan_are_not_visible(camera: CameraModel) -> None:
+def test_projection_centre_and_nan_are_not_visible(camera: CameraModel) -> None:
     points = np.array([camera.c, [np.nan, 0, 0], [np.inf, 0, 0]])
     assert not camera.project(points)[1].any()
 
 
-def folding() -> Cahvor:
-    """Its polynomial chi - 0.2 chi^3 grows up to chi^2 = 1 / 0.6, where it reaches (2 / 3) sqrt(1 / 0.6)."""
+def make_folding_camera() -> Cahvor:
+    """The polynomial chi - 0.2 chi^3 increases up to chi^2 = 1 / 0.6, with the value (2 / 3) sqrt(1 / 0.6)."""
     cahv = Cahv.from_axes((100.0, 100.0), (400, 400), axis=(0, 0, 1), right=(1, 0, 0))
     return Cahvor.from_cahv(cahv, r=(0.0, -0.2, 0.0))
 
 
 def test_distortion_does_not_fold_back() -> None:
-    camera = folding()
+    camera = make_folding_camera()
     limit = math.sqrt(1 / 0.6)
     radii = np.array([0.0, 0.5 * limit, 0.999 * limit, 1.001 * limit, 2 * limit])
     points = np.stack([radii, 0 * radii, 1 + 0 * radii], axis=-1)
@@ -226,8 +230,8 @@ def test_distortion_does_not_fold_back() -> None:
     assert (np.diff(pixels[:3, 0]) > 0).all()
 
 
-def test_pixels_beyond_the_distortions_range_have_no_ray() -> None:
-    camera = folding()
+def test_pixels_beyond_distortion_range_have_no_ray() -> None:
+    camera = make_folding_camera()
     hc, vc = camera.image_centre
     reach = 100 * 2 / 3 * math.sqrt(1 / 0.6)
     directions = camera.rays(np.array([[hc + 0.9999 * reach, vc], [hc + 1.0001 * reach, vc]]))[1]
@@ -239,25 +243,25 @@ def test_pixels_beyond_the_distortions_range_have_no_ray() -> None:
     "r", [(0.0, -0.2, 0.0), (0.0, 0.3, -0.05), (0.0, -0.3, 0.06), (-0.5, 0.0, 0.0), (0.1, 2.0, 3.0)]
 )
 def test_inverse_reaches_every_angle_up_to_the_limit(r: tuple[float, float, float]) -> None:
-    """Also where the polynomial has an inflection and plain Newton would leave its range."""
+    """Includes polynomials with an inflection, where plain Newton iteration leaves the valid range."""
     cahv = Cahv.from_axes((100.0, 100.0), (400, 400), axis=(0, 0, 1), right=(1, 0, 0))
     camera = Cahvor.from_cahv(cahv, r=r)
     chi = np.concatenate([np.geomspace(1e-9, 1e-3, 30), np.linspace(0.002, 8, 2000)])
     points = np.stack([0.6 * chi, -0.8 * chi, np.ones_like(chi)], axis=-1)
     pixels, visible = camera.project(points)
     directions = camera.rays(pixels[visible])[1]
-    again = camera.project(directions)[0]
+    repeated = camera.project(directions)[0]
     assert visible[:60].all()
     scale = np.maximum(np.abs(pixels[visible]), 1e4)  # the strongest polynomial reaches 1e7 px
-    assert np.max(np.abs(again - pixels[visible]) / scale) < 1e-14
+    assert np.max(np.abs(repeated - pixels[visible]) / scale) < 1e-14
     slope = 1 + r[0] + 3 * r[1] * chi**2 + 5 * r[2] * chi**4
     first_fall = np.argmax(slope <= 0) if (slope <= 0).any() else len(chi)
     assert visible[:first_fall].all()
     assert not visible[first_fall:].any()
 
 
-def test_a_fisheye_sees_beyond_ninety_degrees(hazcam: Cahvore) -> None:
-    """The hazcam's diagonal is about 180 degrees wide (Maki et al. 2003), so its corners look slightly behind."""
+def test_fisheye_covers_more_than_ninety_degrees(hazcam: Cahvore) -> None:
+    """The hazcam's diagonal is about 180 degrees (Maki et al. 2003): its corners point slightly backwards."""
     corners = hazcam.corner_rays()[1]
     assert np.degrees(np.arccos(corners @ hazcam.boresight()).max()) == pytest.approx(90, abs=5)
     assert (corners @ hazcam.o).min() < 0.02
@@ -270,7 +274,7 @@ def test_a_fisheye_sees_beyond_ninety_degrees(hazcam: Cahvore) -> None:
     assert np.allclose(pixels[:, 0], 200 + 100 * angle)
 
 
-def test_cahvore_of_linearity_one_without_pupil_is_cahvor(navcam: Cahvor) -> None:
+def test_cahvore_with_linearity_one_equals_cahvor(navcam: Cahvor) -> None:
     same = Cahvore(
         navcam.c, navcam.a, navcam.h, navcam.v, navcam.o, navcam.r, np.zeros(3), linearity=1, size=navcam.size
     )
@@ -295,7 +299,8 @@ def test_jacobian_of_real_cameras(camera: CameraModel) -> None:
     origins, directions = camera.rays(camera.pixel_grid()[::60, ::60])
     points = origins + 3 * directions
     analytic = camera.projection_jacobian(points)
-    # Fourth-order differences at 1 mm of 3 m: truncation (3e-4)^4, rounding 1e-12 px / 1e-3 m = 1e-9 px/m of 400 px/m.
+    # Fourth-order differences with 1 mm at 3 m: truncation (3e-4)^4; rounding 1e-12 px / 1e-3 m = 1e-9 px/m of 400
+    # px/m.
     assert analytic.shape == (*points.shape[:-1], 2, 3)
     assert np.max(np.abs(analytic - numerical_jacobian(camera, points, 1e-3))) < 1e-7
 
@@ -310,13 +315,13 @@ def test_jacobian_on_the_optical_axis(navcam: Cahvor, hazcam: Cahvore) -> None:
 
 @given(cameras, arrays(float, (4, 2), elements=st.floats(0.1, 0.9)), st.floats(5, 50))
 def test_jacobian_of_plausible_cameras(camera: CameraModel, parts: np.ndarray, distance: float) -> None:
-    origins, directions = camera.rays(pixels_of(camera, parts))
+    origins, directions = camera.rays(scale_to_pixels(camera, parts))
     points = origins + distance * directions
     analytic = camera.projection_jacobian(points)
     numerical = numerical_jacobian(camera, points, 1e-4 * distance)
-    known = np.isfinite(numerical)  # differences may leave the distortion's range
+    known = np.isfinite(numerical)  # differences may leave the valid range
     size = np.linalg.norm(np.where(np.isfinite(analytic), analytic, 0), axis=(-2, -1), keepdims=True)
-    # Rounding of points 5000 m off: 1e-12 m / (1e-4 * 5 m) = 2e-9 of the slope; the rest is truncation near a limit.
+    # Rounding of points 5000 m away: 1e-12 m / (1e-4 * 5 m) = 2e-9 of the slope; the rest is truncation near a limit.
     assert np.all((np.abs(analytic - numerical) <= 2e-5 * size + 1e-7)[known])
 
 
@@ -337,7 +342,7 @@ def test_leading_dimensions_are_kept(camera: CameraModel, shape: tuple[int, ...]
 
 
 def test_single_point_equals_the_point_among_many(camera: CameraModel) -> None:
-    """Bit for bit, so that results do not depend on how work is divided."""
+    """Bitwise equality: results do not depend on the division of work."""
     points = camera.c + 3 * camera.rays(camera.pixel_grid()[::4, ::4].reshape(-1, 2))[1]
     together = camera.project(points)[0]
     assert len(points) > 3 * 16384  # several blocks
@@ -345,7 +350,7 @@ def test_single_point_equals_the_point_among_many(camera: CameraModel) -> None:
         assert np.array_equal(camera.project(points[index])[0], together[index])
 
 
-def test_arguments_are_not_changed(camera: CameraModel) -> None:
+def test_arguments_are_not_modified(camera: CameraModel) -> None:
     points = camera.c + np.array([[3.0, 0.1, 0.2], [-3.0, 0.1, 0.2]])
     pixels = np.array([[3.0, 4.0], [500.0, 600.0]])
     points_before, pixels_before = points.copy(), pixels.copy()
@@ -356,7 +361,7 @@ def test_arguments_are_not_changed(camera: CameraModel) -> None:
     assert np.array_equal(pixels, pixels_before)
 
 
-def test_single_precision_points_are_taken(navcam: Cahvor) -> None:
+def test_single_precision_points_are_accepted(navcam: Cahvor) -> None:
     points = (navcam.c + 3 * navcam.a)[np.newaxis].astype(np.float32)
     pixels = navcam.project(points)[0]
     assert pixels.dtype == np.float64

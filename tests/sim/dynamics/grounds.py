@@ -1,4 +1,4 @@
-"""Grounds whose stances are known in closed form."""
+"""Grounds with closed-form rover stances."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from marsyard.sim.dynamics import SlipParameters
 
-#: Wheels that do exactly as they are commanded.
+#: Wheels that follow their commands exactly.
 NO_SLIP = SlipParameters(
     flat=0.0, full_slope_deg=89.0, exponent=100.0, downhill=0.0, across=0.0, turn=0.0, turn_slope=0.0,
     soil_spread=0.0, step_spread=0.0, wander_deg_m=0.0,
@@ -30,7 +30,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class Steps:
-    """Level ground with smooth mounds under single wheels: (x, y, height) of each, constant within 0.2 m."""
+    """Level ground with smooth mounds under single wheels: (x, y, height) of each, with a flat top within 0.2 m."""
 
     mounds: tuple[tuple[float, float, float], ...]
 
@@ -43,5 +43,5 @@ class Steps:
 
 
 def uphill_east(slope_deg: float) -> Plane:
-    """A plane that rises to the east."""
+    """Return a plane that rises to the east."""
     return Plane(float(np.tan(np.radians(slope_deg))))

@@ -1,4 +1,4 @@
-"""What wheels are told, and what the rover does."""
+"""Tests of the rover motion for given drive commands."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from marsyard.sim.measurements import DriveCommand
 from tests.sim.dynamics.grounds import NO_SLIP, Plane, uphill_east
 
 EAST, NORTH = 0.5 * np.pi, 0.0
-#: The defaults without what is drawn.
+#: The defaults without random parts.
 STEADY = SlipParameters(soil_spread=0.0, step_spread=0.0, wander_deg_m=0.0)
 PERFECT = Soil(NO_SLIP, 1.0)
 COMMANDS = [
@@ -29,8 +29,8 @@ def _rng() -> np.random.Generator:
 
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize("slope_deg", [0.0, 15.0])
-def test_without_slip_the_rover_does_as_it_is_reported(command: DriveCommand, slope_deg: float) -> None:
-    # on a plane the motion in the body's axes is the planar one, whatever the slope
+def test_motion_without_slip_follows_the_command(command: DriveCommand, slope_deg: float) -> None:
+    # On a plane the motion in body axes is planar for any slope.
     ground = uphill_east(slope_deg)
     start = settle(MER, ground, 1.0, 2.0, 0.4)
     driven = drive(MER, ground, PERFECT, start, command, _rng())
@@ -42,30 +42,30 @@ def test_without_slip_the_rover_does_as_it_is_reported(command: DriveCommand, sl
     assert driven.stances[-1] is driven.end
 
 
-def test_a_command_ends_where_many_small_motions_end() -> None:
+def test_command_equals_many_small_motions() -> None:
     command = DriveCommand(forward_m=1.3, left_m=-0.4, turn_left_rad=1.1)
-    count, place, angle = 20000, np.zeros(2), 0.0
+    count, position, angle = 20000, np.zeros(2), 0.0
     step = np.array([command.forward_m, command.left_m]) / count
     for _ in range(count):
         angle += 0.5 * command.turn_left_rad / count
-        place += np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ step
+        position += np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ step
         angle += 0.5 * command.turn_left_rad / count
-    assert command.displacement_m == pytest.approx(place, abs=1e-8)
+    assert command.displacement_m == pytest.approx(position, abs=1e-8)
 
 
-def test_moving_sideways_around_a_target_keeps_it_ahead() -> None:
+def test_sideways_motion_around_target_keeps_it_ahead() -> None:
     ahead, turn = 7.0, np.radians(10.0)
     command = DriveCommand(left_m=-ahead * turn, turn_left_rad=turn)
     start = settle(MER, Plane(), 0.0, 0.0, EAST)
     end = drive(MER, Plane(), PERFECT, start, command, _rng()).end
     target = end.world_from_rover.inv().apply(np.array([ahead, 0.0, 0.0]))
     assert target == pytest.approx([ahead, 0.0, 0.0], abs=1e-7)
-    # turning to the left, the rover goes to the right of its first heading
+    # A left turn around the target moves the rover right of its initial heading.
     assert end.world_from_rover.translation[1] < 0.0
 
 
-def test_slip_of_half_is_half_the_way() -> None:
-    # the default curve loses half at 15 deg: s(15 deg) = 0.01 + 0.99 0.75**2.4
+def test_slip_of_one_half_halves_the_distance() -> None:
+    # The default curve loses half at 15 deg: s(15 deg) = 0.01 + 0.99 0.75**2.4.
     lost = 0.01 + 0.99 * 0.75**2.4
     assert lost == pytest.approx(0.5, abs=0.01)
     ground = uphill_east(15.0)
@@ -77,32 +77,32 @@ def test_slip_of_half_is_half_the_way() -> None:
 
 
 @pytest.mark.parametrize(("slope_deg", "slip"), [(0.0, 0.01), (10.0, 0.2), (20.0, 1.0), (25.0, 1.0)])
-def test_uphill_slip_reaches_all(slope_deg: float, slip: float) -> None:
+def test_uphill_slip_reaches_one(slope_deg: float, slip: float) -> None:
     ground = uphill_east(slope_deg)
     start = settle(MER, ground, 0.0, 0.0, EAST)
     up = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=0.5), _rng())
     assert up.slip == pytest.approx(slip, abs=0.005)
-    # backwards up the same slope is no easier; down it the rover runs on
-    turned = settle(MER, ground, 0.0, 0.0, -EAST)
-    back = drive(MER, ground, Soil(STEADY, 1.0), turned, DriveCommand(forward_m=-0.5), _rng())
+    # Reverse driving uphill has the same slip; downhill the rover moves farther.
+    rotated = settle(MER, ground, 0.0, 0.0, -EAST)
+    back = drive(MER, ground, Soil(STEADY, 1.0), rotated, DriveCommand(forward_m=-0.5), _rng())
     assert back.slip == pytest.approx(up.slip, abs=1e-9)
-    down = drive(MER, ground, Soil(STEADY, 1.0), turned, DriveCommand(forward_m=0.5), _rng())
+    down = drive(MER, ground, Soil(STEADY, 1.0), rotated, DriveCommand(forward_m=0.5), _rng())
     assert down.slip == pytest.approx(0.01 - 0.3 * (up.slip - 0.01), abs=1e-9)
 
 
 @pytest.mark.parametrize("azimuth_rad", [NORTH, np.pi])
-def test_across_a_slope_the_rover_slides_downhill(azimuth_rad: float) -> None:
+def test_rover_slides_downhill_across_a_slope(azimuth_rad: float) -> None:
     ground = uphill_east(10.0)
     start = settle(MER, ground, 0.0, 0.0, azimuth_rad)
     driven = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=1.0), _rng())
     moved = driven.end.world_from_rover.translation - start.world_from_rover.translation
     sideways = 0.5 * (STEADY.slip_fraction(np.radians(10.0)) - STEADY.flat)
-    # the ground falls to the west
+    # The ground falls to the west.
     assert moved[0] == pytest.approx(-sideways * np.cos(np.radians(10.0)), abs=1e-9)
     assert driven.slip == pytest.approx(STEADY.flat, abs=1e-9)
 
 
-def test_turns_fall_short() -> None:
+def test_turns_lose_angle_by_slip() -> None:
     start = settle(MER, Plane(), 0.0, 0.0, EAST)
     driven = drive(MER, Plane(), Soil(STEADY, 1.0), start, DriveCommand(turn_left_rad=np.radians(40.0)), _rng())
     assert np.degrees(start.azimuth_rad - driven.end.azimuth_rad) == pytest.approx(40.0 * 0.97)
@@ -115,17 +115,17 @@ def test_turns_fall_short() -> None:
     )
 
 
-def test_soils_and_steps_scatter_as_stated() -> None:
+def test_soil_and_step_scatter_have_specified_spread() -> None:
     parameters = SlipParameters(soil_spread=0.3, step_spread=0.0, wander_deg_m=0.0)
     factors = np.log([Soil.draw(parameters, np.random.default_rng(n)).factor for n in range(400)])
-    # 0.3 within four standard errors, 0.3 / sqrt(800)
+    # 0.3 within four standard errors, 0.3 / sqrt(800).
     assert np.std(factors) == pytest.approx(0.3, abs=0.042)
     ground = uphill_east(10.0)
     start = settle(MER, ground, 0.0, 0.0, EAST)
     loose = drive(MER, ground, Soil(STEADY, 1.5), start, DriveCommand(forward_m=0.3), _rng())
     firm = drive(MER, ground, Soil(STEADY, 1.0), start, DriveCommand(forward_m=0.3), _rng())
     assert loose.slip == pytest.approx(1.5 * firm.slip, rel=1e-9)
-    # 120 draws each: within four standard errors, 1 / sqrt(240) of the spread
+    # 120 draws each: within four standard errors, 1 / sqrt(240) of the spread.
     rng = np.random.default_rng(1)
     stepping = Soil(SlipParameters(soil_spread=0.0, step_spread=0.2, wander_deg_m=0.0), 1.0)
     slips = [drive(MER, ground, stepping, start, DriveCommand(forward_m=0.1), rng).slip for _ in range(120)]
@@ -138,7 +138,7 @@ def test_soils_and_steps_scatter_as_stated() -> None:
     assert np.std(turns) == pytest.approx(0.3, abs=0.078)
 
 
-def test_drives_are_reproducible_and_their_parts_join() -> None:
+def test_drives_are_reproducible_and_continuous() -> None:
     ground = uphill_east(8.0)
     start = settle(MER, ground, 0.0, 0.0, 0.3)
     one, two = (

@@ -1,4 +1,4 @@
-"""The helicopter's flight: consistent in itself, and as the field test paper describes it (III.C)."""
+"""Tests of the field test helicopter: kinematic consistency and the flight described in the paper (III.C)."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from marsyard.sim.dynamics.helicopter import HelicopterFlight, HelicopterParamet
 ORIGIN = np.array([100.0, -200.0, 35.0])
 
 
-def flight(**changes: object) -> HelicopterFlight:
+def make_flight(**changes: object) -> HelicopterFlight:
     parameters = HelicopterParameters.model_validate(changes)
     return helicopter_flight(parameters, ORIGIN, np.radians(70.0), 9.8, np.random.default_rng(7))
 
 
 @pytest.mark.parametrize("turns", [False, True])
 def test_velocity_rate_and_force_are_derivatives(turns: bool) -> None:
-    """Central differences over 1 ms: truncation of the 0.6 Hz swing is below 1e-5 rad/s."""
-    flown, step = flight(turns_with_flight=turns), 1e-3
+    """Central differences over 1 ms: the truncation for the 0.6 Hz swing is below 1e-5 rad/s."""
+    flight, step = make_flight(turns_with_flight=turns), 1e-3
     times = np.linspace(-40.0, 2440.0, 400)
-    before, now, after = (flown.motion(times + shift) for shift in (-step, 0.0, step))
+    before, now, after = (flight.motion(times + shift) for shift in (-step, 0.0, step))
     velocity = (after.positions_m - before.positions_m) / (2.0 * step)
     np.testing.assert_allclose(now.velocities_m_s, velocity, atol=1e-5)
     acceleration = (after.velocities_m_s - before.velocities_m_s) / (2.0 * step)
-    felt = now.attitudes.inv().apply(acceleration + np.array([0.0, 0.0, 9.8]))
-    np.testing.assert_allclose(now.specific_forces_m_s2, felt, atol=1e-4)
+    specific_force = now.attitudes.inv().apply(acceleration + np.array([0.0, 0.0, 9.8]))
+    np.testing.assert_allclose(now.specific_forces_m_s2, specific_force, atol=1e-4)
     rate = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2.0 * step)
-    # the rotation over the interval has no part along the rate's change, but the axes turn: half a step at most
+    # The rotation over the interval has no component along the change of rate, but the axes turn by up to half a step.
     np.testing.assert_allclose(now.body_rates_rad_s, rate, atol=2e-5)
 
 
-def test_passes_are_as_the_paper_has_them() -> None:
-    flown = flight()
-    inside = np.concatenate([np.arange(one.start_s, one.end_s, 0.1) for one in flown.passes])
-    motion = flown.motion(inside)
+def test_passes_match_the_paper() -> None:
+    flight = make_flight()
+    inside = np.concatenate([np.arange(one.start_s, one.end_s, 0.1) for one in flight.passes])
+    motion = flight.motion(inside)
     heights = motion.positions_m[:, 2] - ORIGIN[2]
     assert abs(heights.min() - 1000.0) < 1.0
     assert abs(heights.max() - 2000.0) < 1.0
@@ -47,25 +47,25 @@ def test_passes_are_as_the_paper_has_them() -> None:
 
 
 def test_passes_alternate_along_one_line() -> None:
-    flown = flight()
+    flight = make_flight()
     along = np.array([np.sin(np.radians(70.0)), np.cos(np.radians(70.0))])
-    for one in flown.passes:
-        middle = flown.state(0.5 * (one.start_s + one.end_s))
+    for one in flight.passes:
+        middle = flight.state(0.5 * (one.start_s + one.end_s))
         assert np.sign(middle.velocity_m_s[:2] @ along) == one.direction == (-1) ** one.number
         across = (middle.position_m - ORIGIN)[:2] @ np.array([-along[1], along[0]])
-        assert abs(across) < 40.0  # 5 times the wander's RMS
+        assert abs(across) < 40.0  # 5 times the RMS of the wander
 
 
-def test_targets_are_passed_over_40_minutes_apart() -> None:
-    flown = flight()
-    first, second = ((start + end) / 2.0 for start, end in flown.fly_overs_s)
+def test_targets_are_overflown_40_minutes_apart() -> None:
+    flight = make_flight()
+    first, second = ((start + end) / 2.0 for start, end in flight.fly_overs_s)
     assert second - first == pytest.approx(2400.0)
     for time in (first, second):
-        assert np.hypot(*(flown.state(time).position_m - ORIGIN)[:2]) < 40.0
+        assert np.hypot(*(flight.state(time).position_m - ORIGIN)[:2]) < 40.0
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_inconsistent_parameters_are_rejected() -> None:
     with pytest.raises(ValueError, match="do not fit into"):
         HelicopterParameters(passes=20)
     with pytest.raises(ValueError, match="outside of the motion"):
-        flight().state(3000.0)
+        make_flight().state(3000.0)

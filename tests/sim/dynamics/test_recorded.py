@@ -1,4 +1,4 @@
-"""Recorded motions: files that others wrote, and splines against motions in closed form."""
+"""Tests of recorded motions: files of other programs, and splines against closed-form motions."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.dynamics.recorded import COLUMNS, RecordedMotion, TrajectoryFileError, read_poses
 from tests.sim.sensor.motions import GRAVITY, Swaying
 
-#: The beginning of freiburg1_xyz of the TUM RGB-D benchmark (Sturm et al. 2012): its two first poses, twice, the
-#: second time a second later.
+#: The start of freiburg1_xyz of the TUM RGB-D benchmark (Sturm et al. 2012): its first two poses, repeated after one
+#: second.
 TUM = """# ground truth trajectory
 # file: 'rgbd_dataset_freiburg1_xyz.bag'
 # timestamp tx ty tz qx qy qz qw
@@ -24,7 +24,7 @@ TUM = """# ground truth trajectory
 1305031099.6758 1.3543 0.6306 1.6360 0.6129 0.5966 -0.3316 -0.3980
 """
 
-#: The beginning of MH_01_easy's ground truth of the EuRoC data sets (Burri et al. 2016), velocities included.
+#: The start of the ground truth of MH_01_easy of the EuRoC data sets (Burri et al. 2016) with velocities.
 EUROC = """#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], \
 v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1]
 1403636580838555648,4.688319,-1.786938,0.783338,0.534108,-0.153029,-0.827383,-0.082152,-0.027876,0.033207,0.800006
@@ -34,39 +34,39 @@ v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1]
 """
 
 
-def table(times: np.ndarray, positions: np.ndarray, attitudes: Rotation) -> pd.DataFrame:
+def make_table(times: np.ndarray, positions: np.ndarray, attitudes: Rotation) -> pd.DataFrame:
     return pd.DataFrame(np.column_stack([times, positions, attitudes.as_quat()]), columns=list(COLUMNS))
 
 
-def written(folder: Path, text: str, name: str = "poses.txt") -> Path:
+def write_poses(folder: Path, text: str, name: str = "poses.txt") -> Path:
     path = folder / name
     path.write_text(text)
     return path
 
 
-def test_tums_file(tmp_path: Path) -> None:
-    poses = read_poses(written(tmp_path, TUM))
+def test_tum_file_is_read(tmp_path: Path) -> None:
+    poses = read_poses(write_poses(tmp_path, TUM))
     assert poses.times_s[0] == 1305031098.6659
     assert np.allclose(poses.positions_m[1], [1.3543, 0.6306, 1.6360])
-    # stored with four digits, and brought to length 1
+    # Stored with four digits, then normalised.
     assert np.allclose(poses.quaternions[0], [0.6132, 0.5962, -0.3311, -0.3986], atol=1e-4)
     assert np.allclose(np.linalg.norm(poses.quaternions, axis=1), 1.0)
 
 
-def test_eurocs_ground_truth_and_its_velocities(tmp_path: Path) -> None:
-    poses = read_poses(written(tmp_path, EUROC, "data.csv"))
-    # scalar first in the file, last in ours; nanoseconds become seconds without losing the steps of 5 ms
+def test_euroc_ground_truth_is_read(tmp_path: Path) -> None:
+    poses = read_poses(write_poses(tmp_path, EUROC, "data.csv"))
+    # Scalar first in the file, last in Marsyard. Nanoseconds become seconds without loss of the 5 ms steps.
     assert np.allclose(poses.quaternions[0], [-0.153029, -0.827383, -0.082152, 0.534108], atol=1e-5)
     assert np.allclose(np.diff(poses.times_s), 0.005, atol=1e-6)
     motion = RecordedMotion(
         poses.times_s - poses.times_s[0], poses.positions_m, Rotation.from_quat(poses.quaternions), 9.81
     )
     middle = motion.motion(motion.times_s[1:3])
-    # the file's own velocities, which its estimator found together with the positions
+    # The velocities of the file are estimated together with the positions.
     assert np.allclose(middle.velocities_m_s, [[-0.0293, 0.0340, 0.8048], [-0.0300, 0.0350, 0.8082]], atol=2e-3)
 
 
-def _swaying() -> Swaying:
+def _make_swaying_motion() -> Swaying:
     return Swaying(
         spin_rad_s=0.3,
         nod_rad=0.2,
@@ -79,75 +79,80 @@ def _swaying() -> Swaying:
     )
 
 
-def _recorded(spacing_s: float) -> RecordedMotion:
+def _record_motion(spacing_s: float) -> RecordedMotion:
     times = np.arange(0.0, 10.0 + 0.5 * spacing_s, spacing_s)
-    truth = _swaying().motion(times)
+    truth = _make_swaying_motion().motion(times)
     return RecordedMotion(times, truth.positions_m, truth.attitudes, GRAVITY)
 
 
 def _errors(spacing_s: float) -> dict[str, float]:
-    motion, at = _recorded(spacing_s), np.linspace(1.0, 9.0, 501)
-    ours, theirs = motion.motion(at), _swaying().motion(at)
+    motion, at = _record_motion(spacing_s), np.linspace(1.0, 9.0, 501)
+    actual, expected = motion.motion(at), _make_swaying_motion().motion(at)
     return {
-        "position": float(np.abs(ours.positions_m - theirs.positions_m).max()),
-        "velocity": float(np.abs(ours.velocities_m_s - theirs.velocities_m_s).max()),
-        "attitude": float((ours.attitudes.inv() * theirs.attitudes).magnitude().max()),
-        "rate": float(np.abs(ours.body_rates_rad_s - theirs.body_rates_rad_s).max()),
-        "force": float(np.abs(ours.specific_forces_m_s2 - theirs.specific_forces_m_s2).max()),
+        "position": float(np.abs(actual.positions_m - expected.positions_m).max()),
+        "velocity": float(np.abs(actual.velocities_m_s - expected.velocities_m_s).max()),
+        "attitude": float((actual.attitudes.inv() * expected.attitudes).magnitude().max()),
+        "rate": float(np.abs(actual.body_rates_rad_s - expected.body_rates_rad_s).max()),
+        "force": float(np.abs(actual.specific_forces_m_s2 - expected.specific_forces_m_s2).max()),
     }
 
 
-def test_splines_follow_a_motion_in_closed_form() -> None:
-    """Cubic splines are wrong by h^4 in value, h^3 in slope, h^2 in curvature: twice as fine: 16, 8, 4 times nearer."""
-    assert isinstance(_recorded(0.1), Trajectory)
+def test_splines_converge_to_closed_form_motion() -> None:
+    """Cubic splines have errors of h^4 in value, h^3 in slope and h^2 in curvature: half the step gives factors of 16,
+    8 and 4.
+    """
+    assert isinstance(_record_motion(0.1), Trajectory)
     coarse, fine = _errors(0.1), _errors(0.05)
     for name, order in (("position", 4), ("velocity", 3), ("attitude", 4), ("rate", 3), ("force", 2)):
         assert fine[name] < coarse[name] / 2 ** (order - 0.5), name
     assert fine["position"] < 1e-5
     assert fine["rate"] < 1e-4
-    # curvature of the sway, 5 m x 1.5^4 rad/s^4, over h^2 / 12
+    # The curvature of the sway, 5 m x 1.5^4 rad/s^4, times h^2 / 12.
     assert fine["force"] < 2.0 * 5.0 * 1.5**4 * 0.05**2 / 12.0 + 1e-3
 
 
-def test_rates_and_forces_are_the_splines_own_derivatives() -> None:
-    """What instruments feel agrees with what is seen, recorded noise included."""
+def test_rates_and_forces_are_spline_derivatives() -> None:
+    """Inertial readings agree with the poses, including recorded noise."""
     rng = np.random.default_rng(3)
     times = np.arange(0.0, 3.0, 0.1)
-    noisy = Rotation.from_rotvec(0.02 * rng.standard_normal((times.size, 3))) * _swaying().motion(times).attitudes
-    positions = _swaying().motion(times).positions_m + 0.1 * rng.standard_normal((times.size, 3))
+    noisy = (
+        Rotation.from_rotvec(0.02 * rng.standard_normal((times.size, 3)))
+        * _make_swaying_motion().motion(times).attitudes
+    )
+    positions = _make_swaying_motion().motion(times).positions_m + 0.1 * rng.standard_normal((times.size, 3))
     motion, at, h = RecordedMotion(times, positions, noisy, GRAVITY), np.linspace(0.5, 2.5, 57), 1e-5
-    before, here, after = motion.motion(at - h), motion.motion(at), motion.motion(at + h)
-    assert np.allclose((after.positions_m - before.positions_m) / (2 * h), here.velocities_m_s, atol=1e-4)
+    before, centre, after = motion.motion(at - h), motion.motion(at), motion.motion(at + h)
+    assert np.allclose((after.positions_m - before.positions_m) / (2 * h), centre.velocities_m_s, atol=1e-4)
     acceleration = (after.velocities_m_s - before.velocities_m_s) / (2 * h)
     assert np.allclose(
-        here.attitudes.apply(here.specific_forces_m_s2),
+        centre.attitudes.apply(centre.specific_forces_m_s2),
         acceleration + np.array([0.0, 0.0, GRAVITY]),
         rtol=1e-4,
         atol=1e-2,
     )
-    turned = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2 * h)
-    assert np.allclose(turned, here.body_rates_rad_s, atol=1e-4)
+    rotated = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2 * h)
+    assert np.allclose(rotated, centre.body_rates_rad_s, atol=1e-4)
 
 
-def test_tables_of_pandas(tmp_path: Path) -> None:
-    truth = _swaying().motion(np.linspace(0.0, 2.0, 21))
-    frame = table(truth.times_s, truth.positions_m, truth.attitudes)
+def test_pandas_tables_are_read(tmp_path: Path) -> None:
+    truth = _make_swaying_motion().motion(np.linspace(0.0, 2.0, 21))
+    frame = make_table(truth.times_s, truth.positions_m, truth.attitudes)
     frame.insert(2, "comment", "as flown")
     frame.to_csv(tmp_path / "poses.csv", index=False)
     frame.to_parquet(tmp_path / "poses.parquet")
     for name in ("poses.csv", "poses.parquet"):
         poses = read_poses(tmp_path / name)
         assert np.allclose(poses.positions_m, truth.positions_m, rtol=0, atol=1e-9)
-        turned = Rotation.from_quat(poses.quaternions).inv() * truth.attitudes
-        assert turned.magnitude().max() < 1e-9
-    # the same file is the same; another has another hash
+        rotated = Rotation.from_quat(poses.quaternions).inv() * truth.attitudes
+        assert rotated.magnitude().max() < 1e-9
+    # Equal files have equal hashes; a changed file has another hash.
     assert read_poses(tmp_path / "poses.csv") is read_poses(tmp_path / "poses.csv")
     assert read_poses(tmp_path / "poses.csv").sha256 != read_poses(tmp_path / "poses.parquet").sha256
 
 
-def _faulty(tmp_path: Path, **changes: float) -> Path:
-    truth = _swaying().motion(np.linspace(0.0, 2.0, 21))
-    frame = table(truth.times_s, truth.positions_m, truth.attitudes)
+def _write_faulty_poses(tmp_path: Path, **changes: float) -> Path:
+    truth = _make_swaying_motion().motion(np.linspace(0.0, 2.0, 21))
+    frame = make_table(truth.times_s, truth.positions_m, truth.attitudes)
     for column, value in changes.items():
         frame.loc[7, column] = value
     frame.to_csv(tmp_path / "faulty.csv", index=False)
@@ -164,9 +169,9 @@ def _faulty(tmp_path: Path, **changes: float) -> Path:
         ({"qw": 3.0}, r"pose 8: the quaternion's length is 3.\d+; allowed: 1 to 0.005"),
     ],
 )
-def test_faulty_poses_are_named(tmp_path: Path, changes: dict[str, float], fault: str) -> None:
+def test_invalid_poses_are_reported(tmp_path: Path, changes: dict[str, float], fault: str) -> None:
     with pytest.raises(TrajectoryFileError, match=fault) as raised:
-        read_poses(_faulty(tmp_path, **changes))
+        read_poses(_write_faulty_poses(tmp_path, **changes))
     assert "faulty.csv" in str(raised.value)
 
 
@@ -182,14 +187,14 @@ def test_faulty_poses_are_named(tmp_path: Path, changes: dict[str, float], fault
         ("PAR1 but no more", "cannot be read as a table"),
     ],
 )
-def test_files_that_are_no_poses(tmp_path: Path, text: str, fault: str) -> None:
+def test_files_without_poses_are_rejected(tmp_path: Path, text: str, fault: str) -> None:
     with pytest.raises(TrajectoryFileError, match=fault):
-        read_poses(written(tmp_path, text, "faulty.dat"))
+        read_poses(write_poses(tmp_path, text, "faulty.dat"))
     with pytest.raises(TrajectoryFileError, match=r"absent\.csv: cannot be read"):
         read_poses(tmp_path / "absent.csv")
 
 
-def test_a_picture_of_a_gigabyte_is_refused_unread(tmp_path: Path) -> None:
+def test_oversized_file_is_rejected_unread(tmp_path: Path) -> None:
     path = tmp_path / "picture.csv"
     with path.open("wb") as file:
         file.truncate(1 << 30)
@@ -197,13 +202,13 @@ def test_a_picture_of_a_gigabyte_is_refused_unread(tmp_path: Path) -> None:
         read_poses(path)
 
 
-def test_motions_that_cannot_be_followed() -> None:
-    times, still = np.arange(4.0), Rotation.identity(4)
-    places = np.zeros((4, 3))
+def test_invalid_motions_are_rejected() -> None:
+    times, static = np.arange(4.0), Rotation.identity(4)
+    positions = np.zeros((4, 3))
     with pytest.raises(ValueError, match="has 3 poses"):
-        RecordedMotion(times[:3], places[:3], still[:3], 3.7)
+        RecordedMotion(times[:3], positions[:3], static[:3], 3.7)
     half = Rotation.from_euler("z", np.array([[0.0], [0.0], [120.0], [120.0]]), degrees=True)
     with pytest.raises(ValueError, match=r"turns by 120 deg after 1.000000 s \(pose 2\)"):
-        RecordedMotion(times, places, half, 3.7)
+        RecordedMotion(times, positions, half, 3.7)
     with pytest.raises(ValueError, match="time 4 s is outside of the motion; allowed: 0 to 3 s"):
-        RecordedMotion(times, places, still, 3.7).state(4.0)
+        RecordedMotion(times, positions, static, 3.7).state(4.0)

@@ -1,4 +1,4 @@
-"""A rover stands as its suspension and the ground make it."""
+"""Tests of the static stance of a rover on the ground with its suspension."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from tests.sim.dynamics.grounds import Plane, Steps, uphill_east
 EAST, NORTH = 0.5 * np.pi, 0.0
 
 
-def test_wheels_rest_at_the_stated_places() -> None:
-    places = dict(zip(WHEELS, MER.wheel_centres_m, strict=True))
-    assert places["left front"] == pytest.approx([0.705, 0.53, 0.125])
-    assert places["right rear"] == pytest.approx([-0.705, -0.53, 0.125])
+def test_wheels_rest_at_specified_positions() -> None:
+    positions = dict(zip(WHEELS, MER.wheel_centres_m, strict=True))
+    assert positions["left front"] == pytest.approx([0.705, 0.53, 0.125])
+    assert positions["right rear"] == pytest.approx([-0.705, -0.53, 0.125])
     assert wheel_centres(MER, 0.0, (0.0, 0.0)) == pytest.approx(MER.wheel_centres_m)
 
 
 @pytest.mark.parametrize("rover", [MER, ROCKY_8])
 @pytest.mark.parametrize("azimuth_deg", [0.0, 90.0, 200.0, -37.0])
-def test_on_a_plane_the_body_lies_as_the_plane_does(rover: RoverParameters, azimuth_deg: float) -> None:
+def test_body_is_parallel_to_a_plane(rover: RoverParameters, azimuth_deg: float) -> None:
     plane = Plane(0.3, -0.2, 5.0)
     stance = settle(rover, plane, 4.0, -3.0, np.radians(azimuth_deg))
     turn = stance.world_from_rover.rotation.as_matrix()
@@ -38,8 +38,8 @@ def test_on_a_plane_the_body_lies_as_the_plane_does(rover: RoverParameters, azim
     assert [stance.differential_rad, *stance.bogies_rad] == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
 
 
-def test_pitch_and_roll_of_a_slope_faced_and_crossed() -> None:
-    # facing uphill the slope is the pitch; heading north on ground that rises to the east, the left side is low
+def test_slope_gives_pitch_uphill_and_roll_across() -> None:
+    # Uphill the slope is the pitch. For a heading to the north on ground that rises to the east, the left side is low.
     facing = settle(MER, uphill_east(12.0), 0.0, 0.0, EAST)
     crossing = settle(MER, uphill_east(12.0), 0.0, 0.0, NORTH)
     assert np.degrees([facing.pitch_rad, facing.roll_rad]) == pytest.approx([12.0, 0.0], abs=1e-6)
@@ -48,23 +48,23 @@ def test_pitch_and_roll_of_a_slope_faced_and_crossed() -> None:
 
 
 def test_body_pitches_by_the_mean_of_its_rockers() -> None:
-    # the left front wheel on a block of 10 cm: rocker and bogie of that side turn, and of the other the opposite way;
-    # heading east, the left front wheel stands at (0.705, 0.53)
+    # The left front wheel is on a block of 10 cm: its rocker and bogie rotate, those of the other side rotate in the
+    # opposite direction. For a heading to the east, the left front wheel is at (0.705, 0.53).
     high = 0.10
     stance = settle(MER, Steps(((0.705, 0.53, high),)), 0.0, 0.0, EAST)
     assert np.abs(stance.gaps_m).max() < 1e-9
     both = settle(MER, Steps(((0.705, 0.53, high), (0.705, -0.53, high))), 0.0, 0.0, EAST)
     assert both.roll_rad == pytest.approx(0.0, abs=1e-9)
     assert both.differential_rad == pytest.approx(0.0, abs=1e-9)
-    # to first order in the height: one block pitches the body by half of what two do, the differential by as much
+    # To first order one block causes half the pitch of two.
     assert stance.pitch_rad == pytest.approx(0.5 * both.pitch_rad, rel=0.06)
     assert -stance.differential_rad == pytest.approx(stance.pitch_rad, rel=0.06)
-    # front wheel up by h, bogie pivot on the level line through the other two: arm from bogie pivot to front wheel
+    # The front wheel rises by h; the arm is from the bogie pivot to the front wheel.
     assert both.pitch_rad == pytest.approx(high / (MER.front_m - MER.bogie_pivot_x_m), rel=0.06)
 
 
-def test_bogie_takes_up_a_block_under_the_middle_wheel() -> None:
-    # the middle wheel up by h lifts the bogie's pivot by h times its distance from the rear wheel over the wheels'
+def test_bogie_absorbs_a_block_under_the_middle_wheel() -> None:
+    # The middle wheel rises by h: the bogie pivot rises by h times its distance from the rear wheel over the wheelbase.
     high = 0.06
     stance = settle(MER, Steps(((0.0, 0.61, high), (0.0, -0.61, high))), 0.0, 0.0, EAST)
     lift = high * (MER.rear_m + MER.bogie_pivot_x_m) / MER.rear_m
@@ -84,25 +84,25 @@ def test_all_wheels_stand_on_rough_ground() -> None:
         east, north = rng.uniform(0.0, 25.0, 2).tolist()
         stance = settle(MER, surface, east, north, float(rng.uniform(-3.0, 3.0)))
         assert np.abs(stance.gaps_m).max() < 1e-6
-        # no point under the middle of a wheel is deeper than its rim
+        # No point below the wheel centre is deeper than the rim.
         centres = stance.world_from_rover.apply(wheel_centres(MER, stance.differential_rad, stance.bogies_rad))
         above = centres[:, 2] - surface.height(centres[:, 0], centres[:, 1])
         assert np.all(above > 0.9 * MER.wheel_radius_m)
 
 
-def _block(east: float, north: float, top: float) -> Float64[np.ndarray, "triangles 3 3"]:
-    """A block, 0.4 m square, half buried."""
+def _make_block(east: float, north: float, top: float) -> Float64[np.ndarray, "triangles 3 3"]:
+    """Return a block 0.4 m square, half buried."""
     block = trimesh.creation.box(extents=(0.4, 0.4, 2.0 * top))
     return np.asarray(np.asarray(block.triangles) + np.array([east, north, 0.0]))
 
 
-def test_bodies_stand_out_of_the_ground_they_lie_on() -> None:
+def test_bodies_raise_the_ground() -> None:
     slope = uphill_east(5.0)
-    ground = RockyGround.of(slope, _block(1.0, 2.0, 0.3), (1.0, 2.0), 1.0)
+    ground = RockyGround.of(slope, _make_block(1.0, 2.0, 0.3), (1.0, 2.0), 1.0)
     x, y = np.array([1.0, 1.19, 1.25, 1.0, 9.0]), np.array([2.0, 2.19, 2.0, 1.75, 9.0])
     assert ground.height(x, y) == pytest.approx([0.3, 0.3, *slope.height(x[2:], y[2:])], abs=1e-9)
-    # buried where the slope is higher than their tops, and none at all
-    assert RockyGround.of(slope, _block(1.0, 2.0, 0.05), (1.0, 2.0), 1.0).height(x, y) == pytest.approx(
+    # Bodies are buried where the slope is higher than their tops.
+    assert RockyGround.of(slope, _make_block(1.0, 2.0, 0.05), (1.0, 2.0), 1.0).height(x, y) == pytest.approx(
         slope.height(x, y), abs=1e-9
     )
     none = RockyGround.of(slope, np.empty((0, 3, 3)), (1.0, 2.0), 1.0)
@@ -110,16 +110,16 @@ def test_bodies_stand_out_of_the_ground_they_lie_on() -> None:
 
 
 def test_wheels_stand_on_bodies() -> None:
-    # as on the mound of the same height, which has room for a wheel on its top
+    # Equal to a mound of the same height with a top wide enough for a wheel.
     high = 0.10
-    ground = RockyGround.of(Plane(), _block(0.705, 0.53, high), (0.0, 0.0), 1.5)
+    ground = RockyGround.of(Plane(), _make_block(0.705, 0.53, high), (0.0, 0.0), 1.5)
     stance = settle(MER, ground, 0.0, 0.0, EAST)
     mound = settle(MER, Steps(((0.705, 0.53, high),)), 0.0, 0.0, EAST)
     assert np.abs(stance.gaps_m).max() < 1e-6
     assert stance.world_from_rover.as_matrix() == pytest.approx(mound.world_from_rover.as_matrix(), abs=1e-4)
 
 
-def test_a_fields_rock_lifts_the_wheel_on_it() -> None:
+def test_rock_of_a_field_lifts_the_wheel() -> None:
     surface = Surface.from_samples(np.zeros((128, 128, 2), dtype=np.float32), 0.1)
     rock = PlacedRock(name="step", east_m=6.4 + 0.705, north_m=6.4 + 0.53, diameter_m=0.3, height_m=0.1)
     field = RockField.on(surface, RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
@@ -133,7 +133,7 @@ def test_a_fields_rock_lifts_the_wheel_on_it() -> None:
     assert stance.differential_rad < 0.0
 
 
-def test_stance_does_not_depend_on_where_it_is_looked_for() -> None:
+def test_stance_does_not_depend_on_initial_guess() -> None:
     ground = Steps(((0.705, 0.53, 0.1), (-0.705, -0.53, 0.05)))
     cold = settle(MER, ground, 0.0, 0.0, EAST)
     warm = settle(MER, ground, 0.0, 0.0, EAST, near=settle(MER, uphill_east(5.0), 0.1, 0.0, EAST))

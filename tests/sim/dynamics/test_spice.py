@@ -1,4 +1,4 @@
-"""Flights from SPICE kernels, which NAIF's own library writes here for a motion in closed form."""
+"""Tests of flights from SPICE kernels, written by NAIF's library for a closed-form motion."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DELTET/EB        = 1.671D-2
 DELTET/M         = ( 6.239996D0 1.99096871D-7 )
 DELTET/DELTA_AT  = ( 36, @2015-JUL-1, 37, @2017-JAN-1 )
 """
-#: A clock that ticks 65,536 times a second from J2000 on.
+#: A clock with 65,536 ticks per second since J2000.
 CLOCK = """KPL/SCLK
 \\begindata
 SCLK_KERNEL_ID           = ( @2030-01-01/12:00:00 )
@@ -38,7 +38,7 @@ SCLK_PARTITION_START_999 = ( 0.0 )
 SCLK_PARTITION_END_999   = ( 2.8147497671065E+14 )
 SCLK01_COEFFICIENTS_999  = ( 0.0 0.0 1.0 )
 """
-#: Site axes that are turned against J2000's, so that a forgotten rotation is seen.
+#: Site axes that are rotated relative to J2000, which reveals a missing rotation.
 FRAMES = f"""KPL/FK
 \\begindata
 FRAME_SITE_ENU          = {SITE_FRAME}
@@ -70,8 +70,8 @@ step_s = {STEP_S}
 """
 
 
-def flown(times_s: np.ndarray) -> tuple[np.ndarray, Rotation]:
-    """A descent in site axes, m, and the camera's attitude in them."""
+def fly(times_s: np.ndarray) -> tuple[np.ndarray, Rotation]:
+    """Return a descent in site axes, m, and the camera attitude in them."""
     east, north = 20.0 * times_s, -5.0 * times_s + 0.1 * times_s**2
     positions = np.stack([east, north, 2000.0 - 75.0 * times_s + 0.2 * times_s**2], axis=-1)
     rotation = Rotation.from_rotvec(np.array([0.3, 0.0, 0.0])) * Rotation.from_rotvec(
@@ -82,7 +82,7 @@ def flown(times_s: np.ndarray) -> tuple[np.ndarray, Rotation]:
 
 @pytest.fixture(scope="module")
 def kernels(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the kernels of the flight and the file that names them."""
+    """Return a folder with the kernels of the flight and the meta-kernel."""
     folder = tmp_path_factory.mktemp("kernels")
     for name, text in (("leap.tls", LEAPSECONDS), ("lander.tsc", CLOCK), ("site.tf", FRAMES)):
         (folder / name).write_text(text)
@@ -90,7 +90,7 @@ def kernels(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with spiceypy.KernelPool([str(folder / name) for name in ("leap.tls", "lander.tsc", "site.tf")]):
         begin = spiceypy.str2et(BEGIN)
         times = STEP_S * np.arange(-4, COUNT + 4)
-        positions, attitudes = flown(times)
+        positions, attitudes = fly(times)
         turn = spiceypy.pxform("SITE_ENU", "J2000", begin)
         velocities = np.gradient(positions, times, axis=0)
         states = 1e-3 * np.concatenate([positions @ turn.T, velocities @ turn.T], axis=1)
@@ -99,7 +99,7 @@ def kernels(tmp_path_factory: pytest.TempPathFactory) -> Path:
         spiceypy.spkw09(spk, LANDER, MARS, "J2000", *span, "descent", 7, len(times), states.tolist(), begin + times)
         spiceypy.spkcls(spk)
         ticks = [spiceypy.sce2c(LANDER, begin + time) for time in times]
-        # C matrices turn vectors from J2000's axes into the camera's; SPICE's quaternions have their scalar first
+        # C matrices transform vectors from J2000 to camera axes; SPICE quaternions have the scalar first.
         turns = [spiceypy.m2q(np.ascontiguousarray((turn @ one.as_matrix()).T)) for one in attitudes]
         ck = spiceypy.ckopn(str(folder / "lander.bc"), "descent", 0)
         rates = np.zeros((len(times), 3))
@@ -111,22 +111,22 @@ def kernels(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_kernels_give_the_flight_that_was_written(kernels: Path) -> None:
+def test_kernels_reproduce_the_flight(kernels: Path) -> None:
     poses = read_poses(kernels / "flight.spice.toml")
     assert poses.times_s.size == COUNT
     np.testing.assert_allclose(poses.times_s, STEP_S * np.arange(COUNT))
-    positions, attitudes = flown(poses.times_s)
+    positions, attitudes = fly(poses.times_s)
     np.testing.assert_allclose(poses.positions_m, positions, atol=1e-6)
     assert (attitudes.inv() * Rotation.from_quat(poses.quaternions)).magnitude().max() < 1e-8
 
 
-def test_the_pool_of_kernels_is_left_as_it_was(kernels: Path) -> None:
+def test_kernel_pool_is_restored(kernels: Path) -> None:
     before = spiceypy.ktotal("ALL")
     read_poses(kernels / "flight.spice.toml")
     assert spiceypy.ktotal("ALL") == before
 
 
-def test_the_hash_is_that_of_all_files(kernels: Path, tmp_path: Path) -> None:
+def test_hash_covers_all_kernels(kernels: Path, tmp_path: Path) -> None:
     copy = tmp_path / "kernels"
     shutil.copytree(kernels, copy)
     assert read_poses(copy / "flight.spice.toml").sha256 == read_poses(kernels / "flight.spice.toml").sha256
@@ -152,7 +152,7 @@ def test_the_hash_is_that_of_all_files(kernels: Path, tmp_path: Path) -> None:
         ('world = "SITE_ENU"', "world = SITE", "Invalid value"),
     ],
 )
-def test_what_is_wrong_is_reported(kernels: Path, tmp_path: Path, before: str, after: str, message: str) -> None:
+def test_kernel_errors_are_reported(kernels: Path, tmp_path: Path, before: str, after: str, message: str) -> None:
     copy = tmp_path / "kernels"
     shutil.copytree(kernels, copy)
     path = copy / "flight.spice.toml"

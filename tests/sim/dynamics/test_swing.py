@@ -1,4 +1,4 @@
-"""The two-stage swing: mechanics' balances, linear theory, and flights that start as asked."""
+"""Tests of the two-stage swing: conservation laws, linear theory and initial conditions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from marsyard.sim.dynamics import SwingDescent, SwingParameters
 from marsyard.sim.dynamics.kernels.swing import Chain, WindField, aerodynamic_force, derivatives
-from marsyard.sim.dynamics.swing import Modes, chain_of
+from marsyard.sim.dynamics.swing import Modes, build_chain
 
 START = np.array([100.0, -50.0, 2100.0])
 GROUND_M = 100.0
@@ -36,7 +36,7 @@ WILD = {
 }
 
 
-def _flown(seed: int = 1, /, **parameters: Any) -> SwingDescent:
+def _fly(seed: int = 1, /, **parameters: Any) -> SwingDescent:
     rng = np.random.default_rng(seed)
     return SwingDescent.simulate(
         SwingParameters(**parameters), START, rng, ground_height_m=GROUND_M, gravity_m_s2=GRAVITY
@@ -47,12 +47,12 @@ def _off_nadir_deg(descent: SwingDescent, times_s: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(descent.motion(times_s).attitudes.as_matrix()[:, 2, 2]))
 
 
-def _no_wind() -> WindField:
+def _make_calm_wind() -> WindField:
     return WindField(GROUND_M, 0.0, 0.0, 500.0, 0.03, np.zeros((0, 7)))
 
 
-def _bodies(y: np.ndarray, chain: Chain, p: SwingParameters) -> list[tuple[float, np.ndarray, np.ndarray]]:
-    """Mass, position and velocity of canopy, backshell and lander's centre of mass."""
+def _body_states(y: np.ndarray, chain: Chain, p: SwingParameters) -> list[tuple[float, np.ndarray, np.ndarray]]:
+    """Mass, position and velocity of the centres of mass of canopy, backshell and lander."""
     r, v, n, dn, e, de = y[:18].reshape(6, 3)
     at = p.line_length_m - p.bridle_length_m
     return [
@@ -63,19 +63,19 @@ def _bodies(y: np.ndarray, chain: Chain, p: SwingParameters) -> list[tuple[float
 
 
 def _energy(y: np.ndarray, chain: Chain, p: SwingParameters) -> float:
-    moving = sum(0.5 * m * v @ v + m * GRAVITY * r[2] for m, r, v in _bodies(y, chain, p))
+    moving = sum(0.5 * m * v @ v + m * GRAVITY * r[2] for m, r, v in _body_states(y, chain, p))
     turning = chain.transverse_inertia * y[15:18] @ y[15:18] + chain.axial_inertia * y[21] ** 2
     return float(moving + 0.5 * turning)
 
 
 def _angular_momentum(y: np.ndarray, chain: Chain, p: SwingParameters) -> np.ndarray:
-    """About the world's origin."""
-    orbital = sum(m * np.cross(r, v) for m, r, v in _bodies(y, chain, p))
+    """Angular momentum about the world origin."""
+    orbital = sum(m * np.cross(r, v) for m, r, v in _body_states(y, chain, p))
     e, de = y[12:15], y[15:18]
     return np.asarray(orbital + chain.transverse_inertia * np.cross(e, de) + chain.axial_inertia * y[21] * e)
 
 
-def _some_state(rng: np.random.Generator) -> np.ndarray:
+def _draw_state(rng: np.random.Generator) -> np.ndarray:
     y = np.zeros(22)
     y[:6] = [10.0, 20.0, 1500.0, 15.0, -8.0, -70.0]
     for start, rate in ((6, 0.3), (12, 1.5)):
@@ -90,56 +90,58 @@ def _some_state(rng: np.random.Generator) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_energy_and_momenta_change_by_the_airs_force_and_the_bridles_friction_alone(seed: int) -> None:
-    """As many balances, but one, as unknown accelerations; with no air and no friction all are conserved."""
+def test_energy_and_momentum_balance_of_drag_and_friction(seed: int) -> None:
+    """The balances determine all unknown accelerations except one. Without air and friction all quantities are
+    conserved.
+    """
     p = SwingParameters(**(WILD | {"nod_damping_ratio": 0.1}))
-    chain = chain_of(p, Modes.of(p, GRAVITY), GRAVITY, 2000.0)
-    y, wind = _some_state(np.random.default_rng(seed)), _no_wind()
+    chain = build_chain(p, Modes.of(p, GRAVITY), GRAVITY, 2000.0)
+    y, wind = _draw_state(np.random.default_rng(seed)), _make_calm_wind()
     rates, force = derivatives(y, chain, wind), aerodynamic_force(y, chain, wind)
     n, dn, e, de = y[6:18].reshape(4, 3)
     spinning = np.cross(e, de) + y[21] * e
     slip = spinning - (spinning @ n) * n - np.cross(n, dn)
     h = 1e-5
     power = (_energy(y + h * rates, chain, p) - _energy(y - h * rates, chain, p)) / (2.0 * h)
-    # the energy, 1e7 J, is rounded to 1e-9 J, over 2e-5 s
+    # The energy of 1e7 J is rounded to 1e-9 J, over 2e-5 s.
     assert power == pytest.approx(force @ y[3:6] - chain.hinge_damping * slip @ slip, abs=1e-3)
     turning = (_angular_momentum(y + h * rates, chain, p) - _angular_momentum(y - h * rates, chain, p)) / (2.0 * h)
-    weights = sum(np.cross(r, -m * GRAVITY * UP) for m, r, _ in _bodies(y, chain, p))
+    weights = sum(np.cross(r, -m * GRAVITY * UP) for m, r, _ in _body_states(y, chain, p))
     np.testing.assert_allclose(turning, np.cross(y[:3], force) + weights, atol=1e-2)
     momentum_rate = sum(
         m * dv
         for (m, _, _), dv in zip(
-            _bodies(y, chain, p),
-            np.array([v for _, _, v in _bodies(y + h * rates, chain, p)])
-            - np.array([v for _, _, v in _bodies(y - h * rates, chain, p)]),
+            _body_states(y, chain, p),
+            np.array([v for _, _, v in _body_states(y + h * rates, chain, p)])
+            - np.array([v for _, _, v in _body_states(y - h * rates, chain, p)]),
             strict=True,
         )
     ) / (2.0 * h)
     np.testing.assert_allclose(momentum_rate, force - chain.mass_kg * GRAVITY * UP, atol=1e-4)
-    # lengths are kept: n . n'' = -|n'|^2
+    # Constant lengths: n . n'' = -|n'|^2.
     assert rates[9:12] @ n == pytest.approx(-dn @ dn, abs=1e-12)
     assert rates[15:18] @ e == pytest.approx(-de @ de, abs=1e-12)
 
 
-def test_air_and_friction_only_take_energy() -> None:
+def test_drag_and_friction_only_dissipate_energy() -> None:
     p = SwingParameters(**WILD)
-    chain = chain_of(p, Modes.of(p, GRAVITY), GRAVITY, 2000.0)
+    chain = build_chain(p, Modes.of(p, GRAVITY), GRAVITY, 2000.0)
     rng = np.random.default_rng(0)
     for _ in range(50):
-        y = _some_state(rng)
-        force = aerodynamic_force(y, chain, _no_wind())
+        y = _draw_state(rng)
+        force = aerodynamic_force(y, chain, _make_calm_wind())
         assert force @ y[3:6] < 0.0
 
 
-def _steady(p: SwingParameters) -> tuple[Chain, Modes]:
-    """A chain whose density does not change with height, so that it falls at a constant rate."""
+def _linearise(p: SwingParameters) -> tuple[Chain, Modes]:
+    """A chain with constant air density, which falls at a constant rate."""
     thin = p.model_copy(update={"density_scale_height_m": 1e15})
     modes = Modes.of(thin, GRAVITY)
-    return chain_of(thin, modes, GRAVITY, 2000.0), modes
+    return build_chain(thin, modes, GRAVITY, 2000.0), modes
 
 
 def _eigenvalues_by_matrices(p: SwingParameters, chain: Chain, modes: Modes) -> np.ndarray:
-    """Of the plane double pendulum below a canopy: coordinates x of the canopy, tilts of the line and of the lander."""
+    """Eigenvalues of the planar double pendulum below a canopy: canopy position x, tilts of line and lander."""
     s, j, length = chain.first_moment, chain.second_moment, chain.line_m
     lander, k, speed, c = (
         p.lander_mass_kg * p.mass_centre_m,
@@ -163,7 +165,7 @@ def _eigenvalues_by_matrices(p: SwingParameters, chain: Chain, modes: Modes) -> 
 
 
 def _eigenvalues_by_differences(p: SwingParameters, chain: Chain) -> np.ndarray:
-    """Of the equations of motion themselves, in the east-up plane, around the steady fall."""
+    """Eigenvalues of the equations of motion in the east-up plane, linearised at the steady fall."""
 
     def rates(q: np.ndarray) -> np.ndarray:
         x, line, lander, dx, dline, dlander = q
@@ -172,10 +174,10 @@ def _eigenvalues_by_differences(p: SwingParameters, chain: Chain) -> np.ndarray:
         for start, angle, rate in ((6, line, dline), (12, lander, dlander)):
             y[start : start + 6] = [np.sin(angle), 0, -np.cos(angle), rate * np.cos(angle), 0, rate * np.sin(angle)]
         y[18:21] = [0.0, 1.0, 0.0]
-        d = derivatives(y, chain, _no_wind())
+        d = derivatives(y, chain, _make_calm_wind())
         # n'' = (theta'' cos - theta'^2 sin, 0, theta'' sin + theta'^2 cos)
-        turned = [d[s] * np.cos(a) + d[s + 2] * np.sin(a) for s, a in ((9, line), (15, lander))]
-        return np.array([dx, dline, dlander, d[3], *turned])
+        rotated = [d[s] * np.cos(a) + d[s + 2] * np.sin(a) for s, a in ((9, line), (15, lander))]
+        return np.array([dx, dline, dlander, d[3], *rotated])
 
     h = 1e-5
     columns = [(rates(h * unit) - rates(-h * unit)) / (2.0 * h) for unit in np.eye(6)]
@@ -183,32 +185,32 @@ def _eigenvalues_by_differences(p: SwingParameters, chain: Chain) -> np.ndarray:
 
 
 @pytest.mark.parametrize("ratio", [0.0, 0.03])
-def test_small_swings_are_those_of_the_double_pendulum(ratio: float) -> None:
+def test_small_swings_match_the_double_pendulum(ratio: float) -> None:
     p = SwingParameters(cone_angle_deg=0.0, cone_damping_ratio=ratio, nod_damping_ratio=ratio)
-    chain, modes = _steady(p)
+    chain, modes = _linearise(p)
     theory = _eigenvalues_by_matrices(p, chain, modes)
-    found = _eigenvalues_by_differences(p, chain)
-    np.testing.assert_allclose(np.sort_complex(found), np.sort_complex(theory), atol=1e-6)
+    result = _eigenvalues_by_differences(p, chain)
+    np.testing.assert_allclose(np.sort_complex(result), np.sort_complex(theory), atol=1e-6)
 
 
-def test_modes_frequencies_and_damping_are_those_of_linear_theory() -> None:
+def test_mode_frequencies_and_damping_match_linear_theory() -> None:
     p = SwingParameters(cone_angle_deg=0.0, cone_damping_ratio=0.02, nod_damping_ratio=0.05)
-    chain, modes = _steady(p)
+    chain, modes = _linearise(p)
     swings = _eigenvalues_by_matrices(p, chain, modes)
     cone, nod = sorted(swings[swings.imag > 0.0], key=abs)
-    # the coning's formula has the lander fixed to the line; the canopy's drag damps nods too, by 0.003
+    # The coning formula assumes a lander fixed to the line; canopy drag damps nods by another 0.003.
     assert abs(cone) == pytest.approx(modes.cone_rad_s, rel=0.02)
     assert -cone.real / abs(cone) == pytest.approx(0.02, abs=0.003)
     assert abs(nod) == pytest.approx(modes.nod_rad_s, rel=0.01)
     assert -nod.real / abs(nod) == pytest.approx(0.05 + 0.003, abs=0.002)
-    # slow against fast, as the field test paper has it
+    # Slow and fast mode as in the field test paper.
     assert 15.0 < 2.0 * np.pi / modes.cone_rad_s < 30.0
     assert 1.0 < 2.0 * np.pi / modes.nod_rad_s < 2.5
 
 
 @pytest.mark.parametrize("changes", [{}, {"cone_minor_fraction": 0.0, "cone_phase_deg": 90.0}, {"cone_angle_deg": 0.0}])
 def test_finite_differences_give_velocity_rate_and_specific_force(changes: dict[str, float]) -> None:
-    descent = _flown(**(WILD | changes))
+    descent = _fly(**(WILD | changes))
     h, times = 1e-3, np.linspace(-9.9, descent.span_s[1] - 0.1, 400)
     stencil = [descent.motion(times + k * h) for k in range(-2, 3)]
     middle = stencil[2]
@@ -216,22 +218,22 @@ def test_finite_differences_give_velocity_rate_and_specific_force(changes: dict[
     acceleration = np.tensordot(FIVE_POINTS, [m.velocities_m_s for m in stencil], 1) / h
     inverse = middle.attitudes.inv()
     rate = np.tensordot(FIVE_POINTS, [(inverse * m.attitudes).as_rotvec() for m in stencil], 1) / h
-    # the dense output follows the equations to some 1e-6
+    # The dense output follows the equations to some 1e-6.
     np.testing.assert_allclose(velocity, middle.velocities_m_s, atol=1e-5)
     np.testing.assert_allclose(inverse.apply(acceleration + GRAVITY * UP), middle.specific_forces_m_s2, atol=1e-5)
     np.testing.assert_allclose(rate, middle.body_rates_rad_s, atol=1e-5)
 
 
-def test_first_picture_is_at_the_start_and_motion_goes_through_it_smoothly() -> None:
-    descent = _flown(**WILD)
+def test_motion_is_smooth_at_the_first_image() -> None:
+    descent = _fly(**WILD)
     np.testing.assert_allclose(descent.state(0.0).position_m, START, atol=1e-9)
     around = descent.motion(np.array([-1e-9, 0.0]))
     np.testing.assert_allclose(around.velocities_m_s[0], around.velocities_m_s[1], atol=1e-6)
     np.testing.assert_allclose(around.specific_forces_m_s2[0], around.specific_forces_m_s2[1], atol=1e-6)
 
 
-def test_state_is_a_row_of_motion() -> None:
-    descent = _flown(**WILD)
+def test_state_equals_a_row_of_motion() -> None:
+    descent = _fly(**WILD)
     times = np.array([9.0, -3.0, 4.0])
     motion = descent.motion(times)
     for k, time in enumerate(times):
@@ -241,9 +243,9 @@ def test_state_is_a_row_of_motion() -> None:
         np.testing.assert_allclose(state.attitude.as_quat(), motion.attitudes[k].as_quat(), atol=1e-15)
 
 
-def test_falls_at_terminal_velocity_in_ever_denser_air() -> None:
-    descent = _flown(**HANGING, descent_rate_m_s=75.0, density_scale_height_m=10000.0)
-    # the fall alone: z'' = rho / rho_0 (g + V^2 / (2 H)) (z' / V)^2 - g
+def test_fall_follows_terminal_velocity() -> None:
+    descent = _fly(**HANGING, descent_rate_m_s=75.0, density_scale_height_m=10000.0)
+    # Vertical fall: z'' = rho / rho_0 (g + V^2 / (2 H)) (z' / V)^2 - g.
     braking = GRAVITY + 75.0**2 / 20000.0
 
     def fall(_t: float, y: np.ndarray) -> list[float]:
@@ -255,7 +257,7 @@ def test_falls_at_terminal_velocity_in_ever_denser_air() -> None:
     motion = descent.motion(times)
     np.testing.assert_allclose(motion.positions_m[:, 2], alone(times)[0], atol=1e-5)
     np.testing.assert_allclose(motion.velocities_m_s[:, 2], alone(times)[1], atol=1e-5)
-    # and it stays near the velocity that balances weight and air at each height
+    # The velocity stays near the balance of weight and drag.
     balanced = 75.0 * np.exp((motion.positions_m[:, 2] - START[2]) / 20000.0)
     np.testing.assert_allclose(-motion.velocities_m_s[:, 2], balanced, rtol=5e-3)
     state = descent.state(0.0)
@@ -264,109 +266,109 @@ def test_falls_at_terminal_velocity_in_ever_denser_air() -> None:
     np.testing.assert_allclose(state.body_rate_rad_s, 0.0, atol=1e-12)
 
 
-def test_drifts_with_the_mean_wind() -> None:
-    motion = _flown(**HANGING, wind_east_m_s=12.0, wind_north_m_s=-7.0).motion(np.linspace(-5.0, 15.0, 21))
+def test_descent_drifts_with_the_mean_wind() -> None:
+    motion = _fly(**HANGING, wind_east_m_s=12.0, wind_north_m_s=-7.0).motion(np.linspace(-5.0, 15.0, 21))
     np.testing.assert_allclose(motion.velocities_m_s[:, :2], np.tile([12.0, -7.0], (21, 1)), atol=1e-6)
 
 
 @pytest.mark.parametrize("angle", [5.0, 30.0])
-def test_circular_cone_stays_at_its_angle_over_the_pictures(angle: float) -> None:
-    descent = _flown(**(STILL | {"cone_angle_deg": angle, "cone_minor_fraction": 1.0, "nod_rate_deg_s": 0.0}))
+def test_circular_cone_keeps_its_angle(angle: float) -> None:
+    descent = _fly(**(STILL | {"cone_angle_deg": angle, "cone_minor_fraction": 1.0, "nod_rate_deg_s": 0.0}))
     assert _off_nadir_deg(descent, np.zeros(1))[0] == pytest.approx(angle, abs=1e-6)
-    # wide cones are a little off linear theory's share of the lander in the tilt, so that it nods by a degree
+    # Wide cones deviate from the lander tilt of linear theory, which causes nods of one degree.
     np.testing.assert_allclose(_off_nadir_deg(descent, np.linspace(-5.0, 7.5, 200)), angle, atol=0.04 * angle)
     rates = descent.motion(np.zeros(1)).body_rates_rad_s[0]
     modes = Modes.of(descent.parameters, GRAVITY)
     line_tilt = np.radians(angle) / modes.lander_tilt_ratio
-    # a conical pendulum goes round with omega / sqrt(cos); the lander turns with its axis
+    # A conical pendulum rotates at omega / sqrt(cos); the lander rotates with its axis.
     expected = modes.cone_rad_s / np.sqrt(np.cos(line_tilt)) * np.sin(np.radians(angle))
     assert np.linalg.norm(rates) == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("phase", [0.0, 60.0, 90.0, 200.0])
-def test_plane_swing_reaches_the_angle_asked_for(phase: float) -> None:
+def test_plane_swing_reaches_the_specified_angle(phase: float) -> None:
     swing = {"cone_angle_deg": 30.0, "cone_minor_fraction": 0.0, "cone_phase_deg": phase, "nod_rate_deg_s": 0.0}
-    descent = _flown(**(STILL | swing))
+    descent = _fly(**(STILL | swing))
     angles = _off_nadir_deg(descent, np.linspace(-6.0, 16.0, 2000))
     assert angles.max() == pytest.approx(30.0, rel=0.03)
     assert angles.min() < 0.5
 
 
-@pytest.mark.parametrize("share", [0.5, -0.5])
-def test_cone_starts_at_its_azimuth_and_goes_round_in_its_sense(share: float) -> None:
-    cone = {"cone_angle_deg": 20.0, "cone_minor_fraction": share, "cone_direction_deg": 90.0, "nod_rate_deg_s": 0.0}
-    descent = _flown(**(STILL | cone))
+@pytest.mark.parametrize("fraction", [0.5, -0.5])
+def test_cone_starts_at_its_azimuth_with_its_sense_of_rotation(fraction: float) -> None:
+    cone = {"cone_angle_deg": 20.0, "cone_minor_fraction": fraction, "cone_direction_deg": 90.0, "nod_rate_deg_s": 0.0}
+    descent = _fly(**(STILL | cone))
     looking = -descent.motion(np.array([0.0, 1.0])).attitudes.as_matrix()[:, :, 2]
-    # the camera looks east of nadir; a positive share goes on clockwise seen from above, to the south
+    # The camera looks east of nadir; a positive value rotates clockwise from above, to the south.
     np.testing.assert_allclose(looking[0], [np.sin(np.radians(20.0)), 0.0, -np.cos(np.radians(20.0))], atol=1e-9)
-    assert np.sign(looking[1, 1]) == -np.sign(share)
-    # after a quarter of a period it is at the smaller half-axis
+    assert np.sign(looking[1, 1]) == -np.sign(fraction)
+    # A quarter of a period later it is at the smaller semi-axis.
     quarter = 0.5 * np.pi / Modes.of(descent.parameters, GRAVITY).cone_rad_s
-    least = _off_nadir_deg(descent, np.linspace(quarter - 1.0, quarter + 1.0, 200)).min()
-    assert least == pytest.approx(10.0, abs=0.4)
+    min_angle = _off_nadir_deg(descent, np.linspace(quarter - 1.0, quarter + 1.0, 200)).min()
+    assert min_angle == pytest.approx(10.0, abs=0.4)
 
 
 @pytest.mark.parametrize("phase", [0.0, 45.0, 250.0])
-def test_greatest_rate_is_that_asked_for(phase: float) -> None:
+def test_max_rate_equals_the_specified_rate(phase: float) -> None:
     nodding = HANGING | {"nod_rate_deg_s": 60.0, "nod_phase_deg": phase}
-    descent = _flown(**nodding)
+    descent = _fly(**nodding)
     period = 2.0 * np.pi / Modes.of(descent.parameters, GRAVITY).nod_rad_s
     motion = descent.motion(np.linspace(-0.5, 0.5, 400) * period)
-    # within a period the canopy's drag takes 2 %
+    # Canopy drag reduces the rate by 2 % within a period.
     greatest = np.degrees(np.linalg.norm(motion.body_rates_rad_s, axis=1)).max()
     assert greatest == pytest.approx(60.0, rel=0.02)
     assert np.ptp(np.degrees(motion.body_rates_rad_s[:, 0])) == pytest.approx(120.0, rel=0.03)
 
 
 def test_heading_and_spin_turn_clockwise() -> None:
-    descent = _flown(**HANGING, heading_deg=90.0, spin_rate_deg_s=5.0)
+    descent = _fly(**HANGING, heading_deg=90.0, spin_rate_deg_s=5.0)
     matrices = descent.motion(np.array([0.0, 3.0])).attitudes.as_matrix()
     np.testing.assert_allclose(matrices[0, :, 1], [1.0, 0.0, 0.0], atol=1e-12)
     azimuth = np.degrees(np.arctan2(matrices[1, 0, 1], matrices[1, 1, 1]))
     assert azimuth == pytest.approx(105.0, abs=1e-6)
 
 
-def test_gusts_come_from_the_generator_alone_and_swing_the_line() -> None:
+def test_gusts_depend_on_generator_and_swing_the_line() -> None:
     gusty = HANGING | {"gust_intensity_m_s": 3.0}
-    one, same, other = _flown(4, **gusty), _flown(4, **gusty), _flown(5, **gusty)
+    one, same, other = _fly(4, **gusty), _fly(4, **gusty), _fly(5, **gusty)
     times = np.linspace(-5.0, 20.0, 50)
     np.testing.assert_array_equal(one.motion(times).positions_m, same.motion(times).positions_m)
     assert np.abs(one.motion(times).positions_m - other.motion(times).positions_m).max() > 1.0
     assert 0.1 < _off_nadir_deg(one, times).max() < 15.0
 
 
-def test_fires_the_thrusters_at_their_height_and_flies_on_for_a_second() -> None:
-    descent = _flown(**WILD)
+def test_thrusters_fire_at_their_height_before_the_end() -> None:
+    descent = _fly(**WILD)
     assert descent.state(descent.thruster_firing_s).position_m[2] == pytest.approx(GROUND_M + 100.0, abs=1e-6)
     assert descent.span_s[1] > descent.thruster_firing_s + 1.0
     assert descent.state(descent.time_of_altitude(1400.0)).position_m[2] == pytest.approx(1500.0, abs=1e-6)
 
 
-def test_horizontal_velocities_are_those_of_the_paper() -> None:
-    """Up to 30 m/s at the pictures, of which the swing is a part (field test paper, III.C)."""
+def test_horizontal_velocities_match_the_paper() -> None:
+    """Up to 30 m/s at the images, including the swing (field test paper, III.C)."""
     speeds = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
         wind, azimuth = rng.uniform(0.0, 22.0), rng.uniform(0.0, 2.0 * np.pi)
-        drawn = {
+        samples = {
             "wind_east_m_s": wind * np.sin(azimuth),
             "wind_north_m_s": wind * np.cos(azimuth),
             "cone_angle_deg": rng.uniform(0.0, 30.0),
             "cone_phase_deg": rng.uniform(0.0, 360.0),
         }
-        motion = _flown(seed, **drawn).motion(np.array([0.0, 3.75, 7.5]))
+        motion = _fly(seed, **samples).motion(np.array([0.0, 3.75, 7.5]))
         speeds.append(np.linalg.norm(motion.velocities_m_s[:, :2], axis=1).max())
     assert 20.0 < max(speeds) < 32.0
 
 
-def test_says_what_is_allowed() -> None:
-    descent = _flown(**HANGING)
+def test_errors_state_the_allowed_values() -> None:
+    descent = _fly(**HANGING)
     with pytest.raises(ValueError, match=r"time -11 s is outside of the motion; allowed: -10 to 27\.\d+ s"):
         descent.state(-11.0)
     with pytest.raises(ValueError, match=r"altitude 5000 m is not flown through; allowed: .* to 27\d\d"):
         descent.time_of_altitude(5000.0)
     with pytest.raises(ValueError, match=r"nod_rate_deg_s is 110; allowed: below \d+"):
-        _flown(nod_rate_deg_s=110.0, mass_centre_m=0.2, gyration_transverse_m=1.0)
+        _fly(nod_rate_deg_s=110.0, mass_centre_m=0.2, gyration_transverse_m=1.0)
     with pytest.raises(ValueError, match=r"start_m is at z = 150\.0 m; allowed: above the thrusters' firing, 200\.0 m"):
         SwingDescent.simulate(
             SwingParameters(), np.array([0.0, 0.0, 150.0]), np.random.default_rng(0), ground_height_m=GROUND_M
@@ -374,16 +376,16 @@ def test_says_what_is_allowed() -> None:
     with pytest.raises(
         ValueError, match=r"gyration_transverse_m of 5 with mass_centre_m of 0\.1 .*; allowed: nods far"
     ):
-        _flown(mass_centre_m=0.1, gyration_transverse_m=5.0, nod_rate_deg_s=0.0)
+        _fly(mass_centre_m=0.1, gyration_transverse_m=5.0, nod_rate_deg_s=0.0)
     with pytest.raises(ValueError, match="lead_s is 60; allowed: above 0, up to 30 s"):
         SwingDescent.simulate(SwingParameters(), START, np.random.default_rng(0), ground_height_m=GROUND_M, lead_s=60.0)
     with pytest.raises(ValidationError, match="bridle_length_m is 60; allowed: up to line_length_m, 47"):
         SwingParameters(bridle_length_m=60.0)
 
 
-def test_compiled_steps_are_those_of_scipy() -> None:
-    """The flight as SciPy's own DOP853 takes it, to what rounding in sums makes of it."""
-    descent = _flown(**WILD)
+def test_compiled_integrator_matches_scipy() -> None:
+    """Compare with SciPy's DOP853, within the rounding of sums."""
+    descent = _fly(**WILD)
     state = descent.path.at(np.zeros(1))[0]
     for end_s in (-9.0, 12.0):
         expected = solve_ivp(

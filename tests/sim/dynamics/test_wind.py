@@ -1,4 +1,4 @@
-"""Wind over height: the mean profile and the gusts' statistics."""
+"""Tests of the wind profile over height and of gust statistics."""
 
 from __future__ import annotations
 
@@ -7,58 +7,58 @@ import pytest
 from scipy.integrate import quad
 
 from marsyard.sim.dynamics import Wind, WindParameters
-from marsyard.sim.dynamics.wind import LONGEST_WAVE_SCALES, SHORTEST_WAVE_M
+from marsyard.sim.dynamics.trajectory import LONGEST_WAVE_SCALES, SHORTEST_WAVE_M
 
 GROUND_M = -1900.0
 
 
-def _wind(seed: int = 0, **parameters: float) -> Wind:
+def _make_wind(seed: int = 0, **parameters: float) -> Wind:
     return Wind.draw(WindParameters(**parameters), GROUND_M, np.random.default_rng(seed))
 
 
-def test_mean_wind_is_constant_above_its_layer_and_logarithmic_in_it() -> None:
-    wind = _wind(wind_east_m_s=20.0, wind_north_m_s=-5.0, gust_intensity_m_s=0.0)
+def test_mean_wind_is_logarithmic_in_layer_and_constant_above() -> None:
+    wind = _make_wind(wind_east_m_s=20.0, wind_north_m_s=-5.0, gust_intensity_m_s=0.0)
     above_ground = np.array([0.0, 1.0, 100.0, 500.0, 2000.0])
-    found = wind.velocities(GROUND_M + above_ground)
-    share = np.minimum(np.log1p(above_ground / 0.03) / np.log1p(500.0 / 0.03), 1.0)
-    np.testing.assert_allclose(found, share[:, None] * [20.0, -5.0, 0.0], atol=1e-12)
+    result = wind.velocities(GROUND_M + above_ground)
+    fraction = np.minimum(np.log1p(above_ground / 0.03) / np.log1p(500.0 / 0.03), 1.0)
+    np.testing.assert_allclose(result, fraction[:, None] * [20.0, -5.0, 0.0], atol=1e-12)
     np.testing.assert_array_equal(wind.velocities(np.array([GROUND_M - 10.0])), 0.0)
 
 
-def test_gusts_leave_out_nothing_but_the_mean() -> None:
-    wind = _wind(wind_east_m_s=20.0, gust_intensity_m_s=2.0)
+def test_gust_bands_contain_all_but_the_mean() -> None:
+    wind = _make_wind(wind_east_m_s=20.0, gust_intensity_m_s=2.0)
     heights = GROUND_M + np.linspace(600.0, 2000.0, 50)
     assert np.ptp(wind.velocities(heights)[:, 0]) > 1.0
     np.testing.assert_allclose(wind.without_gusts.velocities(heights)[:, 0], 20.0)
 
 
-def _structure(spectrum: str, lag_m: float, length_m: float) -> float:
-    """Mean squared difference over a lag for unit variance, by quadrature of the band's spectrum."""
+def _structure_function(spectrum: str, lag_m: float, length_m: float) -> float:
+    """Mean squared difference over a lag for unit variance, by quadrature of the band spectrum."""
 
     def density(k: float) -> float:
         x2 = (length_m * k) ** 2
         return 2.0 / (1.0 + x2) if spectrum == "longitudinal" else (1.0 + 3.0 * x2) / (1.0 + x2) ** 2
 
     first, last = 2.0 * np.pi / (LONGEST_WAVE_SCALES * length_m), 2.0 * np.pi / SHORTEST_WAVE_M
-    whole, _ = quad(density, first, last, limit=400)
+    full, _ = quad(density, first, last, limit=400)
     part, _ = quad(lambda k: density(k) * 2.0 * (1.0 - np.cos(k * lag_m)), first, last, limit=2000)
-    return part / whole
+    return part / full
 
 
 @pytest.mark.parametrize("lag_m", [50.0, 300.0])
-def test_gusts_have_drydens_spectra(lag_m: float) -> None:
+def test_gusts_have_dryden_spectra(lag_m: float) -> None:
     draws = 3000
     heights = GROUND_M + np.array([1000.0, 1000.0 + lag_m])
-    rows = np.stack([_wind(seed, gust_intensity_m_s=2.0).velocities(heights) for seed in range(draws)])
-    # a variance from n normal draws spreads by sqrt(2 / n): 2.6 %, and four times that is never seen
+    rows = np.stack([_make_wind(seed, gust_intensity_m_s=2.0).velocities(heights) for seed in range(draws)])
+    # The variance of n normal draws has a spread of sqrt(2 / n) = 2.6 %; the tolerance is four times that.
     band = 4.0 * np.sqrt(2.0 / draws)
     np.testing.assert_allclose(rows[:, 0].var(axis=0), 4.0, rtol=band)
     squared = np.mean((rows[:, 1] - rows[:, 0]) ** 2, axis=0) / 4.0
-    np.testing.assert_allclose(squared[:2], _structure("transverse", lag_m, 533.0), rtol=band)
-    np.testing.assert_allclose(squared[2], _structure("longitudinal", lag_m, 533.0), rtol=band)
+    np.testing.assert_allclose(squared[:2], _structure_function("transverse", lag_m, 533.0), rtol=band)
+    np.testing.assert_allclose(squared[2], _structure_function("longitudinal", lag_m, 533.0), rtol=band)
 
 
 def test_components_are_independent() -> None:
-    rows = np.stack([_wind(seed, gust_intensity_m_s=1.0).velocities(np.zeros(1))[0] for seed in range(2000)])
+    rows = np.stack([_make_wind(seed, gust_intensity_m_s=1.0).velocities(np.zeros(1))[0] for seed in range(2000)])
     correlation = np.corrcoef(rows.T) - np.eye(3)
     assert np.abs(correlation).max() < 4.0 / np.sqrt(2000)

@@ -1,3 +1,5 @@
+"""Fixtures of rendering tests."""
+
 from collections.abc import Callable
 
 import numpy as np
@@ -16,7 +18,7 @@ def renderer() -> Renderer:
 
 @pytest.fixture(scope="session")
 def rough() -> Surface:
-    """A small world of 768 m with craters and slopes of 6 deg."""
+    """Return a small world of 768 m with craters and slopes of 6 deg."""
     parameters = TerrainParameters(
         samples=512,
         rms_slope_deg=6.0,
@@ -30,7 +32,7 @@ def rough() -> Surface:
 
 @pytest.fixture(scope="session")
 def descent_camera() -> Callable[..., Cahvor]:
-    """Makes the descent camera's field of view at some size and distortion, in the body frame."""
+    """Return a function that makes descent cameras of given size and distortion, in the body frame."""
 
     def make(size: int = 1024, r: tuple[float, float, float] = (0.00096, -0.002183, 0.018547)) -> Cahvor:
         pinhole = Cahv.from_focal_length(

@@ -1,4 +1,4 @@
-"""Each backend draws the same picture; what cannot draw says so."""
+"""Tests of the rendering backends: equal images and errors for missing backends."""
 
 import ctypes
 import os
@@ -53,13 +53,13 @@ def _draw(backend: str, folder: Path) -> dict[str, np.ndarray]:
     return dict(np.load(path))
 
 
-def test_osmesa_and_egl_draw_the_same_picture(tmp_path: Path) -> None:
+def test_osmesa_and_egl_render_equal_images(tmp_path: Path) -> None:
     osmesa, egl = _draw("osmesa", tmp_path), _draw("egl", tmp_path)
-    # Where a ray grazes a crest, two depths a rounding apart can lead to this side of it or the other.
+    # Where a ray grazes a crest, a rounding difference in depth can select either side.
     assert np.mean(np.abs(egl["distance"] / osmesa["distance"] - 1.0) < 1e-6) > 0.999
     assert np.mean(np.abs(egl["radiance"] / osmesa["radiance"] - 1.0) < 1e-4) > 0.999
-    # Even before the search for the terrain: a depth sample off the pixel's centre (EGL's multisampling) would be off
-    # by a quarter of a pixel's slope, some tenths of a metre here.
+    # A depth sample off the pixel centre (EGL multisampling) would differ by a quarter of a pixel's slope: some tenths
+    # of a metre.
     assert np.abs(egl["depth"] - osmesa["depth"]).mean() < 1e-3
 
 
@@ -70,9 +70,7 @@ def test_unknown_backend_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("installed", "chosen"), [(("OSMesa", "EGL"), "osmesa"), (("EGL",), "egl"), ((), "osmesa")])
-def test_default_backend_is_an_installed_one(
-    monkeypatch: pytest.MonkeyPatch, installed: tuple[str, ...], chosen: str
-) -> None:
+def test_default_backend_is_installed(monkeypatch: pytest.MonkeyPatch, installed: tuple[str, ...], chosen: str) -> None:
     from marsyard.sim.render import backend
 
     monkeypatch.delenv("MARSYARD_GL", raising=False)
@@ -80,33 +78,33 @@ def test_default_backend_is_an_installed_one(
     assert backend.default_backend() == chosen
 
 
-def _view(height_m: float) -> tuple[np.ndarray, float, float, float]:
+def _render_depths(height_m: float) -> tuple[np.ndarray, float, float, float]:
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = height_m
     return pose, 40.0, 1.0, 100.0
 
 
 def test_load_replaces_the_previous_geometry() -> None:
-    """Depths of level ground and of a triangle above its middle, in closed form, in whatever order they are loaded."""
+    """Depths of level ground and of a triangle above its centre in closed form, for any load order."""
     corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0], [-30.0, 30.0, 0.0]])
     ground = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
     above = np.array([[[-9.0, -9.0, 4.0], [9.0, -9.0, 4.0], [0.0, 9.0, 4.0]]])
     renderer = DepthRenderer(64, default_backend())
     with pytest.raises(RenderingError, match="no mesh"):
-        renderer.draw(*_view(20.0))
+        renderer.draw(*_render_depths(20.0))
     nothing = (np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
     for loaded, number in (((above, np.array([70000])), 70001), (nothing, 0), ((above, np.array([5])), 6)):
         renderer.load(ground, *loaded)
         for height in (20.0, 10.0):
-            depth, numbers = renderer.draw(*_view(height))
-            # to the 24 bits of a depth between 1 and 100 m
+            depth, numbers = renderer.draw(*_render_depths(height))
+            # 24 bits of a depth between 1 and 100 m.
             assert depth[32, 32] == pytest.approx(height - (4.0 if number else 0.0), abs=1e-3)
             assert depth[2, 2] == pytest.approx(height, abs=1e-3)
             assert numbers.size == 0 if number == 0 else (numbers[32, 32], numbers[2, 2]) == (number, 0)
     renderer.close()
 
 
-def test_second_backend_in_one_process_is_refused() -> None:
+def test_second_backend_in_one_process_is_rejected() -> None:
     program = (
         "from marsyard.sim.render.backend import DepthRenderer, RenderingError\n"
         "import OpenGL\n"
@@ -119,7 +117,7 @@ def test_second_backend_in_one_process_is_refused() -> None:
     assert "already uses OpenGL through osmesa" in done.stdout
 
 
-def test_python_without_assertions_is_refused() -> None:
+def test_python_without_assertions_is_rejected() -> None:
     program = (
         "from marsyard.sim.render.backend import DepthRenderer, RenderingError\n"
         "try:\n    DepthRenderer(64, 'osmesa')\nexcept RenderingError as error:\n    print(error)\n"

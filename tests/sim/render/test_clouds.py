@@ -1,3 +1,5 @@
+"""Tests of cloud layers: cover, transmittance, motion and scattered light."""
+
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -12,25 +14,25 @@ from marsyard.sim.terrain import Surface
 
 ALBEDO = 0.3
 SUN = Sun(direction(np.radians(130.0), np.radians(50.0)))
-#: Brightness is then albedo times the cosine of incidence times what the clouds let through.
+#: Brightness is then albedo times the cosine of incidence times the transmittance of the clouds.
 LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
 
 
-def _flat() -> Surface:
+def _make_flat_ground() -> Surface:
     samples = np.zeros((64, 64, 2), dtype=np.float32)
     samples[..., 1] = ALBEDO
     return Surface.from_samples(samples, 64.0)
 
 
-def _layer(seed: int = 1, **changes: float) -> CloudLayer:
+def _make_layer(seed: int = 1, **changes: float) -> CloudLayer:
     return CloudLayer.draw(CloudParameters(**changes), np.random.default_rng(seed))
 
 
-def _scene(clouds: CloudLayer | None, photometry: Photometry = LAMBERT) -> Scene:
-    return Scene(_flat(), (0.0, 0.0), SUN, photometry, clouds=clouds, edge_rays=1)
+def _make_scene(clouds: CloudLayer | None, photometry: Photometry = LAMBERT) -> Scene:
+    return Scene(_make_flat_ground(), (0.0, 0.0), SUN, photometry, clouds=clouds, edge_rays=1)
 
 
-def _from_above(
+def _render_from_above(
     renderer: Renderer, scene: Scene, camera: CameraModel, time_s: float = 0.0, at: tuple[float, float] = (100.0, 300.0)
 ) -> Frame:
     pose = rigid(Rotation.from_euler("z", 25.0, degrees=True), np.array([*at, 2000.0]))
@@ -39,19 +41,19 @@ def _from_above(
 
 @pytest.mark.parametrize("cover", [0.1, 0.3, 0.6])
 def test_cover_and_size_equal_the_parameters(cover: float) -> None:
-    layers = [_layer(seed, cover=cover, size_m=900.0, edge_m=20.0) for seed in range(4)]
+    layers = [_make_layer(seed, cover=cover, size_m=900.0, edge_m=20.0) for seed in range(4)]
     assert np.mean([layer.cover.mean() for layer in layers]) == pytest.approx(cover, rel=0.01)
     inside = np.stack([layer.cover > 0.5 for layer in layers])
     entries = np.count_nonzero(inside & ~np.roll(inside, 1, axis=2))
-    # some 400 clouds a layer are crossed by 1024 lines
+    # 1024 lines cross about 400 clouds per layer.
     assert inside.sum() / entries * layers[0].cell_m == pytest.approx(900.0, rel=0.05)
 
 
 def test_clouds_dim_the_direct_sun_by_their_optical_depth(
     renderer: Renderer, descent_camera: Callable[..., Cahvor]
 ) -> None:
-    layer = _layer(cover=0.4, optical_depth=1.0, edge_m=10.0)
-    frame = _from_above(renderer, _scene(layer), descent_camera(128))
+    layer = _make_layer(cover=0.4, optical_depth=1.0, edge_m=10.0)
+    frame = _render_from_above(renderer, _make_scene(layer), descent_camera(128))
     elevation = np.radians(50.0)
     clear = ALBEDO * np.sin(elevation)
     more = layer.parameters.sky_light(SUN) * ALBEDO
@@ -59,11 +61,9 @@ def test_clouds_dim_the_direct_sun_by_their_optical_depth(
     assert frame.radiance.min() == pytest.approx(clear * np.exp(-1.0 / np.sin(elevation)) + more, rel=1e-3)
 
 
-def test_the_picture_shows_the_transmittance_that_truth_states(
-    renderer: Renderer, descent_camera: Callable[..., Cahvor]
-) -> None:
-    scene = _scene(_layer(seed=3, asymmetry=0.0, optical_depth=100.0))
-    frame = _from_above(renderer, scene, descent_camera(128), time_s=12.0)
+def test_rendered_transmittance_equals_truth(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+    scene = _make_scene(_make_layer(seed=3, asymmetry=0.0, optical_depth=100.0))
+    frame = _render_from_above(renderer, scene, descent_camera(128), time_s=12.0)
     assert scene.clouds is not None
     passed = scene.clouds.transmittance(frame.points_world(), SUN, 12.0)
     more = scene.clouds.parameters.sky_light(SUN)
@@ -72,13 +72,13 @@ def test_the_picture_shows_the_transmittance_that_truth_states(
 
 
 def test_shadows_move_with_the_wind(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
-    """Seen from a place that drifts with the wind, the shadows on an even ground stand still."""
-    scene, camera = _scene(_layer(wind_east_m_s=9.0, wind_north_m_s=-4.0)), descent_camera(128)
-    first = _from_above(renderer, scene, camera, 5.0)
-    later = _from_above(renderer, scene, camera, 8.75, at=(100.0 + 3.75 * 9.0, 300.0 - 3.75 * 4.0))
-    stayed = _from_above(renderer, scene, camera, 8.75)
+    """From a camera that drifts with the wind, the shadows on uniform ground are static."""
+    scene, camera = _make_scene(_make_layer(wind_east_m_s=9.0, wind_north_m_s=-4.0)), descent_camera(128)
+    first = _render_from_above(renderer, scene, camera, 5.0)
+    later = _render_from_above(renderer, scene, camera, 8.75, at=(100.0 + 3.75 * 9.0, 300.0 - 3.75 * 4.0))
+    stayed = _render_from_above(renderer, scene, camera, 8.75)
     assert np.ptp(first.radiance) > 0.1
-    # a hundredth of a pixel of 13 m, times the steepest brightness of an edge of 40 m, is 7e-4
+    # A hundredth of a pixel of 13 m times the steepest gradient of a 40 m edge is 7e-4.
     assert np.abs(later.radiance - first.radiance).max() < 1e-4
     assert np.abs(stayed.radiance - first.radiance).max() > 0.05
 
@@ -89,7 +89,7 @@ def test_zero_cover_equals_no_clouds_bit_for_bit(
     camera = PixelRays.of(descent_camera(128))
     pose = rigid(Rotation.identity(), np.array([380.0, 200.0, 900.0]))
     bare = Scene(rough, (380.0, 200.0), SUN, Photometry())
-    clouded = replace(bare, clouds=_layer(cover=0.0))
+    clouded = replace(bare, clouds=_make_layer(cover=0.0))
     assert (
         renderer.render(bare, camera, pose).radiance.tobytes()
         == renderer.render(clouded, camera, pose, 40.0).radiance.tobytes()
@@ -98,19 +98,19 @@ def test_zero_cover_equals_no_clouds_bit_for_bit(
 
 def test_scattered_light_does_not_exceed_the_removed_light() -> None:
     for depth in (0.0, 0.5, 5.0, 50.0):
-        given = CloudParameters(optical_depth=depth, cover=0.4)
-        kept = 0.4 * (1.0 - given.direct_transmittance(SUN)) * SUN.direction[2]
-        assert 0.0 <= given.sky_light(SUN) <= kept
+        inputs = CloudParameters(optical_depth=depth, cover=0.4)
+        stored = 0.4 * (1.0 - inputs.direct_transmittance(SUN)) * SUN.direction[2]
+        assert 0.0 <= inputs.sky_light(SUN) <= stored
     assert CloudParameters(optical_depth=0.0).sky_light(SUN) == 0.0
 
 
-def test_the_same_generator_draws_the_same_clouds() -> None:
-    assert _layer(7).cover.tobytes() == _layer(7).cover.tobytes()
-    assert _layer(7).cover.tobytes() != _layer(8).cover.tobytes()
+def test_equal_generators_give_equal_clouds() -> None:
+    assert _make_layer(7).cover.tobytes() == _make_layer(7).cover.tobytes()
+    assert _make_layer(7).cover.tobytes() != _make_layer(8).cover.tobytes()
 
 
 def test_transmittance_of_the_sky_is_nan() -> None:
     points = np.array([[np.nan, np.nan, np.nan], [3.0, 4.0, 5.0]])
-    passed = _layer().transmittance(points, SUN, 0.0)
+    passed = _make_layer().transmittance(points, SUN, 0.0)
     assert np.isnan(passed[0])
     assert 0.0 < passed[1] <= 1.0

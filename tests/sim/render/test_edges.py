@@ -1,4 +1,4 @@
-"""Pixels that hold an edge: their rays, what these meet, and the picture against 256 rays a pixel."""
+"""Tests of pixels with edges: subpixel rays, ray intersection, and images against 256 rays per pixel."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.validation.motion import View, supersampled
+from benchmarks.validation.motion import View, supersample
 from benchmarks.validation.raycast import meet_triangles
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
@@ -21,7 +21,7 @@ SUN = Sun(direction(np.radians(110.0), np.radians(40.0)))
 SAMPLES = 16
 
 
-def _camera(size: tuple[int, int], focal_m: float = 16e-3) -> Cahv:
+def _make_camera(size: tuple[int, int], focal_m: float = 16e-3) -> Cahv:
     return Cahv.from_focal_length(
         focal_m=focal_m,
         pixel_pitch_m=12e-6,
@@ -34,7 +34,7 @@ def _camera(size: tuple[int, int], focal_m: float = 16e-3) -> Cahv:
 
 @pytest.fixture(scope="module")
 def rocky() -> View:
-    """A rock of 1 m among others, 5 m away, in front of rolling ground and the sky."""
+    """A rock of 1 m among other rocks at 5 m, with rolling ground and sky."""
     parameters = TerrainParameters(
         samples=512, spacing_m=0.05, rms_slope_deg=3.0, slope_baseline_m=1.0, outer_scale_m=10.0, craters_per_km2=0.0
     )
@@ -55,92 +55,91 @@ def rocky() -> View:
         mesh_lines=801,
         among_objects=True,
     )
-    return View(scene, _camera((192, 160), 6e-3), rigid(Rotation.from_euler("y", 8.0, degrees=True), eye))
+    return View(scene, _make_camera((192, 160), 6e-3), rigid(Rotation.from_euler("y", 8.0, degrees=True), eye))
 
 
 @pytest.fixture(scope="module")
 def reference(renderer: Renderer, rocky: View) -> np.ndarray:
-    """The rocks by 256 rays a pixel, each of which sees ground and texture as smooth as the pixel."""
+    """The rocks rendered with 256 rays per pixel; ground and texture have the smoothness of a pixel."""
     single = replace(rocky, scene=replace(rocky.scene, edge_rays=1))
-    return supersampled(renderer, replace(single, footprint=float(SAMPLES)), SAMPLES)
+    return supersample(renderer, replace(single, footprint=float(SAMPLES)), SAMPLES)
 
 
-def test_subpixel_rays_are_spread_evenly_about_the_centre() -> None:
-    camera = _camera((7, 5))
+def test_subpixel_rays_are_evenly_distributed() -> None:
+    camera = _make_camera((7, 5))
     rays = PixelRays.of(camera)
     pixels = np.array([0, 17, 34])
     within = rays_within(rays, pixels, 3)
-    found, _ = camera.project(within.directions.astype(np.float64))
+    result, _ = camera.project(within.directions.astype(np.float64))
     middles = np.stack([pixels % 7, pixels // 7], axis=-1)
-    places = found.reshape(3, 9, 2) - middles[:, None]
-    assert np.abs(places.mean(axis=1)).max() < 1e-3
-    # no two in a row or a column: as far apart along either as nine of them can be
+    positions = result.reshape(3, 9, 2) - middles[:, None]
+    assert np.abs(positions.mean(axis=1)).max() < 1e-3
+    # No two of the nine rays share a row or column.
     for axis in range(2):
-        steps = np.diff(np.sort(places[..., axis], axis=1), axis=1)
+        steps = np.diff(np.sort(positions[..., axis], axis=1), axis=1)
         np.testing.assert_allclose(steps, 1.0 / 9.0, atol=2e-3)
 
 
-def test_the_nearest_triangle_is_that_of_an_exhaustive_search(rocky: View) -> None:
+def test_nearest_triangle_equals_exhaustive_search(rocky: View) -> None:
     objects, pose = rocky.scene.objects, rocky.world_from_body
     rays = pose.rotation.apply(rocky.rays(rocky.camera).directions[::37].astype(np.float64))
     starts = np.broadcast_to(pose.translation, rays.shape)
     expected = meet_triangles(objects, starts, rays)
-    found = np.array([nearest_hit(objects.hierarchy, Ray(*pose.translation, *ray), np.inf).distance for ray in rays])
+    result = np.array([nearest_hit(objects.hierarchy, Ray(*pose.translation, *ray), np.inf).distance for ray in rays])
     assert 0.05 < np.mean(np.isfinite(expected)) < 0.95
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    np.testing.assert_allclose(result, expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize(("side", "share"), [(2, 0.5), (3, 0.4)])
-def test_outlines_are_those_of_256_rays_a_pixel(
-    renderer: Renderer, rocky: View, reference: np.ndarray, side: int, share: float
+@pytest.mark.parametrize(("side", "fraction"), [(2, 0.5), (3, 0.4)])
+def test_outlines_match_256_rays_per_pixel(
+    renderer: Renderer, rocky: View, reference: np.ndarray, side: int, fraction: float
 ) -> None:
     single = replace(rocky, scene=replace(rocky.scene, edge_rays=1))
     rays = rocky.rays(rocky.camera)
     one = renderer.render(single.scene, rays, rocky.world_from_body)
-    several = renderer.render(replace(rocky.scene, edge_rays=side), rays, rocky.world_from_body)
+    antialiased = renderer.render(replace(rocky.scene, edge_rays=side), rays, rocky.world_from_body)
     edges = edge_pixels(one.radiance, one.range_m, one.body)
     assert 500 < edges.size < 0.2 * one.radiance.size
 
     def error(radiance: np.ndarray) -> float:
         return float(np.sqrt(np.mean((radiance - reference).ravel()[edges] ** 2)) / reference.mean())
 
-    assert error(several.radiance) < share * error(one.radiance)
-    # light is neither lost nor won at outlines
-    at_edges = (several.radiance - reference).ravel()[edges].mean() / reference.mean()
+    assert error(antialiased.radiance) < fraction * error(one.radiance)
+    # The mean brightness at outlines is unbiased.
+    at_edges = (antialiased.radiance - reference).ravel()[edges].mean() / reference.mean()
     assert abs(at_edges) < 0.1 * error(one.radiance)
 
 
-def test_truth_is_that_of_pixel_centres(renderer: Renderer, rocky: View) -> None:
+def test_truth_is_at_pixel_centres(renderer: Renderer, rocky: View) -> None:
     rays = rocky.rays(rocky.camera)
     one = renderer.render(replace(rocky.scene, edge_rays=1), rays, rocky.world_from_body)
-    several = renderer.render(rocky.scene, rays, rocky.world_from_body)
+    antialiased = renderer.render(rocky.scene, rays, rocky.world_from_body)
     for layer in ("range_m", "body", "normal"):
-        assert getattr(one, layer).tobytes() == getattr(several, layer).tobytes()
-    changed = np.flatnonzero(one.radiance.ravel() != several.radiance.ravel())
+        assert getattr(one, layer).tobytes() == getattr(antialiased, layer).tobytes()
+    changed = np.flatnonzero(one.radiance.ravel() != antialiased.radiance.ravel())
     assert np.isin(changed, edge_pixels(one.radiance, one.range_m, one.body)).all()
 
 
-def test_the_horizon_of_a_plane_is_where_its_mesh_ends(renderer: Renderer) -> None:
-    """A rolled camera over a plane: the share of ground in each column is that below the mesh's border.
-
-    The mesh ends 200 m away, 5 mrad or 3.3 pixels below the plane's own horizon.
+def test_plane_horizon_is_at_the_mesh_border(renderer: Renderer) -> None:
+    """A rolled camera over a plane: the ground fraction in each column is the part below the mesh border. The mesh
+    ends 200 m away, 5 mrad or 3.3 pixels below the horizon.
     """
     samples = np.zeros((64, 64, 2), dtype=np.float32)
     samples[..., 1] = 0.2
     surface = Surface.from_samples(samples, 0.5)
     law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0)
     scene = Scene(surface, (0.0, 0.0), SUN, law, mesh_finest_m=0.04, mesh_reach_m=200.0, mesh_lines=801)
-    camera = _camera((128, 64), 8e-3)
+    camera = _make_camera((128, 64), 8e-3)
     pose = rigid(Rotation.from_euler("x", 7.0, degrees=True), np.array([0.0, 0.0, 1.0]))
-    border, _ = camera.moved(pose).project(np.array([[200.0, -30.0, 0.0], [200.0, 30.0, 0.0]]))
-    # pixel 63 ends at 63.5
+    border, _ = camera.transform(pose).project(np.array([[200.0, -30.0, 0.0], [200.0, 30.0, 0.0]]))
+    # Pixel 63 ends at 63.5.
     expected = 63.5 - np.interp(np.arange(128), *border[np.argsort(border[:, 0])].T)
     errors = []
     for count in (1, 3):
         frame = renderer.render(replace(scene, edge_rays=count), PixelRays.of(camera), pose)
         ground, sky = frame.radiance[-1].mean(), frame.radiance[0].mean()
-        share = ((frame.radiance - sky) / (ground - sky)).sum(axis=0)
-        errors.append(float(np.sqrt(np.mean((share - expected) ** 2))))
-    # a straight edge by one ray a pixel is off by up to half a pixel, evenly: 0.29 px rms
+        fraction = ((frame.radiance - sky) / (ground - sky)).sum(axis=0)
+        errors.append(float(np.sqrt(np.mean((fraction - expected) ** 2))))
+    # A straight edge with one ray per pixel has a uniform error of up to half a pixel: 0.29 px rms.
     assert errors[0] > 0.2
     assert errors[1] < 0.1

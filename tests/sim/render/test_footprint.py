@@ -1,4 +1,4 @@
-"""Places where things may shade the ground: none that they do shade is left out, and most others are."""
+"""Tests of shadow footprints: all ground that objects may shade is included, and little other ground."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ from marsyard.sim.terrain import RockParameters, TerrainParameters, site
 ROCKY = TerrainParameters(samples=512, spacing_m=3.0, rocks=RockParameters(abundance=0.15, smallest_m=1.0))
 
 
-def _inside(footprint: Footprint, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _is_inside(footprint: Footprint, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     cells, west, south, per_metre = footprint
     column = np.floor((x - west) * per_metre).astype(int)
     row = np.floor((y - south) * per_metre).astype(int)
@@ -29,24 +29,24 @@ def _inside(footprint: Footprint, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("elevation", [0.2, 0.7, 1.5])
 def test_footprint_contains_every_shaded_position(elevation: float) -> None:
-    """Rays to the sun that pass through a sphere, from ground of any height above the lowest; and few others."""
+    """Rays to the sun that intersect a sphere, from ground of any height above the lowest; few others."""
     rng = np.random.default_rng(0)
     spheres = np.column_stack(
         [rng.uniform(-900.0, 900.0, (40, 2)), rng.uniform(-30.0, 30.0, 40), rng.uniform(0.5, 3.0, 40)]
     )
     sun = direction(rng.uniform(0.0, 6.0), elevation)
     footprint = shadow_footprint(spheres, sun, -40.0)
-    # from points within the spheres back along the sun's rays, down to any height
+    # Points in the spheres, traced back along the sun rays to any height.
     inside = np.repeat(spheres, 500, axis=0)
     away = rng.standard_normal((len(inside), 3))
     away *= (rng.random(len(inside)) ** (1.0 / 3.0) / np.linalg.norm(away, axis=1))[:, None]
     points = inside[:, :3] + inside[:, 3:] * away
     fall = rng.random(len(points)) * (points[:, 2] + 40.0)
     ground = points - (fall / sun[2])[:, None] * sun
-    assert _inside(footprint, ground[:, 0], ground[:, 1]).all()
+    assert _is_inside(footprint, ground[:, 0], ground[:, 1]).all()
     anywhere = rng.uniform(-1000.0, 1000.0, (20000, 2))
-    # shadows of 70 m / tan(elevation), some cells wide, of 40 things on 4 km2
-    assert _inside(footprint, *anywhere.T).mean() < 0.15 + 0.1 / np.tan(elevation)
+    # Shadows of 70 m / tan(elevation), some cells wide, of 40 objects on 4 km2.
+    assert _is_inside(footprint, *anywhere.T).mean() < 0.15 + 0.1 / np.tan(elevation)
 
 
 def test_footprint_without_objects_or_sun_is_everywhere() -> None:
@@ -55,38 +55,38 @@ def test_footprint_without_objects_or_sun_is_everywhere() -> None:
     assert shadow_footprint(one, direction(0.0, -0.1), 0.0) is EVERYWHERE
 
 
-def test_pictures_with_and_without_footprint_are_equal() -> None:
-    """Bit for bit, over ground with many rocks under a low sun."""
+def test_footprint_does_not_change_images() -> None:
+    """Bitwise equal over ground with many rocks under a low sun."""
     ground = SiteGround.of(site("gusev").model_copy(update={"descent": ROCKY}))
-    rays = PixelRays.of(preset("mer-descent-flown").cameras()[0].binned(4, 4))
+    rays = PixelRays.of(preset("mer-descent-flown").cameras()[0].bin(4, 4))
     pose = nadir_pose(ground.surface, 300.0, 200.0, 400.0)
     scene = site_scene(ground, Eye.of(rays, pose, ground.surface), Sun(direction(1.0, 0.3)))
     assert len(scene.objects) > 50
     limited = process_renderer(default_backend()).render(scene, rays, pose)
     unlimited = replace(scene)
     unlimited.__dict__["footprint"] = EVERYWHERE
-    whole = process_renderer(default_backend()).render(unlimited, rays, pose)
-    np.testing.assert_array_equal(limited.radiance, whole.radiance)
+    full = process_renderer(default_backend()).render(unlimited, rays, pose)
+    np.testing.assert_array_equal(limited.radiance, full.radiance)
     assert not scene.footprint.cells.all()
 
 
 @pytest.mark.parametrize("elevation", [0.25, 1.0])
-def test_picture_of_potentially_visible_objects_is_equal(elevation: float) -> None:
-    """Bit for bit: a subframe from a mast among rocks under a low and a high sun, from either side."""
+def test_potentially_visible_objects_give_equal_images(elevation: float) -> None:
+    """Bitwise equal: a subframe from a mast among rocks with a low and a high sun from both sides."""
     terrain = ROCKY.model_copy(update={"spacing_m": 0.05, "rms_slope_deg": 5.0, "slope_baseline_m": 1.0})
     terrain = terrain.model_copy(update={"outer_scale_m": 10.0, "craters_per_km2": 0.0})
     rocks = RockParameters(abundance=0.1, smallest_m=0.05)
     ground = SiteGround.of(site("gusev").model_copy(update={"descent": terrain.model_copy(update={"rocks": rocks})}))
-    rays = PixelRays.of(preset("research-navcam").cameras()[0].cropped(400, 380, (161, 161)))
+    rays = PixelRays.of(preset("research-navcam").cameras()[0].crop(400, 380, (161, 161)))
     pose = mast_pose(ground.surface, 12.0, 11.0, 1.5, 30.0, -14.0)
     for azimuth in (0.5, 3.0):
         eye = Eye(12.0, 11.0, 1.5, rays.pixel_rad, 0.5, 1.2, 25.0)
         scene = site_scene(ground, eye, Sun(direction(azimuth, elevation)))
         near = scene.within([rays.cone(pose)])
         assert 0 < len(near.objects) < 0.5 * len(scene.objects)
-        whole, some = (process_renderer(default_backend()).render(one, rays, pose) for one in (scene, near))
-        np.testing.assert_array_equal(some.radiance, whole.radiance)
-        np.testing.assert_array_equal(some.range_m, whole.range_m)
-        # what is known of bodies stays with them
-        again = Objects(**{name: getattr(near.objects, name) for name in Objects.__dataclass_fields__})
-        np.testing.assert_array_equal(near.objects.spheres, again.spheres)
+        full, subset = (process_renderer(default_backend()).render(one, rays, pose) for one in (scene, near))
+        np.testing.assert_array_equal(subset.radiance, full.radiance)
+        np.testing.assert_array_equal(subset.range_m, full.range_m)
+        # Data of bodies are kept.
+        repeated = Objects(**{name: getattr(near.objects, name) for name in Objects.__dataclass_fields__})
+        np.testing.assert_array_equal(near.objects.spheres, repeated.spheres)

@@ -1,4 +1,4 @@
-"""Where things appear in rendered pictures, against analytic truth and an independent ray cast."""
+"""Tests of the geometry of rendered images against analytic truth and an independent ray cast."""
 
 from collections.abc import Callable
 
@@ -20,17 +20,16 @@ from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
 
 OVERHEAD = Sun(np.array([0.0, 0.0, 1.0]))
-#: Ground that is as bright as its albedo, from wherever it is seen.
+#: Ground whose brightness equals its albedo from any direction.
 PAINT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0)
-#: Tilted 25 deg and rolled.
+#: Tilted by 25 deg and rolled.
 TILTED = Rotation.from_euler("zxy", [30.0, 20.0, 15.0], degrees=True)
 STRONG = (0.01, -0.25, 0.08)
 
 
 def _marked_plane(height_m: float) -> tuple[Surface, np.ndarray]:
-    """A plane with bright spots; the surface and the spots' world positions, shape (n, 3).
-
-    A spot is a Gaussian of 2.5 samples in the control values: the B-spline blurs it evenly, so its centre stays.
+    """A plane with bright spots; returns the surface and the spot positions in the world, shape (n, 3). A spot is a
+    Gaussian of 2.5 samples in the control values: the symmetric B-spline keeps its centre.
     """
     side, spacing = 512, 1.5
     rng = np.random.default_rng(4)
@@ -47,7 +46,7 @@ def _marked_plane(height_m: float) -> tuple[Surface, np.ndarray]:
 
 
 def _centroid(radiance: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Centre of light about the background within 8 pixels of a place."""
+    """Centroid of brightness above the background within 8 pixels of a position."""
     u0, v0 = np.rint(near).astype(int)
     patch = radiance[v0 - 8 : v0 + 9, u0 - 8 : u0 + 9].astype(np.float64)
     border = np.concatenate([patch[0], patch[-1], patch[:, 0], patch[:, -1]])
@@ -57,24 +56,22 @@ def _centroid(radiance: np.ndarray, near: np.ndarray) -> np.ndarray:
 
 
 def _expected_centroid(camera: Cahvor, spot: np.ndarray) -> np.ndarray:
-    """Where the centre of light of a spot's picture lies: the mean of its points' pixels, weighted by brightness and by
-    the picture area that a piece of ground takes. It differs from the centre's pixel by perspective, some 0.01 px.
+    """Expected centroid of a spot's image: the mean pixel of its points, weighted by brightness and image area.
+    Perspective shifts it by about 0.01 px from the pixel of the centre.
     """
     offset = np.linspace(-15.0, 15.0, 31)
     dx, dy = np.meshgrid(offset, offset)
     points = spot + np.stack([dx, dy, np.zeros_like(dx)], axis=-1)
     area = np.abs(np.linalg.det(camera.projection_jacobian(points)[..., :2]))
-    # the spot of 2.5 samples, blurred by the B-spline (variance 1/3 sample^2)
+    # The spot of 2.5 samples, blurred by the B-spline (variance 1/3 sample^2).
     variance = (2.5**2 + 1.0 / 3.0) * 1.5**2
     weight = area * np.exp(-(dx**2 + dy**2) / (2.0 * variance))
     pixels, _ = camera.project(points)
     return np.asarray((weight[..., None] * pixels).sum(axis=(0, 1)) / weight.sum())
 
 
-def test_a_pattern_on_a_plane_is_found_where_the_camera_model_puts_it(
-    renderer: Renderer, descent_camera: Callable[..., Cahvor]
-) -> None:
-    """The bar: 0.05 px rms through a strongly distorted CAHVOR camera, tilted and rolled."""
+def test_spots_on_a_plane_are_at_projected_pixels(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+    """Requirement: 0.05 px rms through a strongly distorted CAHVOR camera, tilted and rolled."""
     surface, spots = _marked_plane(height_m=7.0)
     camera = descent_camera(r=STRONG)
     pose = rigid(TILTED, np.array([300.0, 700.0, 1207.0]))
@@ -82,22 +79,22 @@ def test_a_pattern_on_a_plane_is_found_where_the_camera_model_puts_it(
     frame = renderer.render(scene, PixelRays.of(camera), pose)
     copies = np.arange(-2, 3) * surface.period_m
     everywhere = np.concatenate([spots + np.array([dx, dy, 0.0]) for dx in copies for dy in copies])
-    pixels, visible = camera.moved(pose).project(everywhere)
+    pixels, visible = camera.transform(pose).project(everywhere)
     inside = visible & (np.abs(pixels - 511.5) < 495.0).all(axis=-1)
-    found = np.stack([_centroid(frame.radiance, near) for near in pixels[inside]])
-    expected = np.stack([_expected_centroid(camera.moved(pose), spot) for spot in everywhere[inside]])
-    error = found - expected
+    result = np.stack([_centroid(frame.radiance, near) for near in pixels[inside]])
+    expected = np.stack([_expected_centroid(camera.transform(pose), spot) for spot in everywhere[inside]])
+    error = result - expected
     assert inside.sum() > 400
     assert np.sqrt(np.mean(np.sum(error**2, axis=-1))) < 0.05
-    assert np.sqrt(np.mean(np.sum((found - pixels[inside]) ** 2, axis=-1))) < 0.05
+    assert np.sqrt(np.mean(np.sum((result - pixels[inside]) ** 2, axis=-1))) < 0.05
     assert np.abs(error.mean(axis=0)).max() < 0.003
-    # and the distortion matters: a pinhole camera would put the spots pixels away
-    pinhole, _ = descent_camera(r=(0.0, 0.0, 0.0)).moved(pose).project(everywhere[inside])
+    # The distortion is significant: a pinhole camera would shift the spots by pixels.
+    pinhole, _ = descent_camera(r=(0.0, 0.0, 0.0)).transform(pose).project(everywhere[inside])
     assert np.linalg.norm(pinhole - pixels[inside], axis=-1).max() > 20.0
 
 
 @pytest.mark.parametrize("height_m", [500.0, 2000.0])
-def test_world_points_lie_on_the_plane_and_on_their_rays(
+def test_world_points_are_on_the_plane_and_on_rays(
     renderer: Renderer, descent_camera: Callable[..., Cahvor], height_m: float
 ) -> None:
     surface, _ = _marked_plane(height_m=-3.0)
@@ -108,13 +105,13 @@ def test_world_points_lie_on_the_plane_and_on_their_rays(
     assert np.isfinite(points).all()
     assert np.abs((points[..., 2] + 3.0) / frame.range_m).max() < 1e-5
     np.testing.assert_allclose(frame.points_world(100), points[::100, ::100], rtol=0.0, atol=1e-9)
-    pixels, visible = camera.moved(pose).project(points)
+    pixels, visible = camera.transform(pose).project(points)
     assert visible.all()
-    # rays are kept in single precision: 6e-8 rad is 1e-4 px
+    # Rays have single precision: 6e-8 rad is 1e-4 px.
     assert np.abs(pixels - camera.pixel_grid()).max() < 1e-3
 
 
-def _cast(surface: Surface, origin: np.ndarray, ray: np.ndarray, reach: float) -> float:
+def _cast_ray(surface: Surface, origin: np.ndarray, ray: np.ndarray, reach: float) -> float:
     """Distance to the ground by marching in steps of a fifth of a sample and bisection, with SciPy's B-spline."""
     control = surface.levels[0][..., 0].astype(np.float64)
 
@@ -131,7 +128,7 @@ def _cast(surface: Surface, origin: np.ndarray, ray: np.ndarray, reach: float) -
     return float(brentq(lambda s: clearance(s).item(), t[first - 1], t[first], xtol=1e-9))
 
 
-def test_ranges_agree_with_an_independent_ray_cast_over_rough_ground(
+def test_rough_ground_ranges_match_independent_ray_cast(
     renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
     rays = PixelRays.of(descent_camera())
@@ -140,38 +137,40 @@ def test_ranges_agree_with_an_independent_ray_cast_over_rough_ground(
     rng = np.random.default_rng(8)
     pixels = rng.integers(0, frame.range_m.size, 300)
     directions = pose.rotation.apply(rays.directions[pixels].astype(np.float64))
-    ours = frame.range_m.ravel()[pixels]
-    theirs = np.array([_cast(rough, pose.translation, ray, t) for ray, t in zip(directions, ours, strict=True)])
-    assert np.mean(np.abs(ours / theirs - 1.0) < 1e-6) >= 0.99
-    assert np.abs(ours / theirs - 1.0).max() < 1e-4
+    actual = frame.range_m.ravel()[pixels]
+    expected = np.array([_cast_ray(rough, pose.translation, ray, t) for ray, t in zip(directions, actual, strict=True)])
+    assert np.mean(np.abs(actual / expected - 1.0) < 1e-6) >= 0.99
+    assert np.abs(actual / expected - 1.0).max() < 1e-4
 
 
 @pytest.mark.parametrize("bounded", [True, False], ids=["by ceilings", "by steps"])
 def test_grazing_rays_meet_the_first_occluding_crest(rough: Surface, bounded: bool) -> None:
-    """Rays that graze rough ground hundreds of samples away, against steps of a thirtieth of a sample."""
+    """Rays that graze rough ground hundreds of samples away, against marching in steps of a thirtieth of a sample."""
     rng = np.random.default_rng(3)
     count, ground = 400, Ground(rough)
     origins = np.column_stack([rng.uniform(0.0, rough.period_m, (count, 2)), np.full(count, ground.highest + 60.0)])
     rays = np.array([direction(a, -np.radians(e)) for a, e in rng.uniform([-np.pi, 2.5], [np.pi, 5.0], (count, 2))])
     expected = ground.cast(origins, rays, 4000.0, 0.05)
     level = GroundLevel(rough.levels[0], rough.ceilings[0] if bounded else NO_CEILING, 1.0 / rough.spacing_m)
-    # by ceilings all of the way is cheap to go
+    # With ceilings the search of the complete ray is fast.
     begin = 0.0 if bounded else 0.8
-    found = np.array(
+    result = np.array(
         [
             cross_ground(level, Ray(*origin, *ray), begin * t, 1.25 * t)
             for origin, ray, t in zip(origins, rays, expected, strict=True)
         ]
     )
     assert np.median(expected) > 500.0 * rough.spacing_m
-    assert np.mean(np.abs(found / expected - 1.0) < 1e-4) > 0.99
-    # rays end on the ground, however flat: a thousandth of a sample, and a step of Newton's method, squared
-    assert np.abs(ground.clearance(origins, rays, found)).max() < 1e-5 * rough.spacing_m
+    assert np.mean(np.abs(result / expected - 1.0) < 1e-4) > 0.99
+    # Rays end on the ground: a thousandth of a sample, and one Newton step, squared.
+    assert np.abs(ground.clearance(origins, rays, result)).max() < 1e-5 * rough.spacing_m
 
 
 @pytest.mark.parametrize("bounded", [True, False], ids=["by ceilings", "by steps"])
-def test_search_finds_ground_up_to_its_end_and_none_beyond(rough: Surface, bounded: bool) -> None:
-    """Without ceilings steps are longer than what is left: ground before a thing was passed over with the thing."""
+def test_search_finds_ground_only_up_to_its_end(rough: Surface, bounded: bool) -> None:
+    """Without ceilings the steps are longer than the remaining distance: a crest and the ground before it must be
+    found.
+    """
     rng = np.random.default_rng(4)
     ground = Ground(rough)
     level = GroundLevel(rough.levels[0], rough.ceilings[0] if bounded else NO_CEILING, 1.0 / rough.spacing_m)
@@ -195,7 +194,7 @@ def test_entry_distance_is_where_a_ray_reaches_the_highest_ground() -> None:
 
 
 def test_blocks_below_a_ray_are_skipped(rough: Surface) -> None:
-    """To the first block whose ceiling it is not above, in all directions and over the border of the period."""
+    """Rays skip to the first block whose ceiling is above the ray, in all directions and across the period."""
     ceiling = rough.ceilings[0]
     level, block = GroundLevel(rough.levels[0], ceiling, 1.0 / rough.spacing_m), CEILING_BLOCK * rough.spacing_m
     rng = np.random.default_rng(5)
@@ -205,17 +204,17 @@ def test_blocks_below_a_ray_are_skipped(rough: Surface) -> None:
         start = rng.uniform(0.0, 50.0)
         clear = skip_empty_blocks(level, Ray(*origin, *ray), start, 5000.0)
         t = np.arange(start, clear + 3.0 * block, 0.01 * block)
-        places = origin + t[:, None] * ray
-        a, b = (np.floor(places[:, axis] / block).astype(int) % len(ceiling) for axis in (1, 0))
-        below = places[:, 2] <= ceiling[a, b]
+        positions = origin + t[:, None] * ray
+        a, b = (np.floor(positions[:, axis] / block).astype(int) % len(ceiling) for axis in (1, 0))
+        below = positions[:, 2] <= ceiling[a, b]
         assert not below[t < clear - 1e-6].any()
         assert below[(t > clear) & (t < clear + 2.0 * block)].any()
 
 
-def test_the_mesh_only_starts_the_search(
+def test_mesh_resolution_does_not_change_the_image(
     renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
-    """A mesh three times as coarse gives the same picture: geometry is the terrain's, not the triangles'."""
+    """A mesh three times as coarse gives the same image: the terrain defines the geometry."""
     rays = PixelRays.of(descent_camera(256))
     pose = rigid(TILTED, np.array([380.0, 200.0, 1500.0]))
     fine = renderer.render(Scene(rough, (380.0, 200.0), OVERHEAD, PAINT), rays, pose)
@@ -239,25 +238,25 @@ def test_pixels_above_the_horizon_see_the_sky(
 def test_objects_out_of_view_do_not_change_the_picture(
     renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
-    """Where nothing but ground is in view no triangle is drawn: the search for one must not read what is not there."""
+    """Without visible objects no triangle is drawn: the search must not read missing data."""
     position = np.array([100.0, 200.0, 300.0])
     corners = position + np.array([[0.0, 0.0, 100.0], [1.0, 0.0, 100.0], [0.0, 1.0, 100.0]])
     faces = np.array([[0, 1, 2]], dtype=np.int32)
     above = Objects.of_mesh(corners, np.tile([0.0, 0.0, 1.0], (3, 1)), faces, np.zeros(1, np.int32), albedo=0.1)
     low_sun = Sun(direction(0.3, np.radians(5.0)))
     rays = PixelRays.of(descent_camera(256))
-    with_it, without = (
+    with_objects, without = (
         renderer.render(
-            Scene(rough, (100.0, 200.0), low_sun, PAINT, things, among_objects=True), rays, rigid(TILTED, position)
+            Scene(rough, (100.0, 200.0), low_sun, PAINT, objects, among_objects=True), rays, rigid(TILTED, position)
         )
-        for things in (above, Objects.none())
+        for objects in (above, Objects.none())
     )
-    assert (with_it.body == -1).all()
-    np.testing.assert_array_equal(with_it.range_m, without.range_m)
-    np.testing.assert_array_equal(with_it.radiance, without.radiance)
+    assert (with_objects.body == -1).all()
+    np.testing.assert_array_equal(with_objects.range_m, without.range_m)
+    np.testing.assert_array_equal(with_objects.radiance, without.radiance)
 
 
-def test_refuses_a_camera_below_the_ground(
+def test_camera_below_the_ground_is_rejected(
     renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
     buried = rigid(Rotation.identity(), np.array([0.0, 0.0, -1000.0]))
@@ -265,7 +264,7 @@ def test_refuses_a_camera_below_the_ground(
         renderer.render(Scene(rough, (0.0, 0.0), OVERHEAD, PAINT), PixelRays.of(descent_camera(64)), buried)
 
 
-def test_picture_does_not_depend_on_earlier_pictures(
+def test_image_does_not_depend_on_earlier_images(
     renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
     rays = PixelRays.of(descent_camera(256))
@@ -273,6 +272,6 @@ def test_picture_does_not_depend_on_earlier_pictures(
     pose = rigid(TILTED, np.array([380.0, 200.0, 1500.0]))
     first = renderer.render(Scene(rough, (380.0, 200.0), sun, Photometry()), rays, pose)
     renderer.render(Scene(rough, (0.0, 0.0), OVERHEAD, PAINT), rays, rigid(TILTED, np.array([0.0, 0.0, 900.0])))
-    again = renderer.render(Scene(rough, (380.0, 200.0), sun, Photometry()), rays, pose)
-    assert first.radiance.tobytes() == again.radiance.tobytes()
-    assert first.range_m.tobytes() == again.range_m.tobytes()
+    repeated = renderer.render(Scene(rough, (380.0, 200.0), sun, Photometry()), rays, pose)
+    assert first.radiance.tobytes() == repeated.radiance.tobytes()
+    assert first.range_m.tobytes() == repeated.range_m.tobytes()

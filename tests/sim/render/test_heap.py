@@ -1,10 +1,10 @@
-"""Memory that pictures have freed."""
+"""Test of the memory that is freed after rendering."""
 
 import subprocess
 import sys
 
 SIZE = 20_000_000
-#: Frees as much as some pictures take, and tells how much more memory is in use then, and after it has gone back.
+#: Frees the memory of several images, then prints the memory in use before and after it is returned.
 SCRIPT = f"""
 import os, sys
 from marsyard.sim.render.renderer import keep_freed_memory, return_freed_memory
@@ -24,15 +24,15 @@ print(freed - before, used() - before)
 """
 
 
-def _in_use(word: str) -> tuple[int, int]:
+def _measure_memory(word: str) -> tuple[int, int]:
     done = subprocess.run([sys.executable, "-c", SCRIPT, word], capture_output=True, text=True, check=True)
     freed, returned = map(int, done.stdout.split())
     return freed, returned
 
 
 def test_freed_memory_is_kept_until_it_is_returned() -> None:
-    freed, returned = _in_use("keep")
+    freed, returned = _measure_memory("keep")
     assert freed > 0.9 * SIZE
     assert returned < 0.1 * SIZE
-    # what the C library does by itself
-    assert _in_use("as it is")[0] < 0.1 * SIZE
+    # The default behaviour of the C library.
+    assert _measure_memory("as it is")[0] < 0.1 * SIZE

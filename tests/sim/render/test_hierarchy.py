@@ -1,4 +1,4 @@
-"""The hierarchy of triangles against all triangles, one by one."""
+"""Tests of the triangle hierarchy against exhaustive search."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ EYE = np.array([0.3, -0.2, 1.1])
 
 @pytest.fixture(scope="module")
 def thicket() -> Objects:
-    """Triangles of a tenth of a metre to one, all around."""
+    """Triangles of 0.1 m to 1 m in all directions."""
     rng = np.random.default_rng(6)
     middles = rng.uniform(-12.0, 12.0, (1500, 1, 3))
     corners = (middles + 10.0 ** rng.uniform(-1.5, -0.2, (1500, 1, 1)) * rng.normal(size=(1500, 3, 3))).reshape(-1, 3)
@@ -22,37 +22,37 @@ def thicket() -> Objects:
     return Objects.of_mesh(corners, np.zeros_like(corners), faces, np.zeros(1500, dtype=np.int32), albedo=0.1)
 
 
-def _rays(rng: np.random.Generator, count: int) -> np.ndarray:
+def _draw_rays(rng: np.random.Generator, count: int) -> np.ndarray:
     rays = rng.normal(size=(count, 3))
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
-def test_the_nearest_triangle_is_that_of_all(thicket: Objects) -> None:
-    rays = _rays(np.random.default_rng(7), 800)
+def test_nearest_triangle_equals_exhaustive_search(thicket: Objects) -> None:
+    rays = _draw_rays(np.random.default_rng(7), 800)
     expected = meet_triangles(thicket, np.broadcast_to(EYE, rays.shape), rays, nearest=0.0)
-    found = np.array([nearest_hit(thicket.hierarchy, Ray(*EYE, *ray), np.inf).distance for ray in rays])
+    result = np.array([nearest_hit(thicket.hierarchy, Ray(*EYE, *ray), np.inf).distance for ray in rays])
     assert 0.05 < np.mean(np.isfinite(expected)) < 0.9
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    np.testing.assert_allclose(result, expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("axis", [*_rays(np.random.default_rng(8), 12), *np.eye(3), *-np.eye(3)], ids=str)
+@pytest.mark.parametrize("axis", [*_draw_rays(np.random.default_rng(8), 12), *np.eye(3), *-np.eye(3)], ids=str)
 @pytest.mark.parametrize("spread", [1e-3, 0.05, 0.5])
-def test_a_beam_lists_all_triangles_that_its_rays_meet(thicket: Objects, axis: np.ndarray, spread: float) -> None:
-    """Rays at all angles from the axis up to its half angle, up to a distance; few others are listed."""
+def test_beam_lists_all_triangles_hit_by_its_rays(thicket: Objects, axis: np.ndarray, spread: float) -> None:
+    """Rays at all angles up to the half angle, up to a distance; few other triangles are listed."""
     farthest = 9.0
     rng = np.random.default_rng(9)
     room = np.empty(1500, dtype=np.int64)
     listed = set(room[: list_in_beam(thicket.hierarchy, Ray(*EYE, *axis), spread, farthest, room)].tolist())
-    across = np.cross(axis, _rays(rng, 400))
+    across = np.cross(axis, _draw_rays(rng, 400))
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     angles = spread * rng.uniform(0.0, 1.0, (400, 1))
     met: set[int] = set()
     for ray in np.cos(angles) * axis + np.sin(angles) * across:
-        met |= _all_met(thicket, ray, farthest)
+        met |= _list_hits(thicket, ray, farthest)
     assert met <= listed
-    # a wide beam meets something, so that this tells
+    # A wide beam has hits: the test is significant.
     assert met or spread < 0.5
-    # what a beam lists lies in a square frustum about it: beside that only what leans over its corners
+    # The beam lists triangles in a square frustum, which is larger than the cone at its corners.
     middles = thicket.triangles.mean(axis=1) - EYE
     size = np.linalg.norm(thicket.triangles - thicket.triangles.mean(axis=1, keepdims=True), axis=2).max(axis=1)
     along = middles @ axis
@@ -71,8 +71,8 @@ def test_beam_reports_an_overflow_of_its_list(thicket: Objects) -> None:
     assert list_in_beam(Objects.none().hierarchy, Ray(*EYE, *ahead), 0.3, 9.0, room) == 0
 
 
-def _all_met(objects: Objects, ray: np.ndarray, farthest: float) -> set[int]:
-    """Numbers of all triangles that a ray from the eye meets up to a distance, by solving for corners' weights."""
+def _list_hits(objects: Objects, ray: np.ndarray, farthest: float) -> set[int]:
+    """Numbers of all triangles that a ray from the eye hits up to a distance, from barycentric coordinates."""
     first, second, third = objects.triangles.transpose(1, 0, 2)
     columns = np.stack([second - first, third - first, np.broadcast_to(-ray, first.shape)], axis=2)
     u, v, t = np.linalg.solve(columns, (EYE - first)[:, :, None])[:, :, 0].T

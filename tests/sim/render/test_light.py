@@ -1,3 +1,5 @@
+"""Tests of rendered brightness against reflectance formulas."""
+
 from collections.abc import Callable
 
 import numpy as np
@@ -12,14 +14,14 @@ from marsyard.sim.terrain import Surface
 NADIR = rigid(Rotation.identity(), np.array([0.0, 0.0, 1000.0]))
 
 
-def _surface(heights: np.ndarray, albedo: float = 0.2) -> Surface:
+def _make_surface(heights: np.ndarray, albedo: float = 0.2) -> Surface:
     samples = np.empty((*heights.shape, 2), dtype=np.float32)
     samples[..., 0] = heights
     samples[..., 1] = albedo
     return Surface.from_samples(samples, 8.0)
 
 
-FLAT = _surface(np.zeros((256, 256)))
+FLAT = _make_surface(np.zeros((256, 256)))
 
 
 def _render(
@@ -29,16 +31,14 @@ def _render(
     return radiance
 
 
-def test_a_lambert_plane_is_as_bright_as_the_cosine_says(
-    renderer: Renderer, descent_camera: Callable[..., Cahvor]
-) -> None:
+def test_lambert_plane_follows_the_cosine_law(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     sun = Sun(direction(np.radians(70.0), np.radians(35.0)))
     law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0)
     radiance = _render(renderer, descent_camera(128), FLAT, sun, law)
     np.testing.assert_allclose(radiance, 0.2 * np.sin(np.radians(35.0)), rtol=1e-5)
 
 
-def test_lunar_lambert_against_the_formula(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+def test_lunar_lambert_matches_the_formula(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     camera = descent_camera(64)
     sun = Sun(direction(np.radians(200.0), np.radians(50.0)))
     law = Photometry(lunar_fraction=0.6, surge_amplitude=0.8, surge_width=0.05, sky_share=0.2, surrounding_albedo=0.0)
@@ -61,10 +61,10 @@ def test_the_opposition_spot_is_at_the_antisolar_point(
     sun = Sun(direction(np.radians(30.0), np.radians(80.0)))
     law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
     radiance = _render(renderer, camera, FLAT, sun, law)
-    at, visible = camera.moved(NADIR).project(NADIR.translation - 500.0 * sun.direction)
+    at, visible = camera.transform(NADIR).project(NADIR.translation - 500.0 * sun.direction)
     assert visible
     peak = np.unravel_index(radiance.argmax(), radiance.shape)
-    # to the nearest pixel
+    # Within one pixel.
     assert np.abs(np.array(peak[::-1]) - at).max() <= 0.51
 
 
@@ -73,28 +73,28 @@ def test_slopes_facing_the_sun_are_brighter(renderer: Renderer, descent_camera: 
     heights = np.broadcast_to(20.0 * np.sin(2 * np.pi * x / 512.0), (256, 256))
     law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0)
     camera = descent_camera(256)
-    # towards the sun in the east the ground falls where its height decreases with x
+    # The ground faces the eastern sun where its height decreases with x.
     east = Sun(direction(np.radians(90.0), np.radians(40.0)))
-    frame = renderer.render(Scene(_surface(heights), (0.0, 0.0), east, law), PixelRays.of(camera), NADIR)
+    frame = renderer.render(Scene(_make_surface(heights), (0.0, 0.0), east, law), PixelRays.of(camera), NADIR)
     facing_east = np.cos(2 * np.pi * frame.points_world()[..., 0] / 512.0) < -0.5
     facing_west = np.cos(2 * np.pi * frame.points_world()[..., 0] / 512.0) > 0.5
     assert frame.radiance[facing_east].min() > frame.radiance[facing_west].max()
 
 
-def test_ground_turned_from_the_sun_has_only_the_sky(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+def test_ground_facing_away_is_lit_by_the_sky_only(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     x = np.arange(256) * 8.0
     heights = np.broadcast_to(40.0 * np.sin(2 * np.pi * x / 512.0), (256, 256))
     low = Sun(direction(np.radians(90.0), np.radians(5.0)))
     dark = _render(
-        renderer, descent_camera(128), _surface(heights), low, Photometry(sky_share=0.0, surrounding_albedo=0.0)
+        renderer, descent_camera(128), _make_surface(heights), low, Photometry(sky_share=0.0, surrounding_albedo=0.0)
     )
     assert dark.min() == 0.0
-    lit = _render(renderer, descent_camera(128), _surface(heights), low, Photometry(sky_share=0.15))
+    lit = _render(renderer, descent_camera(128), _make_surface(heights), low, Photometry(sky_share=0.15))
     assert lit.min() > 0.15 * 0.2 * 0.9
 
 
-def test_a_distant_ground_is_averaged_not_sampled(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
-    """Stripes four times finer than a pixel fade to their mean instead of aliasing."""
+def test_distant_ground_is_averaged(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+    """Stripes four times finer than a pixel converge to their mean without aliasing."""
     samples = np.zeros((512, 512, 2), dtype=np.float32)
     samples[..., 1] = 0.2
     samples[:, ::2, 1] = 0.4
@@ -106,6 +106,6 @@ def test_a_distant_ground_is_averaged_not_sampled(renderer: Renderer, descent_ca
     np.testing.assert_allclose(radiance, 0.3, rtol=0.01)
 
 
-def test_refuses_a_sun_that_is_not_a_unit_vector() -> None:
+def test_sun_must_be_a_unit_vector() -> None:
     with pytest.raises(ValueError, match="not a unit vector"):
         Sun(np.array([0.0, 0.0, 2.0]))

@@ -1,3 +1,5 @@
+"""Tests of the ground mesh: extent, closure and partial meshes."""
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -19,7 +21,7 @@ def test_offsets_have_the_given_extent_and_spacing(finest: float, stretch: float
     assert (np.diff(gaps[count // 2 :]) > -1e-9 * reach).all()
 
 
-def test_refuses_more_lines_than_fit() -> None:
+def test_too_many_grid_lines_are_rejected() -> None:
     with pytest.raises(ValueError, match="reach beyond"):
         graded_offsets(100.0, 10.0, 101)
 
@@ -29,7 +31,7 @@ def test_mesh_is_closed_faces_up_and_follows_the_ground(rough: Surface) -> None:
     mesh = ground_mesh(rough, 120.0 + offsets, -40.0 + offsets)
     assert len(mesh.faces) == 2 * 64 * 64
     assert (mesh.face_normals[:, 2] > 0.0).all()
-    # no cracks: the only open edges are the square's border
+    # No cracks: the only open edges are the border of the square.
     assert len(mesh.edges_unique) == 3 * 64 * 64 + 2 * 64
     middle = np.abs(mesh.vertices[:, :2] - [120.0, -40.0]).max(axis=1) < 50.0
     near = mesh.vertices[middle]
@@ -38,18 +40,18 @@ def test_mesh_is_closed_faces_up_and_follows_the_ground(rough: Surface) -> None:
 
 @given(st.lists(st.tuples(st.floats(-30.0, 30.0), st.floats(-30.0, 30.0)), min_size=3, max_size=9), st.integers(0, 9))
 def test_cells_in_hull_cover_it_closely(corners: list[tuple[float, float]], seed: int) -> None:
-    """Also where it reaches beyond the grid, or between two of its lines."""
-    places = np.array(corners) + np.array([[0.0, 0.0], [0.3, 0.1], [0.1, 0.4], *[[0.0, 0.0]] * (len(corners) - 3)])
-    assume(np.linalg.matrix_rank(places - places[0], tol=1e-3) == 2)
+    """Includes hulls that extend beyond the grid or lie between two grid lines."""
+    positions = np.array(corners) + np.array([[0.0, 0.0], [0.3, 0.1], [0.1, 0.4], *[[0.0, 0.0]] * (len(corners) - 3)])
+    assume(np.linalg.matrix_rank(positions - positions[0], tol=1e-3) == 2)
     lines = graded_offsets(20.0, 0.2, 61)
-    spans = cells_in_hull(lines, lines, places)
-    weights = np.random.default_rng(seed).dirichlet(np.ones(len(places)), 500)
-    inside = weights @ places
+    spans = cells_in_hull(lines, lines, positions)
+    weights = np.random.default_rng(seed).dirichlet(np.ones(len(positions)), 500)
+    inside = weights @ positions
     inside = inside[np.abs(inside).max(axis=1) < 20.0]
     column, row = (np.searchsorted(lines, inside) - 1).T
     assert np.all((spans[row, 0] <= column) & (column < spans[row, 1]))
-    # every cell that is drawn reaches into the box about the places
-    low, high = places.min(axis=0), places.max(axis=0)
+    # Each drawn cell overlaps the box around the positions.
+    low, high = positions.min(axis=0), positions.max(axis=0)
     for strip in np.flatnonzero(spans[:, 1] > spans[:, 0]):
         assert lines[strip] <= high[1]
         assert lines[strip + 1] >= low[1]
@@ -58,12 +60,12 @@ def test_cells_in_hull_cover_it_closely(corners: list[tuple[float, float]], seed
 
 
 def test_partial_mesh_equals_the_whole_mesh(rough: Surface) -> None:
-    """The spans leave strips out, overlap by a corner, and do not touch at all."""
+    """The spans omit strips, overlap at a corner, and do not touch."""
     lines = graded_offsets(300.0, 5.0, 17)
     spans = np.zeros((16, 2), dtype=int)
     spans[3:6] = [[2, 5], [7, 9], [0, 16]]
     spans[15] = [15, 16]
-    some, whole = ground_mesh(rough, lines, lines, spans), ground_mesh(rough, lines, lines)
-    wanted = [row * 16 + column for row, (first, end) in enumerate(spans) for column in range(first, end)]
-    of_cells = whole.triangles.reshape(256, 2, 3, 3)
-    np.testing.assert_array_equal(some.triangles.reshape(-1, 2, 3, 3), of_cells[wanted])
+    subset, full = ground_mesh(rough, lines, lines, spans), ground_mesh(rough, lines, lines)
+    expected = [row * 16 + column for row, (first, end) in enumerate(spans) for column in range(first, end)]
+    of_cells = full.triangles.reshape(256, 2, 3, 3)
+    np.testing.assert_array_equal(subset.triangles.reshape(-1, 2, 3, 3), of_cells[expected])

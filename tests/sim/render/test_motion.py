@@ -1,4 +1,4 @@
-"""A picture moves as its camera does: quick versions of the bars that `make validate` measures in full."""
+"""Tests that rendered images move like their camera: short versions of the measurements of `make validate`."""
 
 from collections.abc import Callable
 
@@ -15,46 +15,46 @@ from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 
 SUN = Sun(direction(np.radians(110.0), np.radians(40.0)))
-#: The bar of the means over all patches, in full measurements of 200 patches and more.
+#: Limit of the means over all patches in the full measurement of at least 200 patches.
 BAR_PX = 0.02
 
 
-def test_the_estimator_finds_a_known_shift() -> None:
-    """Bumps of some pixels in size drawn at their exact places; the second picture darker, by its own gain."""
+def test_estimator_finds_a_known_shift() -> None:
+    """Bumps of several pixels at exact positions; the second image is darker by a gain."""
     rng = np.random.default_rng(2)
-    places, sizes, heights = rng.uniform(0, 160, (900, 2)), rng.uniform(2.0, 5.0, 900), rng.uniform(-1, 1, 900)
+    positions, sizes, heights = rng.uniform(0, 160, (900, 2)), rng.uniform(2.0, 5.0, 900), rng.uniform(-1, 1, 900)
     v, u = np.mgrid[:160, :160].astype(np.float64)
 
     def picture(shift: np.ndarray) -> np.ndarray:
-        drawn = np.zeros((160, 160))
-        for (x, y), size, height in zip(places + shift, sizes, heights, strict=True):
-            drawn += height * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * size**2))
-        return drawn
+        samples = np.zeros((160, 160))
+        for (x, y), size, height in zip(positions + shift, sizes, heights, strict=True):
+            samples += height * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2 * size**2))
+        return samples
 
     shift = np.array([0.37, -0.22])
     first, second = SmoothPicture(picture(np.zeros(2))), SmoothPicture(0.8 * picture(shift) + 0.1)
     shifts = symmetric_shifts(first, second, patch_grid((160, 160)))
     np.testing.assert_allclose(shifts.found, np.broadcast_to(shift, shifts.found.shape), atol=2e-3)
-    # and where all pixels of a patch move alike, that motion is what it expects to find
+    # With equal motion of all pixels in a patch, the estimator expects that motion.
     everywhere = np.broadcast_to(shift, (len(shifts.found), PATCH, PATCH, 2))
     np.testing.assert_allclose(shifts.expected(everywhere), np.broadcast_to(shift, shifts.found.shape), atol=1e-9)
 
 
-def test_a_descent_picture_moves_as_the_camera_does(
+def test_descent_image_motion_matches_the_camera(
     renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor]
 ) -> None:
     texture = Texture(3.0, (0.03,) * 6)
     scene = Scene(rough, (380.0, 200.0), SUN, Photometry(), ground_texture=texture)
-    camera = descent_camera().cropped(256, 256, (512, 512))
+    camera = descent_camera().crop(256, 256, (512, 512))
     pose = rigid(Rotation.from_euler("zyx", [20.0, 5.0, -4.0], degrees=True), np.array([380.0, 200.0, 2000.0]))
     for motion in measure(renderer, View(scene, camera, pose), np.array([0.3, 0.75])):
         assert len(motion.error) >= 200
-        # an order better than the bar: without rocks nothing in the picture has an edge
+        # Ten times better than the limit: without rocks the image has no edges.
         assert np.abs(motion.error.mean(axis=0)).max() < 0.1 * BAR_PX
 
 
 @pytest.mark.parametrize("distance_m", [5.0, 2.0])
-def test_a_rock_from_a_mast_moves_as_the_camera_does(renderer: Renderer, distance_m: float) -> None:
+def test_rock_image_motion_matches_the_mast_camera(renderer: Renderer, distance_m: float) -> None:
     parameters = TerrainParameters(
         samples=512, spacing_m=0.05, rms_slope_deg=3.0, slope_baseline_m=1.0, outer_scale_m=10.0, craters_per_km2=0.0
     )

@@ -1,4 +1,4 @@
-"""The reflectance law as rendered: reciprocity, albedo by an independent integration, and the opposition peak."""
+"""Tests of the rendered reflectance law: reciprocity, albedo by independent integration, opposition peak."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -30,7 +30,7 @@ def flat() -> Surface:
 
 
 def _brightness(renderer: Renderer, flat: Surface, law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray) -> float:
-    """Radiance factor of flat ground in the direct sun alone."""
+    """Radiance factor of flat ground in direct sunlight."""
     camera = Cahv.from_field_of_view(
         horizontal_rad=0.002,
         size=(9, 9),
@@ -49,14 +49,14 @@ def test_reflectance_law_is_reciprocal(renderer: Renderer, flat: Surface, law: P
     for _ in range(3):
         azimuths, heights = rng.uniform(0.0, 2.0 * np.pi, 2), np.arcsin(rng.uniform(0.15, 1.0, 2))
         sun, eye = (direction(float(a), float(h)) for a, h in zip(azimuths, heights, strict=True))
-        there, back = _brightness(renderer, flat, law, sun, eye), _brightness(renderer, flat, law, eye, sun)
-        # I/F over the cosine of incidence is pi times the bidirectional reflectance
-        assert there / sun[2] == pytest.approx(back / eye[2], rel=1e-5)
+        forward, backward = _brightness(renderer, flat, law, sun, eye), _brightness(renderer, flat, law, eye, sun)
+        # I/F over the cosine of incidence is pi times the bidirectional reflectance.
+        assert forward / sun[2] == pytest.approx(backward / eye[2], rel=1e-5)
 
 
 @each_law
 def test_albedo_is_the_reflected_fraction_of_light(law: Photometry) -> None:
-    """Sun and eye drawn in proportion to their cosines: the mean of I/F over cos i is the spherical albedo."""
+    """Sun and eye are drawn in proportion to their cosines: the mean of I/F over cos i is the spherical albedo."""
     one, two, turn = qmc.Sobol(3, rng=np.random.default_rng(1)).random_base2(17).T
     cos_i, cos_e = np.sqrt(1.0 - one), np.sqrt(1.0 - two)
     g = np.arccos(np.clip(cos_i * cos_e + np.sqrt(one * two) * np.cos(2.0 * np.pi * turn), -1.0, 1.0))
@@ -81,12 +81,12 @@ def _hazcam() -> Cahvore:
 def test_the_opposition_peak_is_opposite_the_sun(
     renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor], wide: float
 ) -> None:
-    """The peak's centre, found in the picture alone, within half a pixel."""
+    """The centre of the peak in the image is within half a pixel."""
     camera = _hazcam() if wide else descent_camera(512)
     law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_share=0.0)
     pose = rigid(Rotation.from_euler("zx", [40.0, 8.0], degrees=True), np.array([0.0, 0.0, 800.0]))
     for opposite in np.array([[150.3, 201.8], [330.6, 255.1]]):
-        _, ray = camera.moved(pose).rays(opposite)
+        _, ray = camera.transform(pose).rays(opposite)
         frame = renderer.render(Scene(flat, (0.0, 0.0), Sun(-ray), law), PixelRays.of(camera), pose)
         radiance = frame.radiance.astype(np.float64)
         weight = np.clip(radiance - radiance.max() + 0.1 * np.ptp(radiance), 0.0, None)

@@ -1,4 +1,4 @@
-"""Kernels take as many levels of every surface."""
+"""Test of the number of resolution levels that kernels receive."""
 
 import numpy as np
 import pytest
@@ -8,14 +8,14 @@ from marsyard.sim.terrain import Surface
 
 
 @pytest.mark.parametrize("side", [16, 128])
-def test_every_surface_has_as_many_levels_for_kernels(side: int) -> None:
+def test_kernels_get_the_same_number_of_levels(side: int) -> None:
     surface = Surface.from_samples(np.zeros((side, side, 2), dtype=np.float32), 1.0)
     ground = ground_struct(surface, (0.0, 1.0, 0.0, 1.0, 2.0), ceilings=True)
     levels, coarsest = ground.levels, ground.top_level
     assert len(levels) == len(ground.ceilings) == LEVELS
     assert levels[coarsest].shape[0] == 16
     assert all(one is other for one, other in zip(levels, surface.levels, strict=False))
-    # compiled for one type of all levels
+    # Kernels are compiled for one type of all levels.
     assert {(one.dtype.str, one.flags.writeable, one.flags.c_contiguous) for one in levels} == {("<f4", False, True)}
     assert all(one is other for one, other in zip(ground.ceilings, surface.ceilings, strict=False))
     without = ground_struct(surface, ground.extent, ceilings=False)

@@ -1,4 +1,4 @@
-"""The rover's shape: where it is, and where its shadow falls."""
+"""Tests of the rendered rover: shape, pose and shadow."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ EAST = 0.5 * np.pi
 
 
 @pytest.mark.parametrize(("rover", "mast"), [(MER, MER_MAST), (ROCKY_8, RESEARCH_MAST)])
-def test_the_rover_stands_on_the_ground_with_its_stated_size(rover: RoverParameters, mast: MastGeometry) -> None:
+def test_rover_stands_on_the_ground_with_specified_size(rover: RoverParameters, mast: MastGeometry) -> None:
     stance = settle(rover, Plane(height_m=2.0), 10.0, 20.0, EAST)
     objects = rover_objects(rover, stance, mast, 0.0, 0.0)
     low, high = objects.triangles.min(axis=(0, 1)), objects.triangles.max(axis=(0, 1))
-    # wheels reach the ground; their cylinders have 24 sides, so that a side may be a hundredth of a radius short
+    # Wheels are cylinders with 24 sides: a side may be a hundredth of a radius short.
     assert low[2] == pytest.approx(2.0, abs=0.01 * rover.wheel_radius_m)
     assert high[2] == pytest.approx(2.0 + (mast.base_m + mast.elbow_m + mast.head_m)[2] + 0.06, abs=1e-9)
     assert (low[1], high[1]) == pytest.approx(
@@ -47,7 +47,7 @@ def test_the_rover_stands_on_the_ground_with_its_stated_size(rover: RoverParamet
 def test_normals_point_outwards() -> None:
     stance = settle(MER, Plane(), 0.0, 0.0, EAST)
     objects = rover_objects(MER, stance, MER_MAST, 0.3, -0.2)
-    # closed bodies: the flux of the position through their faces is three times their volume, which is positive
+    # For closed bodies the flux of the position through the faces is three times the positive volume.
     crossed = np.cross(*(objects.triangles[:, k] - objects.triangles[:, 0] for k in (1, 2)))
     assert np.einsum("ti,ti->", objects.triangles[:, 0], crossed) > 0.0
     areas = np.linalg.norm(crossed, axis=1, keepdims=True)
@@ -55,7 +55,7 @@ def test_normals_point_outwards() -> None:
 
 
 def test_wheels_follow_the_suspension() -> None:
-    # a block under the left front wheel: the rover's lowest points there lie on the block
+    # With a block under the left front wheel, the lowest rover points there are on the block.
     stance = settle(MER, Steps(((0.705, 0.53, 0.1),)), 0.0, 0.0, EAST)
     corners = rover_objects(MER, stance, MER_MAST, 0.0, 0.0).triangles.reshape(-1, 3)
     for x, y, height in ((0.705, 0.53, 0.1), (0.705, -0.53, 0.0), (-0.705, 0.53, 0.0)):
@@ -65,18 +65,18 @@ def test_wheels_follow_the_suspension() -> None:
 
 @pytest.mark.parametrize("elevation_deg", [10.0, 0.0, -20.0, -35.0])
 @pytest.mark.parametrize("azimuth_deg", [0.0, 70.0, -150.0])
-def test_the_head_hides_nothing_from_its_cameras(azimuth_deg: float, elevation_deg: float) -> None:
+def test_head_does_not_occlude_its_cameras(azimuth_deg: float, elevation_deg: float) -> None:
     angles = (float(np.radians(azimuth_deg)), float(np.radians(elevation_deg)))
     pair = stereo_mast("mer-navcam")
     stance = settle(MER, Plane(), 0.0, 0.0, EAST)
     objects = rover_objects(MER, stance, pair.geometry, *angles, baseline_m=0.2)
     world_from_head = stance.world_from_rover * pair.geometry.rover_from_head(*angles)
-    for camera in (pair.left.moved(world_from_head), pair.right.moved(world_from_head)):
-        # about the middle of the picture, where targets are
+    for camera in (pair.left.transform(world_from_head), pair.right.transform(world_from_head)):
+        # The central part of the image, which shows the targets.
         u, v = np.meshgrid(np.linspace(430.0, 590.0, 9), np.linspace(430.0, 590.0, 9))
         origins, directions = camera.rays(np.stack([u.ravel(), v.ravel()], axis=1))
         met = meet_triangles(objects, origins, directions, nearest=1e-3)
-        # steeply aside the deck shows, 0.9 m below; nothing nearer, and ahead nothing at all
+        # Views to the side and down show the deck 0.9 m below, views ahead do not.
         assert met.min() > (0.9 if azimuth_deg else 100.0)
 
 
@@ -98,7 +98,7 @@ def test_mast_shadow_lies_opposite_the_sun(renderer: Renderer) -> None:
     sun = Sun(direction(EAST, elevation))
     objects = rover_objects(MER, stance, MER_MAST, 0.0, 0.0)
     scene = Scene(surface, (32.0, 32.0), sun, LAMBERT, objects, mesh_finest_m=0.2, mesh_reach_m=60.0, edge_rays=1)
-    # high up on the mast, so that it is not in the deck's shadow: it falls to the west by height / tan(elevation)
+    # High on the mast, outside the deck's shadow: the shadow is in the west at height / tan(elevation).
     mast = stance.world_from_rover.apply(np.array([*MER_MAST.base_m[:2], 0.0]))
     high = 1.28
     shade = mast + np.array([-high / np.tan(elevation), 0.0, 0.0])
@@ -110,7 +110,7 @@ def test_mast_shadow_lies_opposite_the_sun(renderer: Renderer) -> None:
     points = frame.points_world()
     dark = frame.radiance < 0.1 * frame.radiance.max()
     assert 0.1 < np.mean(dark) < 0.5
-    # the shadow is a band along east, as wide as the mast
+    # The shadow is a band to the east, as wide as the mast.
     band = points[dark & (np.abs(points[..., 0] - shade[0]) < 0.1)]
     assert band[:, 1].mean() == pytest.approx(shade[1], abs=0.01)
     assert np.ptp(band[:, 1]) == pytest.approx(2 * 0.05, abs=0.02)
@@ -126,18 +126,18 @@ def test_sphere_contains_the_rover_in_any_stance(rover: RoverParameters, mast: M
         corners = rover_objects(rover, stance, mast, *rng.uniform(-1.5, 1.5, 2)).triangles.reshape(-1, 3)
         *centre, radius = rover_sphere(rover, stance, mast)[0]
         farthest.append(np.linalg.norm(corners - centre, axis=1).max() / radius)
-    # not much wider than it must be, or it would tell nothing
+    # The radius is close to the necessary radius.
     assert 0.7 < max(farthest) <= 1.0
 
 
-def test_positions_that_a_rover_cannot_shade() -> None:
+def test_rover_shadow_reach() -> None:
     objects = rover_objects(MER, settle(MER, Plane(), 0.0, 0.0, EAST), MER_MAST, 0.0, 0.0)
     low = direction(EAST, np.radians(20.0))
-    # the mast's tip, 1.6 m up, throws its shadow 4.4 m to the west and none to the east
+    # The mast top at 1.6 m has a shadow 4.4 m to the west and none to the east.
     corners = objects.triangles.reshape(-1, 3)
     shadow = corners - corners[:, 2:] / low[2] * low
-    for place in shadow[:: len(shadow) // 50]:
-        assert may_cast_shadow(objects.spheres, low, place, 0.0)
+    for position in shadow[:: len(shadow) // 50]:
+        assert may_cast_shadow(objects.spheres, low, position, 0.0)
     assert not may_cast_shadow(objects.spheres, low, np.array([2.5, 0.0, 0.0]), 0.3)
     assert may_cast_shadow(objects.spheres, low, np.array([2.5, 0.0, 0.0]), 2.0)
     assert not may_cast_shadow(objects.spheres, low, np.array([-8.0, 0.0, 0.0]), 0.3)

@@ -1,4 +1,4 @@
-"""Cast shadows against an independent ray cast: SciPy's B-spline for the ground, brute force for triangles."""
+"""Tests of cast shadows against an independent ray cast: SciPy's B-spline for the ground, brute force for triangles."""
 
 from collections.abc import Callable
 
@@ -24,39 +24,39 @@ from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import RockField, RockParameters
 
 ALBEDO = 0.2
-#: Brightness is then albedo times the cosine of incidence in the sun, and 0 in shadow.
+#: Brightness is then albedo times the cosine of incidence in sunlight, and 0 in shadow.
 LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
-#: Share of pixels on which the two agree: the bar of docs/validation.md.
+#: Required fraction of equal pixels, from docs/validation.md.
 BAR = 0.995
 
 
-def _even(surface: Surface) -> Surface:
-    """The same ground, all of one albedo."""
+def _with_uniform_albedo(surface: Surface) -> Surface:
+    """Return the same ground with uniform albedo."""
     samples = surface.levels[0].copy()
     samples[..., 1] = ALBEDO
     return Surface.from_samples(samples, surface.spacing_m)
 
 
 def _agreement(frame: Frame, scene: Scene, count: int, step: float) -> tuple[float, float]:
-    """Share of random pixels on which picture and ray cast agree that the sun shines, and the share in cast shadow."""
+    """Fraction of random pixels where image and ray cast agree, and the fraction in cast shadow."""
     pixels = np.random.default_rng(6).integers(0, frame.radiance.size, count)
     points = frame.points_world().reshape(-1, 3)[pixels]
     towards = scene.sun.direction
     facing = frame.normal.reshape(-1, 3)[pixels].astype(np.float64) @ towards
-    share = frame.radiance.ravel()[pixels] / (ALBEDO * np.maximum(facing, 1e-6))
+    fraction = frame.radiance.ravel()[pixels] / (ALBEDO * np.maximum(facing, 1e-6))
     hidden = Ground(scene.surface).hides(points, towards, step)
     rays = np.broadcast_to(towards, points.shape)
     hidden |= np.isfinite(meet_triangles(scene.objects, points, rays, nearest=2e-3))
-    ours, theirs = (facing > 0.0) & (share > 0.5), (facing > 0.0) & ~hidden
-    return float(np.mean(ours == theirs)), float(np.mean((facing > 0.0) & hidden))
+    actual, expected = (facing > 0.0) & (fraction > 0.5), (facing > 0.0) & ~hidden
+    return float(np.mean(actual == expected)), float(np.mean((facing > 0.0) & hidden))
 
 
 @pytest.mark.parametrize("azimuth_deg", [110.0, 200.0])
-def test_shadows_of_rough_ground_under_a_low_sun(
+def test_low_sun_shadows_of_rough_ground_match_ray_cast(
     renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor], azimuth_deg: float
 ) -> None:
     sun = Sun(direction(np.radians(azimuth_deg), np.radians(12.0)))
-    scene = Scene(_even(rough), (380.0, 200.0), sun, LAMBERT, edge_rays=1)
+    scene = Scene(_with_uniform_albedo(rough), (380.0, 200.0), sun, LAMBERT, edge_rays=1)
     pose = rigid(Rotation.from_euler("zxy", [30.0, 12.0, 5.0], degrees=True), np.array([380.0, 200.0, 1500.0]))
     frame = renderer.render(scene, PixelRays.of(descent_camera(512)), pose)
     agree, in_shadow = _agreement(frame, scene, 4000, 0.3)
@@ -64,11 +64,11 @@ def test_shadows_of_rough_ground_under_a_low_sun(
     assert agree >= BAR
 
 
-def test_shadows_of_rocks(renderer: Renderer) -> None:
+def test_rock_shadows_match_ray_cast(renderer: Renderer) -> None:
     parameters = TerrainParameters(
         samples=256, spacing_m=0.1, rms_slope_deg=2.0, slope_baseline_m=2.0, outer_scale_m=15.0, craters_per_km2=0.0
     )
-    surface = _even(synthesise(parameters, np.random.default_rng(5)))
+    surface = _with_uniform_albedo(synthesise(parameters, np.random.default_rng(5)))
     field = RockField.on(surface, RockParameters(abundance=0.1, smallest_m=0.15), np.random.default_rng(1))
     mesh = field.near(10.0, 10.0, 7.0, above_m=8.0)
     rocks = Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=ALBEDO)
@@ -88,8 +88,8 @@ def test_shadows_of_rocks(renderer: Renderer) -> None:
     assert agree >= BAR
 
 
-def test_penumbra_of_a_ridge(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
-    """The edge of a shadow 55 m long is as soft as the part of the sun's disc above the ridge says."""
+def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+    """The softness of a shadow edge 55 m away follows from the visible part of the solar disc."""
     spacing, elevation = 0.5, np.radians(20.0)
     heights = np.zeros((256, 256)) + np.maximum(20.0 - spacing * np.abs(np.arange(256.0) - 60.0), 0.0)
     samples = np.stack([heights, np.full_like(heights, ALBEDO)], axis=-1).astype(np.float32)
@@ -106,14 +106,14 @@ def test_penumbra_of_a_ridge(renderer: Renderer, descent_camera: Callable[..., C
     offset = np.clip((elevation - np.interp(at, ground, skyline)) / sun.angular_radius_rad, -1.0, 1.0)
     expected = 0.5 + (offset * np.sqrt(1.0 - offset**2) + np.arcsin(offset)) / np.pi
     lit = frame.radiance.ravel() / (ALBEDO * np.sin(elevation))
-    # a metre wide, pixels of 3 cm
+    # One metre wide, with pixels of 3 cm.
     assert 0.1 < np.mean((expected > 0.0) & (expected < 1.0)) < 0.3
     np.testing.assert_allclose(lit, expected, atol=0.01)
 
 
 @pytest.mark.parametrize("elevation", [-0.2, 0.15, 1.0, np.pi / 2])
 def test_hidden_positions_agree_with_all_triangles(elevation: float) -> None:
-    """Triangles of all sizes and any shape, some of them upright, in bodies that overlap."""
+    """Triangles of all sizes and shapes, some of them upright, in overlapping bodies."""
     rng = np.random.default_rng(8)
     middles = rng.uniform(-5.0, 5.0, (60, 1, 1, 3))
     triangles = (middles + 10.0 ** rng.uniform(-1.5, 0.3, (60, 1, 1, 1)) * rng.normal(size=(60, 7, 3, 3))).reshape(
@@ -123,29 +123,29 @@ def test_hidden_positions_agree_with_all_triangles(elevation: float) -> None:
     names = np.repeat(np.arange(60, dtype=np.int32), 7)
     objects = Objects.of_mesh(triangles, np.zeros_like(triangles), faces, names, ALBEDO)
     sun = Sun(direction(0.7, elevation))
-    places = rng.uniform(-9.0, 9.0, (3000, 3))
+    positions = rng.uniform(-9.0, 9.0, (3000, 3))
     casters = casters_towards(objects, sun)
-    found = np.empty(len(places), dtype=np.bool_)
-    sun_hidden(casters, *places.T.copy(), found)
-    rays = np.broadcast_to(sun.direction, places.shape)
-    expected = np.isfinite(meet_triangles(objects, places, rays, nearest=0.0))
+    result = np.empty(len(positions), dtype=np.bool_)
+    sun_hidden(casters, *positions.T.copy(), result)
+    rays = np.broadcast_to(sun.direction, positions.shape)
+    expected = np.isfinite(meet_triangles(objects, positions, rays, nearest=0.0))
     assert 0.1 < np.mean(expected) < 0.9
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(result, expected)
 
 
 @pytest.mark.parametrize("azimuth_deg", [20.0, 110.0, 200.0, 290.0, 45.0])
 def test_partial_shadow_sweep_equals_the_whole_sweep(rough: Surface, azimuth_deg: float) -> None:
-    """Also over the border of the terrain's period."""
+    """Includes the border of the terrain period."""
     sun = Sun(direction(np.radians(azimuth_deg), np.radians(35.0)))
     heights = height_range(rough.levels[0])
     shown = (-40.0, 60.0, 700.0, 760.0)
     everywhere, in_view = ground_shadow(rough, sun, heights), ground_shadow(rough, sun, heights, shown)
-    whole, part, spacing = everywhere.height, in_view.height, everywhere.spacing
+    full, part, spacing = everywhere.height, in_view.height, everywhere.spacing
     assert everywhere[2:] == in_view[2:]
-    assert len(part) < len(whole)
+    assert len(part) < len(full)
     x, y = (np.arange(int(a / spacing) - 1, int(b / spacing) + 3) for a, b in (shown[:2], shown[2:]))
     rows, columns = (x, y) if everywhere.along_x else (y, x)
-    of_whole, of_part = (each[np.ix_(rows & (len(each) - 1), columns & (len(each) - 1))] for each in (whole, part))
+    of_whole, of_part = (each[np.ix_(rows & (len(each) - 1), columns & (len(each) - 1))] for each in (full, part))
     np.testing.assert_array_equal(of_part, of_whole)
 
 
@@ -168,7 +168,7 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(rough: Surface, azimuth_de
     assert slope_bounds(rough, just_above) == steepest
     assert not sun_over_slopes(just_below, steepest)
     assert slope_bounds(rough, just_below) == (np.inf, np.inf)
-    # the sweep finds no shadow either, but for the rounding of its numbers
+    # The sweep finds no shadow except for rounding.
     shadow = ground_shadow(rough, just_above, height_range(rough.levels[0]))
     heights = rough.levels[shadow.level][..., 0].T if shadow.along_x else rough.levels[shadow.level][..., 0]
     assert np.all(shadow.height < heights + 1e-3)
@@ -186,8 +186,8 @@ def test_ground_in_cones_bounds_all_positions_in_them() -> None:
     rays = axis + np.tan(half) * rng.uniform(-1.0, 1.0, (20000, 3))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     rays = rays[rays @ axis >= np.cos(half)]
-    places = tip + (rng.uniform(0.0, 1.0, len(rays)) ** 0.1 * (-0.4 - tip[2]) / rays[:, 2])[:, None] * rays
+    positions = tip + (rng.uniform(0.0, 1.0, len(rays)) ** 0.1 * (-0.4 - tip[2]) / rays[:, 2])[:, None] * rays
     low, high = np.array(bounds).reshape(2, 2).T
-    assert np.all((places[:, :2] > low) & (places[:, :2] < high))
-    assert np.all(high - low < 1.1 * np.ptp(np.vstack([places, tip])[:, :2], axis=0))
+    assert np.all((positions[:, :2] > low) & (positions[:, :2] < high))
+    assert np.all(high - low < 1.1 * np.ptp(np.vstack([positions, tip])[:, :2], axis=0))
     assert ground_in_cones([(tip, direction(2.0, -0.1), half)], -0.4) is None

@@ -1,4 +1,4 @@
-"""Places side by side: the same numbers as one by one."""
+"""Test of vectorised spline evaluation: equal to single positions."""
 
 import numpy as np
 
@@ -11,9 +11,9 @@ SAMPLES = np.random.default_rng(3).normal(size=(SIDE, SIDE, 2)).astype(np.float3
 SURFACE = Surface.from_samples(SAMPLES, SPACING_M)
 
 
-def test_spline_of_places_on_levels_of_their_own() -> None:
+def test_vectorised_spline_equals_single_evaluation() -> None:
     rng = np.random.default_rng(4)
-    # within the terrain, on its border and beyond it, for it repeats
+    # Inside the terrain, on its border and beyond (periodic).
     x, y = rng.uniform(-40.0, 40.0, (2, ROW))
     x[:4], y[:4] = [0.0, -0.25, 31.75, 32.0], [31.9, 0.0, -0.1, 16.0]
     level_of = rng.integers(0, len(SURFACE.levels), STRIP)

@@ -1,4 +1,4 @@
-"""Pixels shared among threads: every one once, and the same picture to the bit."""
+"""Tests of the division of pixels among threads: each pixel once, and bitwise equal images."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_exception_in_a_thread_is_raised() -> None:
         run_in_parts(fail, 100_000, 2)
 
 
-def test_pictures_do_not_depend_on_threads(
+def test_images_do_not_depend_on_threads(
     renderer: Renderer, rough: Surface, descent_camera: Callable[..., Cahvor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rock = PlacedRock(name="rock", east_m=380.0, north_m=205.0, diameter_m=30.0, shape=3, yaw_deg=20.0)
@@ -48,7 +48,7 @@ def test_pictures_do_not_depend_on_threads(
     scene = Scene(
         rough, (380.0, 200.0), light, Photometry(), rocks, Texture(3.0, (0.03,) * 6), Texture(0.5, (0.05,) * 3)
     )
-    rays = PixelRays.of(descent_camera().cropped(400, 400, (161, 161)))
+    rays = PixelRays.of(descent_camera().crop(400, 400, (161, 161)))
     pose = rigid(Rotation.from_euler("x", 4.0, degrees=True), np.array([380.0, 200.0, 400.0]))
     monkeypatch.setattr("marsyard.sim.render.renderer.run_in_parts", partial(run_in_parts, threads=1))
     alone = renderer.render(scene, rays, pose)

@@ -1,4 +1,4 @@
-"""Motions in closed form on which instruments are tested."""
+"""Closed-form motions for tests of instruments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def uniform_motion(rows_s: float, columns_s: float) -> ImageMotion:
 
 @dataclass(frozen=True)
 class Swaying:
-    """Spins about the vertical, nods about its own x axis, flies on a parabola and sways to the east."""
+    """Rotates about the vertical, pitches about its own x axis, moves on a parabola and oscillates to the east."""
 
     spin_rad_s: float = 0.0
     nod_rad: float = 0.0

@@ -1,3 +1,5 @@
+"""Tests of inertial errors during the approach against a propagation at the full rate."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -11,15 +13,15 @@ from marsyard.sim.sensor import Approach, ApproachParameters, Imu, ImuIncrements
 from marsyard.sim.sensor.imu import true_increments
 from tests.sim.sensor.test_imu import perfect
 
-#: Short, so that it can be measured at the full rate.
+#: A short profile that can be measured at the full rate.
 SHORT = ApproachParameters(
     attitude_sd_deg=0.0, velocity_sd_m_s=0.0, cruise_s=60.0, entry_s=40.0, parachute_s=25.0, upright_s=15.0
 )
 
 
 @dataclass(frozen=True)
-class Flown:
-    """The nominal profile as a motion: attitude, rate and force, without position and gravity."""
+class ProfileMotion:
+    """The nominal profile as a motion: attitude, rate and force without position and gravity."""
 
     approach: Approach
     span_s: tuple[float, float] = (-np.inf, np.inf)
@@ -35,11 +37,11 @@ class Flown:
         )
 
 
-def _slow(imu: Imu, approach: Approach, seeds: range) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Errors of attitude and velocity at the end, from measurements of the profile at the full rate."""
+def _propagate_at_full_rate(imu: Imu, approach: Approach, seeds: range) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Final errors of attitude and velocity from measurements of the profile at the full rate."""
     start = approach.attitudes(np.array([approach.start_s]))[0]
     boundaries = imu.boundaries(approach.start_s, approach.end_s)
-    angles, velocities = true_increments(Flown(approach), boundaries)
+    angles, velocities = true_increments(ProfileMotion(approach), boundaries)
     exact = ImuIncrements(boundaries, 1.0 / imu.parameters.rate_hz, angles, velocities)
     true = InertialSolution.propagate(exact, start, np.zeros(3), 0.0)
     errors = []
@@ -50,9 +52,9 @@ def _slow(imu: Imu, approach: Approach, seeds: range) -> list[tuple[np.ndarray, 
             delta_angles_rad=imu.gyro.measure(angles, boundaries, rng),
             delta_velocities_m_s=imu.accelerometer.measure(velocities, boundaries, rng),
         )
-        believed = InertialSolution.propagate(measured, start, np.zeros(3), 0.0)
-        attitude = (believed.attitudes[-1] * true.attitudes[-1].inv()).as_rotvec()
-        errors.append((attitude, believed.velocities_m_s[-1] - true.velocities_m_s[-1]))
+        estimate = InertialSolution.propagate(measured, start, np.zeros(3), 0.0)
+        attitude = (estimate.attitudes[-1] * true.attitudes[-1].inv()).as_rotvec()
+        errors.append((attitude, estimate.velocities_m_s[-1] - true.velocities_m_s[-1]))
     return errors
 
 
@@ -62,13 +64,13 @@ def test_rates_are_the_derivative_of_attitude() -> None:
     h = 1e-4
     before, after = approach.attitudes(times - h), approach.attitudes(times + h)
     differences = (before.inv() * after).as_rotvec() / (2.0 * h)
-    # but at the corners of the profile
+    # Except at the corners of the profile.
     knots = np.array([-2.0 - 25.0 - 40.0, -2.0 - 25.0, -2.0 - 10.0])
     smooth = np.abs(times[:, None] - knots).min(axis=1) > 2.0 * h
     np.testing.assert_allclose(approach.body_rates(times)[smooth], differences[smooth], atol=1e-6)
 
 
-def test_the_profile_loses_the_stated_speed_and_ends_upright() -> None:
+def test_profile_has_specified_deceleration_and_ends_upright() -> None:
     p = ApproachParameters()
     approach = Approach(p, 0.0)
     times = np.linspace(approach.start_s, 0.0, 200001)
@@ -77,7 +79,7 @@ def test_the_profile_loses_the_stated_speed_and_ends_upright() -> None:
     lost = np.trapezoid(forces[:, 2], times)
     assert lost == pytest.approx(p.entry_speed_m_s + p.parachute_speed_m_s + carried, rel=1e-3)
     assert approach.attitudes(np.array([0.0]))[0].apply([0.0, 0.0, -1.0])[2] == pytest.approx(-1.0)
-    # towards the heading and 12 deg below the horizon at first
+    # Initially towards the heading and 12 deg below the horizon.
     first = approach.attitudes(np.array([approach.start_s]))[0].apply([0.0, 0.0, -1.0])
     assert np.degrees(np.arctan2(first[0], first[1])) == pytest.approx(p.heading_deg)
     assert np.degrees(np.arccos(-first[2])) == pytest.approx(p.entry_off_nadir_deg)
@@ -97,10 +99,10 @@ def test_constant_errors_grow_as_in_a_full_rate_propagation() -> None:
     )
     approach = Approach(SHORT, -2.0)
     for seed in range(3):
-        imu = Imu.drawn(constant, (approach.start_s, 0.0), np.random.default_rng(seed))
+        imu = Imu.draw(constant, (approach.start_s, 0.0), np.random.default_rng(seed))
         fast = approach.errors(imu, np.random.default_rng(0))
-        [(attitude, velocity)] = _slow(imu, approach, range(1))
-        # first order in errors of up to 10 mrad, steps of 2.4 deg of spin
+        [(attitude, velocity)] = _propagate_at_full_rate(imu, approach, range(1))
+        # First order in errors of up to 10 mrad, with steps of 2.4 deg of spin.
         np.testing.assert_allclose(fast.attitude_rad, attitude, atol=0.01 * float(np.linalg.norm(attitude)))
         np.testing.assert_allclose(fast.velocity_m_s, velocity, atol=0.01 * float(np.linalg.norm(velocity)))
 
@@ -108,42 +110,42 @@ def test_constant_errors_grow_as_in_a_full_rate_propagation() -> None:
 def test_noise_grows_as_in_a_full_rate_propagation() -> None:
     noisy = perfect(rate_hz=20.0, angular_random_walk_deg_sqrt_h=1.0, velocity_random_walk_ug_sqrt_hz=3000.0)
     approach = Approach(SHORT, -2.0)
-    imu = Imu.drawn(noisy, (approach.start_s, 0.0), np.random.default_rng(0))
+    imu = Imu.draw(noisy, (approach.start_s, 0.0), np.random.default_rng(0))
     fast = [approach.errors(imu, np.random.default_rng(seed)) for seed in range(400)]
-    slow = _slow(imu, approach, range(120))
+    slow = _propagate_at_full_rate(imu, approach, range(120))
     attitude_fast, velocity_fast = (
         np.std([e.attitude_rad for e in fast], axis=0),
         np.std([e.velocity_m_s for e in fast], axis=0),
     )
     attitude_slow, velocity_slow = (np.std([s[k] for s in slow], axis=0) for k in (0, 1))
-    # 400 and 120 values: their ratio is known to 7.4 %; tolerance three times that
+    # 400 and 120 values determine the ratio to 7.4 %; the tolerance is three times that.
     np.testing.assert_allclose(attitude_fast / attitude_slow, 1.0, atol=0.22)
     np.testing.assert_allclose(velocity_fast / velocity_slow, 1.0, atol=0.22)
     np.testing.assert_allclose(np.degrees(attitude_fast), np.sqrt(125.0 / 3600.0), rtol=0.12)
 
 
-def test_spin_turns_a_scale_error_into_a_turn_about_the_flight_at_cruise() -> None:
+def test_scale_error_rotates_attitude_about_spin_axis() -> None:
     p = SHORT.model_copy(update={"cruise_s": 900.0, "spin_scale_ppm": 20.0})
     approach = Approach(p, 0.0)
-    imu = Imu.drawn(perfect(gyro_scale_ppm=1e4), (approach.start_s, 0.0), np.random.default_rng(0))
+    imu = Imu.draw(perfect(gyro_scale_ppm=1e4), (approach.start_s, 0.0), np.random.default_rng(0))
     calibrated = approach.calibrate(imu, np.random.default_rng(1))
     flat = Approach(p.model_copy(update={"entry_off_nadir_deg": 0.0, "deploy_off_nadir_deg": 0.0}), 0.0)
     error = flat.errors(calibrated, np.random.default_rng(0)).attitude_rad
-    turned = 2.0 * np.pi / 30.0 * 940.0
+    rotated = 2.0 * np.pi / 30.0 * 940.0
     assert abs(calibrated.gyro.scale[2]) < 1e-4
-    assert error[2] == pytest.approx(calibrated.gyro.scale[2] * turned, rel=1e-9)
+    assert error[2] == pytest.approx(calibrated.gyro.scale[2] * rotated, rel=1e-9)
     np.testing.assert_array_equal(calibrated.gyro.scale[:2], imu.gyro.scale[:2])
 
 
-def test_attitude_at_the_descent_is_known_to_a_few_tenths_of_a_degree() -> None:
+def test_descent_attitude_error_is_a_few_tenths_of_a_degree() -> None:
     approach = Approach(ApproachParameters(), -2.0)
     errors = []
     for seed in range(150):
         rng = np.random.default_rng(seed)
-        imu = approach.calibrate(Imu.drawn(ImuParameters(), (approach.start_s, 0.0), rng), rng)
+        imu = approach.calibrate(Imu.draw(ImuParameters(), (approach.start_s, 0.0), rng), rng)
         errors.append(approach.errors(imu, rng).attitude_rad)
     spread = np.degrees(np.std(errors, axis=0))
-    # 1 deg/h for 1140 s along the spin axis, 20 ppm of 38 turns: 0.32 and 0.27 deg about the flight's direction at
-    # entry; across it the bias averages out until the parachute opens
+    # 1 deg/h for 1140 s along the spin axis and 20 ppm of 38 turns give 0.32 and 0.27 deg about the entry direction.
+    # Across the axis the bias averages out until the parachute opens.
     assert 0.3 < spread[0] < 0.55
     assert spread[1:].max() < 0.25

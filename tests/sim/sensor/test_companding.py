@@ -1,3 +1,5 @@
+"""Tests of square-root companding of image counts."""
+
 import numpy as np
 import pytest
 
@@ -5,27 +7,27 @@ from marsyard.sim.sensor.detector import compand, compression_table, expand, exp
 
 
 @pytest.mark.parametrize("full_scale", [255, 1023, 4095])
-def test_round_trip(full_scale: int) -> None:
+def test_companding_round_trip_is_within_half_a_step(full_scale: int) -> None:
     codes = np.arange(256, dtype=np.uint8)[None]
     np.testing.assert_array_equal(compand(expand(codes, full_scale), full_scale), codes)
     counts = np.arange(full_scale + 1, dtype=np.uint16)[None]
     error = np.abs(expand(compand(counts, full_scale), full_scale).astype(int) - counts)
     step = np.gradient(expansion_table(full_scale).astype(float))[compression_table(full_scale)]
-    # the last code has half a step only
+    # The last code has only half a step.
     assert (error <= 0.5 * step + 1.0)[counts < expansion_table(full_scale)[253]].all()
-    # twelve bits in eight: the widest step is 32 counts, and the first ones are single counts
+    # Twelve bits in eight: the widest step is 32 counts, the first steps are single counts.
     assert error.max() <= full_scale / 255 * 1.1
     assert error[0, :2].max() == 0
 
 
-def test_steps_grow_as_the_square_root() -> None:
+def test_step_width_grows_with_square_root_of_signal() -> None:
     steps = np.diff(expansion_table(4095).astype(float))
     middle = expansion_table(4095)[1:-1].astype(float)
     widths = 0.5 * (steps[1:] + steps[:-1])
-    # 31.9 counts at full scale
+    # 31.9 counts at full scale.
     np.testing.assert_allclose(widths[100:-2], 31.9 * np.sqrt((middle[100:-2] + 4.3) / 4099.0), atol=1.5)
 
 
-def test_refuses_what_needs_no_companding() -> None:
+def test_small_full_scale_is_rejected() -> None:
     with pytest.raises(ValueError, match="no companding"):
         compression_table(127)

@@ -1,4 +1,4 @@
-"""Detectors from a datasheet: against the figures that follow from them by hand, and the presets that we have."""
+"""Tests of detectors from datasheets, against manual calculation and the presets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from marsyard.sim.sensor import DetectorChoice, DetectorParameters, preset, read_datasheet
 
 CHOICE: TypeAdapter[DetectorParameters] = TypeAdapter(DetectorChoice)
-#: Sony IMX265 as a camera's maker states it by EMVA 1288 (rounded), behind 16 mm f/4.
+#: Sony IMX265 as specified by a camera manufacturer by EMVA 1288 (rounded), behind 16 mm f/4.
 SHEET = """name = "Sony IMX265, f/4"
 pixel_pitch_um = 3.45
 full_well_e = 10500
@@ -31,50 +31,50 @@ transmission = 0.9
 """
 
 
-def written(folder: Path, text: str = SHEET) -> Path:
+def write_sheet(folder: Path, text: str = SHEET) -> Path:
     path = folder / "sensor.toml"
     path.write_text(text)
     return path
 
 
-def test_figures_follow(tmp_path: Path) -> None:
-    p = read_datasheet(written(tmp_path)).parameters()
+def test_parameters_follow_from_the_datasheet(tmp_path: Path) -> None:
+    p = read_datasheet(write_sheet(tmp_path)).parameters()
     assert p.gain_e_dn == pytest.approx(10500 / 4096)
     assert p.rows_summed == 1
     assert p.transfer_row_s == p.clear_row_s == 0.0
     assert p.readout_row_s == pytest.approx(0.0512 / 1536)
-    # the dark current at the temperature at which it is stated
+    # The dark current at its specified temperature.
     assert p.temperature_c == 20.0
     assert p.dark_e_s * p.dark_growth == pytest.approx(1.0)
-    # diffraction: about 550 nm x 4 / 3.45 um
+    # Diffraction: about 550 nm x 4 / 3.45 um.
     assert p.optics.diffraction_px == pytest.approx(0.55 * 4 / 3.45, rel=0.02)
-    # radiance factor 0.3 fills 60 % of the well
+    # A radiance factor of 0.3 fills 60 % of the full well.
     assert 0.3 * p.responsivity_e_s * p.exposure_s == pytest.approx(0.6 * 10500)
 
 
-def test_responsivity_is_the_suns_photons(tmp_path: Path) -> None:
-    """ASTM E490's sunlight between 420 and 680 nm is 475 W/m2; from a photon's mean energy, at 550 nm, all follows."""
-    p = read_datasheet(written(tmp_path, "sun_au = 1.0\n" + SHEET)).parameters()
+def test_responsivity_counts_solar_photons(tmp_path: Path) -> None:
+    """ASTM E490 gives 475 W/m2 between 420 and 680 nm; the mean photon energy is that of 550 nm."""
+    p = read_datasheet(write_sheet(tmp_path, "sun_au = 1.0\n" + SHEET)).parameters()
     photons = 475.0 / (6.62607015e-34 * 2.99792458e8 / 550e-9)
     by_hand = 0.65 * 0.9 * (3.45e-6) ** 2 * photons / (4.0 * 4.0**2)
-    # the sun is taken for a black body, which is up to 9 % fainter in the green
+    # The sun is modelled as a black body, which is up to 9 % fainter in the green.
     assert p.responsivity_e_s == pytest.approx(by_hand, rel=0.1)
-    # and the detector says for which sun that holds
+    # The detector states its sun.
     assert p.sunlight == 1.0
-    elsewhere = read_datasheet(written(tmp_path, "sun_au = 3.0\n" + SHEET)).parameters()
+    elsewhere = read_datasheet(write_sheet(tmp_path, "sun_au = 3.0\n" + SHEET)).parameters()
     assert elsewhere.responsivity_e_s / elsewhere.sunlight == pytest.approx(p.responsivity_e_s)
 
 
-def test_a_flat_curve_is_the_mean(tmp_path: Path) -> None:
+def test_flat_curve_equals_the_mean(tmp_path: Path) -> None:
     curve = SHEET.replace("quantum_efficiency = 0.65\n", "").replace(
         "[lens]", "[quantum_efficiency]\nwavelength_nm = [300.0, 900.0]\nefficiency = [0.65, 0.65]\n\n[lens]"
     )
-    mean = read_datasheet(written(tmp_path)).parameters()
-    assert read_datasheet(written(tmp_path, curve)).parameters() == mean
+    mean = read_datasheet(write_sheet(tmp_path)).parameters()
+    assert read_datasheet(write_sheet(tmp_path, curve)).parameters() == mean
 
 
-def test_the_mer_ccd_from_its_figures(tmp_path: Path) -> None:
-    """The preset's detector by the datasheet's way: Maki et al. 2003, and the assumed curve of quantum efficiency."""
+def test_mer_ccd_from_datasheet_matches_the_preset(tmp_path: Path) -> None:
+    """The preset's detector calculated from Maki et al. 2003 and the assumed quantum efficiency curve."""
     points = [15, 22, 28, 33, 38, 42, 43, 40, 34, 27, 19, 11, 5, 2, 0]
     text = f"""pixel_pitch_um = 12.0
 full_well_e = 170000
@@ -96,25 +96,25 @@ efficiency = {[one / 100 for one in points]}
 f_number = 12.0
 band_nm = [600.0, 800.0]
 """
-    ours = read_datasheet(written(tmp_path, text)).parameters()
-    theirs = preset("mer-navcam").detector
+    actual = read_datasheet(write_sheet(tmp_path, text)).parameters()
+    expected = preset("mer-navcam").detector
     for name in ("responsivity_e_s", "exposure_s", "full_well_e", "gain_e_dn", "read_noise_e", "readout_row_s"):
-        assert getattr(ours, name) == pytest.approx(getattr(theirs, name), rel=1e-3), name
-    assert ours.dark_e_s * ours.dark_growth == pytest.approx(theirs.dark_e_s * theirs.dark_growth)
+        assert getattr(actual, name) == pytest.approx(getattr(expected, name), rel=1e-3), name
+    assert actual.dark_e_s * actual.dark_growth == pytest.approx(expected.dark_e_s * expected.dark_growth)
 
 
-def test_campaigns_name_the_file(tmp_path: Path) -> None:
-    path = written(tmp_path)
+def test_campaign_stores_the_datasheet(tmp_path: Path) -> None:
+    path = write_sheet(tmp_path)
     plain = CHOICE.validate_python(str(path))
     assert plain == read_datasheet(path).parameters().model_copy(update={"file": str(path)})
-    # as a campaign's folder keeps it, it is not read again
+    # The stored datasheet of the campaign folder is not read again.
     path.write_text("")
     assert CHOICE.validate_python(plain.model_dump(mode="json")) == plain
     path.write_text(SHEET)
     changed = CHOICE.validate_python({"file": str(path), "temperature_c": -10.0, "optics": {"dust_discs": 3}})
     assert (changed.temperature_c, changed.optics.dust_discs) == (-10.0, 3)
     assert changed.full_well_e == plain.full_well_e
-    # what was read stands for the file
+    # The stored values replace the file.
     stored = changed.model_dump(mode="json")
     path.unlink()
     assert CHOICE.validate_python(stored) == changed
@@ -135,16 +135,16 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("old", "new", "fault"), FAULTS, ids=[new or "nothing" for _, new, _ in FAULTS])
-def test_faults_are_named(tmp_path: Path, old: str, new: str, fault: str) -> None:
+def test_datasheet_errors_are_reported(tmp_path: Path, old: str, new: str, fault: str) -> None:
     assert old in SHEET
-    path = written(tmp_path, SHEET.replace(old, new))
+    path = write_sheet(tmp_path, SHEET.replace(old, new))
     with pytest.raises(ValidationError, match=fault) as raised:
         CHOICE.validate_python(str(path))
     assert "sensor.toml" in str(raised.value)
 
 
-def test_both_a_preset_and_a_file_are_too_much(tmp_path: Path) -> None:
+def test_preset_and_file_together_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(ValidationError, match="not both"):
-        CHOICE.validate_python({"file": str(written(tmp_path)), "preset": "xc-55"})
+        CHOICE.validate_python({"file": str(write_sheet(tmp_path)), "preset": "xc-55"})
     with pytest.raises(ValidationError, match="cannot be read"):
         CHOICE.validate_python("absent.toml")

@@ -1,4 +1,4 @@
-"""Bad pixels that a camera knows of."""
+"""Tests of the correction of known bad pixels."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import numpy as np
 from marsyard.sim.sensor.detector import fill_bad_pixels
 
 
-def test_listed_pixels_get_the_mean_of_their_good_neighbours() -> None:
+def test_listed_pixels_get_the_mean_of_good_neighbours() -> None:
     counts = (10 * np.arange(6)[:, None] + np.arange(8)[None]).astype(np.uint16)
     bad = np.zeros(counts.shape, dtype=bool)
     bad[2, 3] = bad[2, 4] = bad[0, 0] = True
-    spoilt = counts.copy()
-    spoilt[bad] = 4000
-    repaired = fill_bad_pixels(spoilt, bad)
+    corrupted = counts.copy()
+    corrupted[bad] = 4000
+    repaired = fill_bad_pixels(corrupted, bad)
     np.testing.assert_array_equal(repaired[~bad], counts[~bad])
-    # of (2, 3): the seven others about it, without (2, 4)
+    # For (2, 3): the other seven neighbours without (2, 4).
     around = [counts[i, j] for i in (1, 2, 3) for j in (2, 3, 4) if (i, j) not in ((2, 3), (2, 4))]
     assert repaired[2, 3] == np.rint(np.mean(around))
     assert repaired[0, 0] == np.rint(np.mean([counts[0, 1], counts[1, 0], counts[1, 1]]))
 
 
-def test_a_pixel_without_good_neighbours_stays_as_it_is() -> None:
+def test_pixel_without_good_neighbours_is_unchanged() -> None:
     bad = np.zeros((5, 5), dtype=bool)
     bad[1:4, 1:4] = True
     counts = np.full((5, 5), 7, dtype=np.uint16)

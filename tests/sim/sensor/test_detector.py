@@ -1,3 +1,5 @@
+"""Tests of the detector model: noise, smear, dark current, defects and calibration."""
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -14,26 +16,26 @@ PERFECT = {"response_spread": 0.0, "calibration_error": 0.0, "read_noise_e": 0.0
 DARK = np.zeros_like(EVEN)
 
 
-def _detector(shape: tuple[int, int] = EVEN.shape, **changes: object) -> Detector:
+def _make_detector(shape: tuple[int, int] = EVEN.shape, **changes: object) -> Detector:
     parameters = DetectorParameters.model_validate(PERFECT | changes)
-    return Detector.drawn(np.ones(shape, dtype=np.float32), parameters, np.random.default_rng(0))
+    return Detector.draw(np.ones(shape, dtype=np.float32), parameters, np.random.default_rng(0))
 
 
-def test_shot_noise_and_gain_by_photon_transfer() -> None:
-    """Variance over mean of flat pictures is the gain: 2 % is four standard errors of 100 pictures' variance."""
-    detector = _detector(transfer_row_s=0.0, clear_row_s=0.0, responsivity_e_s=5e7)
+def test_photon_transfer_gives_gain() -> None:
+    """Variance over mean of uniform images is the gain: 2 % is four standard errors of 100 images."""
+    detector = _make_detector(transfer_row_s=0.0, clear_row_s=0.0, responsivity_e_s=5e7)
     pictures = np.stack(
         [detector.expose(0.2 * EVEN, np.random.default_rng(seed)).astype(np.float64) for seed in range(100)]
     )
     signal_dn = pictures.mean() - detector.parameters.offset_dn
-    # rounding adds a twelfth of a count to the variance
+    # Rounding adds one twelfth of a count to the variance.
     variance = pictures.var(axis=0, ddof=1).mean() - 1.0 / 12.0
     assert signal_dn / variance == pytest.approx(detector.parameters.gain_e_dn, rel=0.02)
 
 
-def test_smear_of_a_bright_row() -> None:
-    """A packet of row r passes the rows before it on the way out, and was under the rows after it while cleared."""
-    detector = _detector(rows_summed=1, transfer_row_s=1e-5, clear_row_s=2e-6)
+def test_smear_of_a_bright_row_matches_transfer_times() -> None:
+    """A packet of row r passes the previous rows during readout and the following rows during clearing."""
+    detector = _make_detector(rows_summed=1, transfer_row_s=1e-5, clear_row_s=2e-6)
     scene = np.zeros_like(EVEN)
     scene[20] = 1.0
     charge = detector.charge(scene)
@@ -43,48 +45,48 @@ def test_smear_of_a_bright_row() -> None:
     np.testing.assert_allclose(charge[20], rate * detector.parameters.exposure_s, rtol=1e-5)
 
 
-def test_rows_are_summed_and_columns_are_not() -> None:
-    counts = _detector(rows_summed=4).expose(EVEN, np.random.default_rng(0))
+def test_only_rows_are_summed() -> None:
+    counts = _make_detector(rows_summed=4).expose(EVEN, np.random.default_rng(0))
     assert counts.shape == (16, 48)
     assert counts.dtype == np.uint16
 
 
-def test_saturates_at_full_well_and_at_full_scale() -> None:
-    counts = _detector().expose(1e3 * EVEN, np.random.default_rng(0))
+def test_signal_saturates_at_full_well_and_full_scale() -> None:
+    counts = _make_detector().expose(1e3 * EVEN, np.random.default_rng(0))
     p = DetectorParameters()
     assert (counts == min(4095, round(p.full_well_e / p.gain_e_dn + p.offset_dn))).all()
-    assert (_detector(gain_e_dn=1.0).expose(1e3 * EVEN, np.random.default_rng(0)) == 4095).all()
+    assert (_make_detector(gain_e_dn=1.0).expose(1e3 * EVEN, np.random.default_rng(0)) == 4095).all()
 
 
-def test_same_stream_same_picture() -> None:
-    detector = _detector()
+def test_equal_streams_give_equal_images() -> None:
+    detector = _make_detector()
     first = detector.expose(0.1 * EVEN, np.random.default_rng(1))
     assert (first == detector.expose(0.1 * EVEN, np.random.default_rng(1))).all()
     assert (first != detector.expose(0.1 * EVEN, np.random.default_rng(2))).any()
 
 
-def test_calibration_knows_the_response_to_its_error() -> None:
-    detector = Detector.drawn(
+def test_calibration_response_has_the_specified_error() -> None:
+    detector = Detector.draw(
         EVEN, DetectorParameters(response_spread=0.02, calibration_error=0.005), np.random.default_rng(3)
     )
     true = detector.response.reshape(16, 4, 48).mean(axis=1)
-    # 768 pixels: the spread is known to 2.6 %
+    # 768 pixels determine the spread to 2.6 %.
     assert (detector.calibration.flat_field / true).std() == pytest.approx(0.005, rel=0.1)
     assert true.std() == pytest.approx(0.02 / 2, rel=0.1)
 
 
-def test_refuses_rows_that_do_not_divide() -> None:
+def test_indivisible_rows_are_rejected() -> None:
     with pytest.raises(ValueError, match="cannot be summed"):
-        Detector.drawn(EVEN[:63], DetectorParameters(), np.random.default_rng(0))
+        Detector.draw(EVEN[:63], DetectorParameters(), np.random.default_rng(0))
 
 
-def test_smear_is_undone_by_dimes() -> None:
-    """On a still picture of the whole detector, with light down to a third and texture from pixel to pixel."""
+def test_dimes_removes_the_smear() -> None:
+    """A static image of the complete detector with light down to one third and texture between pixels."""
     rng = np.random.default_rng(5)
     large = gaussian_filter(rng.standard_normal((1024, 32)), 60.0, mode="wrap")
     fine = gaussian_filter(rng.standard_normal((1024, 32)), 1.5, mode="wrap")
     scene = (0.15 * (1.0 + 0.3 * large / large.std() + 0.08 * fine / fine.std())).clip(0.05).astype(np.float32)
-    detector = _detector(scene.shape)
+    detector = _make_detector(scene.shape)
     p = detector.parameters
 
     def delivered(charge: np.ndarray) -> np.ndarray:
@@ -95,14 +97,14 @@ def test_smear_is_undone_by_dimes() -> None:
     assert np.abs(smeared - exposed).max() > 0.2 * p.full_scale_dn
     assert smeared.max() < p.full_scale_dn
     error = remove_frame_transfer(smeared, detector.calibration, 4) - exposed
-    # bar 4: 0.2 % of full scale; rows that differ within a delivered row are what is left
+    # Requirement: 0.2 % of full scale; the residual comes from different rows within a delivered row.
     assert np.abs(error).max() < 0.002 * p.full_scale_dn
 
 
-def test_dark_current_doubles_every_six_degrees_and_grows_while_rows_wait() -> None:
-    cold, warm = (_detector(temperature_c=t).dark_charge() for t in (-34.0, -28.0))
+def test_dark_current_doubles_every_six_degrees_and_grows_in_readout() -> None:
+    cold, warm = (_make_detector(temperature_c=t).dark_charge() for t in (-34.0, -28.0))
     np.testing.assert_allclose(warm, 2.0 * cold, rtol=1e-6)
-    detector = _detector(temperature_c=0.0)
+    detector = _make_detector(temperature_c=0.0)
     p = detector.parameters
     seconds = dark_seconds(p, 64)
     assert seconds[0] == pytest.approx(p.exposure_s + 64 * p.transfer_row_s)
@@ -110,35 +112,35 @@ def test_dark_current_doubles_every_six_degrees_and_grows_while_rows_wait() -> N
     np.testing.assert_allclose(detector.dark_charge()[:, 0], 4 * p.dark_e_s * seconds, rtol=1e-6)
 
 
-def test_dark_current_is_in_the_picture_with_its_shot_noise() -> None:
-    detector = _detector(temperature_c=40.0, gain_e_dn=1.0, bits=16, offset_dn=0.0)
+def test_dark_current_adds_signal_and_shot_noise() -> None:
+    detector = _make_detector(temperature_c=40.0, gain_e_dn=1.0, bits=16, offset_dn=0.0)
     picture = detector.expose(DARK, np.random.default_rng(1)).astype(np.float64)
     expected = np.broadcast_to(detector.dark_charge(), picture.shape)
     assert (expected > 50.0).all()
-    # 768 pixels, each with a standard error of the root of its charge
+    # 768 pixels, each with a standard error of the square root of its charge.
     assert ((picture - expected) / np.sqrt(expected)).mean() == pytest.approx(0.0, abs=4.0 / np.sqrt(768))
     assert ((picture - expected) / np.sqrt(expected)).std() == pytest.approx(1.0, abs=0.1)
 
 
-def test_hot_and_dead_pixels_at_their_rates() -> None:
+def test_hot_and_dead_pixels_have_specified_rates() -> None:
     defects = DefectParameters(hot_fraction=0.01, dead_fraction=0.02, hot_e_s=5000.0)
-    detector = _detector((512, 512), defects=defects)
+    detector = _make_detector((512, 512), defects=defects)
     assert detector.hot_e_s is not None
     hot = detector.hot_e_s > 0.0
-    # 262,144 pixels: standard errors 2 % and 1.4 % of the rates, 2 % of the mean current
+    # 262,144 pixels: standard errors are 2 % and 1.4 % of the rates and 2 % of the mean current.
     assert hot.mean() == pytest.approx(0.01, rel=0.06)
     assert (detector.response == 0.0).mean() == pytest.approx(0.02, rel=0.05)
     assert detector.hot_e_s[hot].mean() == pytest.approx(5000.0, rel=0.08)
-    # the ground knows of neither
+    # The calibration contains neither.
     assert (detector.calibration.flat_field == 1.0).all()
-    warmer = _detector((512, 512), defects=defects, temperature_c=detector.parameters.temperature_c + 6.0)
+    warmer = _make_detector((512, 512), defects=defects, temperature_c=detector.parameters.temperature_c + 6.0)
     np.testing.assert_allclose(warmer.dark_charge(), 2.0 * detector.dark_charge(), rtol=1e-5)
 
 
 def test_bursts_disturb_runs_along_the_rows() -> None:
     scene = 0.1 * np.ones((256, 64), dtype=np.float32)
-    quiet = _detector(scene.shape, rows_summed=1)
-    disturbed = _detector(
+    quiet = _make_detector(scene.shape, rows_summed=1)
+    disturbed = _make_detector(
         scene.shape, rows_summed=1, bursts=BurstParameters(bursts=3.0, length_px=200.0, amplitude_dn=500.0)
     )
     pairs = [
@@ -146,51 +148,52 @@ def test_bursts_disturb_runs_along_the_rows() -> None:
         for n in range(60)
     ]
     changed = np.stack([(a != b).reshape(-1) for a, b in pairs])
-    # 180 bursts of 200 pixels, known to 10 %, less those that the picture's end cuts (1 %)
+    # 180 bursts of 200 pixels determine the rate to 10 %, minus those clipped by the image border (1 %).
     assert changed.sum() / 60 == pytest.approx(600.0, rel=0.25)
-    # each burst is one run: few places where a disturbed pixel follows a quiet one (some noise rounds to nothing)
+    # Each burst is one run: few disturbed pixels follow a quiet pixel (some noise rounds to zero).
     starts = (changed[:, 1:] & ~changed[:, :-1]).sum() / 60
     assert starts < 10.0
 
 
-def test_companding_costs_less_than_shot_noise() -> None:
+def test_companding_noise_is_below_shot_noise() -> None:
     scene = np.tile(np.linspace(0.02, 0.25, 48, dtype=np.float32), (64, 1))
     plain, companded = (
-        _detector(companded=value).expose(scene, np.random.default_rng(3)).astype(np.float64) for value in (False, True)
+        _make_detector(companded=value).expose(scene, np.random.default_rng(3)).astype(np.float64)
+        for value in (False, True)
     )
     assert len(np.unique(companded)) < len(np.unique(plain))
     signal = plain - 20.0
     assert (np.abs(companded - plain) <= np.sqrt(signal * 41.5) / 41.5 * 2.0 + 1.0).all()
 
 
-def test_motion_changes_the_picture_and_stays_reproducible() -> None:
+def test_motion_blur_is_reproducible() -> None:
     scene = np.random.default_rng(2).random(EVEN.shape, dtype=np.float32) * np.float32(0.2)
-    detector = _detector()
+    detector = _make_detector()
     moving = uniform_motion(900.0, -700.0)
     first = detector.expose(scene, np.random.default_rng(1), moving)
     np.testing.assert_array_equal(first, detector.expose(scene, np.random.default_rng(1), moving))
-    still = detector.expose(scene, np.random.default_rng(1))
-    assert (first != still).mean() > 0.5
-    np.testing.assert_array_equal(still, detector.expose(scene, np.random.default_rng(1), uniform_motion(0.0, 0.0)))
+    static = detector.expose(scene, np.random.default_rng(1))
+    assert (first != static).mean() > 0.5
+    np.testing.assert_array_equal(static, detector.expose(scene, np.random.default_rng(1), uniform_motion(0.0, 0.0)))
 
 
-def test_exposure_can_be_set_and_is_stated() -> None:
-    detector = _detector().with_exposure(0.002)
+def test_exposure_is_set_and_reported() -> None:
+    detector = _make_detector().with_exposure(0.002)
     assert detector.parameters.exposure_s == detector.calibration.exposure_s == 0.002
     with pytest.raises(ValueError, match="exposure_s"):
-        _detector().with_exposure(-1.0)
+        _make_detector().with_exposure(-1.0)
 
 
-def test_a_subframe_has_the_pixels_of_the_whole() -> None:
+def test_subframe_has_the_pixels_of_the_full_frame() -> None:
     parameters = DetectorParameters(
         transfer_row_s=0.0, clear_row_s=0.0, optics=SHARP, defects=DefectParameters(hot_fraction=0.02)
     )
-    whole = Detector.drawn(EVEN, parameters, np.random.default_rng(6))
-    part = whole.window(8, 16, (24, 32))
+    full = Detector.draw(EVEN, parameters, np.random.default_rng(6))
+    part = full.window(8, 16, (24, 32))
     scene = np.random.default_rng(2).random(EVEN.shape, dtype=np.float32)
-    np.testing.assert_array_equal(part.charge(scene[16:48, 8:32]), whole.charge(scene)[16:48, 8:32])
-    np.testing.assert_array_equal(part.calibration.flat_field, whole.calibration.flat_field[4:12, 8:32])
+    np.testing.assert_array_equal(part.charge(scene[16:48, 8:32]), full.charge(scene)[16:48, 8:32])
+    np.testing.assert_array_equal(part.calibration.flat_field, full.calibration.flat_field[4:12, 8:32])
     assert part.expose(scene[16:48, 8:32], np.random.default_rng(0)).shape == (8, 24)
-    for wrong in ((0, 2, (8, 8)), (0, 0, (8, 6)), (44, 0, (8, 8)), (0, -4, (8, 8)), (0, 0, (0, 8))):
+    for invalid in ((0, 2, (8, 8)), (0, 0, (8, 6)), (44, 0, (8, 8)), (0, -4, (8, 8)), (0, 0, (0, 8))):
         with pytest.raises(ValueError, match="a subframe of"):
-            whole.window(*wrong)
+            full.window(*invalid)

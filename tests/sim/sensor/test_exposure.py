@@ -1,3 +1,5 @@
+"""Tests of automatic exposure."""
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -8,44 +10,46 @@ GROUND = (0.1 + 0.02 * np.random.default_rng(0).random((128, 96))).astype(np.flo
 ASKED = AutoExposureParameters()
 
 
-def _detector(exposure_s: float) -> Detector:
+def _make_detector(exposure_s: float) -> Detector:
     parameters = DetectorParameters(exposure_s=exposure_s, rows_summed=1, transfer_row_s=0.0, clear_row_s=0.0)
-    return Detector.drawn(np.ones_like(GROUND), parameters, np.random.default_rng(1))
+    return Detector.draw(np.ones_like(GROUND), parameters, np.random.default_rng(1))
 
 
 @pytest.mark.parametrize("start_s", [0.0005, 0.02, 0.5])
-def test_converges_from_too_dark_and_too_bright(start_s: float) -> None:
-    found = auto_expose(_detector(start_s), GROUND, ASKED, np.random.default_rng(2))
-    assert found.converged
-    assert len(found.exposures_s) <= 5
-    picture = found.detector.expose(GROUND, np.random.default_rng(3))
+def test_auto_exposure_converges_from_dark_and_bright(start_s: float) -> None:
+    result = auto_expose(_make_detector(start_s), GROUND, ASKED, np.random.default_rng(2))
+    assert result.converged
+    assert len(result.exposures_s) <= 5
+    picture = result.detector.expose(GROUND, np.random.default_rng(3))
     assert np.percentile(picture, 98.0) == pytest.approx(0.75 * 4095, rel=ASKED.tolerance + 0.01)
-    assert found.detector.calibration.exposure_s == found.exposures_s[-1]
+    assert result.detector.calibration.exposure_s == result.exposures_s[-1]
 
 
-def test_a_part_of_the_picture_is_exposed_for_itself() -> None:
-    """Under a bright sky the ground is dark unless it is judged alone."""
+def test_exposure_can_use_a_part_of_the_image() -> None:
+    """Under a bright sky the ground is dark unless exposure uses the ground only."""
     scene = GROUND.copy()
     scene[:40] = 0.6
-    whole = auto_expose(_detector(0.01), scene, ASKED, np.random.default_rng(2))
-    part = auto_expose(_detector(0.01), scene, ASKED, np.random.default_rng(2), region=(slice(60, 110), slice(20, 70)))
-    assert whole.converged
+    full = auto_expose(_make_detector(0.01), scene, ASKED, np.random.default_rng(2))
+    part = auto_expose(
+        _make_detector(0.01), scene, ASKED, np.random.default_rng(2), region=(slice(60, 110), slice(20, 70))
+    )
+    assert full.converged
     assert part.converged
-    assert part.exposures_s[-1] / whole.exposures_s[-1] == pytest.approx(0.6 / 0.12, rel=0.12)
+    assert part.exposures_s[-1] / full.exposures_s[-1] == pytest.approx(0.6 / 0.12, rel=0.12)
 
 
-def test_says_when_it_cannot() -> None:
+def test_unreachable_exposure_is_reported() -> None:
     short = AutoExposureParameters(max_exposure_s=0.001)
-    found = auto_expose(_detector(0.001), GROUND, short, np.random.default_rng(2))
-    assert not found.converged
-    assert found.exposures_s == (0.001,)
-    hurried = auto_expose(_detector(0.5), GROUND, AutoExposureParameters(pictures=1), np.random.default_rng(2))
+    result = auto_expose(_make_detector(0.001), GROUND, short, np.random.default_rng(2))
+    assert not result.converged
+    assert result.exposures_s == (0.001,)
+    hurried = auto_expose(_make_detector(0.5), GROUND, AutoExposureParameters(pictures=1), np.random.default_rng(2))
     assert not hurried.converged
     assert hurried.detector.parameters.exposure_s < 0.5
 
 
-def test_refuses_nonsense() -> None:
+def test_invalid_parameters_are_rejected() -> None:
     with pytest.raises(ValidationError, match="longer than the longest"):
         AutoExposureParameters(min_exposure_s=0.1, max_exposure_s=0.01)
     with pytest.raises(ValueError, match="without pixels"):
-        auto_expose(_detector(0.01), GROUND, ASKED, np.random.default_rng(0), region=(slice(0, 0), slice(0, 0)))
+        auto_expose(_make_detector(0.01), GROUND, ASKED, np.random.default_rng(0), region=(slice(0, 0), slice(0, 0)))

@@ -1,3 +1,5 @@
+"""Tests of the inertial measurement unit: random walk, bias, scale, rounding and temperature."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -8,7 +10,7 @@ from marsyard.sim.sensor import Imu, ImuParameters, WarmUp
 from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, STANDARD_GRAVITY_M_S2
 from tests.sim.sensor.motions import GRAVITY, Swaying
 
-#: No error but those that a test asks for.
+#: An ideal unit; tests add single errors.
 PERFECT = {name: 0.0 for name in ImuParameters.model_fields if name.startswith(("gyro_", "accelerometer_"))} | {
     "gyro_wander_s": 100.0,
     "accelerometer_wander_s": 60.0,
@@ -24,7 +26,7 @@ def perfect(**errors: object) -> ImuParameters:
 
 
 def _allan_deviation(rates: Float64[np.ndarray, "n channels"], samples: int) -> float:
-    """Of successive means over so many samples, all channels together (IEEE Std 952, annex C)."""
+    """Allan deviation of means over this number of samples, all channels together (IEEE Std 952, annex C)."""
     count = len(rates) // samples
     means = rates[: count * samples].reshape(count, samples, -1).mean(axis=1)
     return float(np.sqrt(0.5 * np.mean(np.diff(means, axis=0) ** 2)))
@@ -37,48 +39,48 @@ def test_allan_deviation_shows_random_walk_and_bias_instability() -> None:
     )
     rng = np.random.default_rng(0)
     hours = 12.0 * 3600.0
-    imu = Imu.drawn(parameters, (0.0, hours), rng)
+    imu = Imu.draw(parameters, (0.0, hours), rng)
     rates = imu.increments(STILL, 0.0, hours, rng).delta_angles_rad * rate
 
     def expected(tau: float) -> float:
         x = tau / correlation
-        # white noise N^2 / tau, and an exponentially correlated bias (IEEE Std 952, eq. C.14, with q T = 2 sd^2)
+        # White noise N^2 / tau and an exponentially correlated bias (IEEE Std 952, eq. C.14, with q T = 2 sd^2).
         markov = (wander * DEG_H) ** 2 / x**2 * (2.0 * x - 3.0 + 4.0 * np.exp(-x) - np.exp(-2.0 * x))
         return float(np.sqrt((walk * DEG_SQRT_H) ** 2 / tau + markov))
 
-    # 5 s: random walk alone (slope -1/2); 190 s: the bias's greatest instability. From 3 x 43200 / tau means they are
-    # known to about sqrt(tau / (3 x 43200)): 0.6 % and 3.8 %; tolerances are three times that, and 1 % for the knots
+    # 5 s: random walk only (slope -1/2); 190 s: maximum of the bias instability. The means determine the deviations to
+    # sqrt(tau / (3 x 43200)): 0.6 % and 3.8 %. Tolerances are three times that, plus 1 % for the knots.
     assert expected(5.0) == pytest.approx(walk * DEG_SQRT_H / np.sqrt(5.0), rel=0.01)
     assert _allan_deviation(rates, int(5.0 * rate)) == pytest.approx(expected(5.0), rel=0.03)
     assert _allan_deviation(rates, int(190.0 * rate)) == pytest.approx(expected(190.0), rel=0.12)
     assert expected(190.0) > 0.618 * wander * DEG_H
 
 
-def test_a_still_unit_without_errors_feels_gravity_alone() -> None:
-    imu = Imu.drawn(perfect(), (0.0, 1.0), np.random.default_rng(0))
+def test_static_ideal_unit_measures_gravity() -> None:
+    imu = Imu.draw(perfect(), (0.0, 1.0), np.random.default_rng(0))
     increments = imu.increments(STILL, 0.0, 1.0, np.random.default_rng(1))
     assert increments.times_s.size == 401
     np.testing.assert_array_equal(increments.delta_angles_rad, 0.0)
     np.testing.assert_allclose(increments.delta_velocities_m_s, [[0.0, 0.0, GRAVITY / 400.0]] * 400, atol=1e-15)
 
 
-def test_scale_and_misalignment_act_on_the_true_increments() -> None:
+def test_scale_and_misalignment_apply_to_true_increments() -> None:
     parameters = perfect(
         gyro_scale_ppm=1000.0, gyro_misalignment_mrad=5.0, accelerometer_scale_ppm=2000.0, accelerometer_bias_mg=1.0
     )
-    imu = Imu.drawn(parameters, (0.0, 1.0), np.random.default_rng(3))
+    imu = Imu.draw(parameters, (0.0, 1.0), np.random.default_rng(3))
     increments = imu.increments(Swaying(spin_rad_s=1.0), 0.0, 1.0, np.random.default_rng(1))
     turn = np.array([imu.gyro.misalignment[0, 2], imu.gyro.misalignment[1, 2], 1.0 + imu.gyro.scale[2]])
     np.testing.assert_allclose(increments.delta_angles_rad.sum(axis=0), turn, atol=1e-12)
-    felt = imu.accelerometer.bias + np.array([0.0, 0.0, GRAVITY * (1.0 + imu.accelerometer.scale[2])])
-    np.testing.assert_allclose(increments.delta_velocities_m_s.sum(axis=0), felt, atol=1e-12)
+    specific_force = imu.accelerometer.bias + np.array([0.0, 0.0, GRAVITY * (1.0 + imu.accelerometer.scale[2])])
+    np.testing.assert_allclose(increments.delta_velocities_m_s.sum(axis=0), specific_force, atol=1e-12)
     assert 0.0 < np.abs(imu.gyro.misalignment).max() < 0.02
     assert np.all(np.diag(imu.gyro.misalignment) == 0.0)
 
 
-def test_rounding_is_carried_over_and_never_accumulates() -> None:
+def test_rounding_errors_do_not_accumulate() -> None:
     parameters = perfect(gyro_count_rad=1e-3, gyro_bias_deg_h=1.0 / DEG_H)
-    imu = Imu.drawn(parameters, (0.0, 10.0), np.random.default_rng(0))
+    imu = Imu.draw(parameters, (0.0, 10.0), np.random.default_rng(0))
     measured = imu.increments(STILL, 0.0, 10.0, np.random.default_rng(0)).delta_angles_rad
     np.testing.assert_allclose(measured / 1e-3, np.rint(measured / 1e-3), atol=1e-9)
     true = imu.gyro.bias * (np.arange(1, 4001)[:, None] / 400.0)
@@ -87,19 +89,19 @@ def test_rounding_is_carried_over_and_never_accumulates() -> None:
 
 def test_bias_follows_temperature() -> None:
     warm_up = WarmUp(start_s=10.0, change_k=20.0, time_constant_s=100.0)
-    imu = Imu.drawn(perfect(gyro_bias_deg_h_k=0.5, warm_up=warm_up), (0.0, 2000.0), np.random.default_rng(0))
+    imu = Imu.draw(perfect(gyro_bias_deg_h_k=0.5, warm_up=warm_up), (0.0, 2000.0), np.random.default_rng(0))
     bias = imu.gyro.bias_at(np.array([0.0, 10.0, 110.0, 2000.0]))
     np.testing.assert_array_equal(bias[:2], 0.0)
     np.testing.assert_allclose(bias[2], imu.gyro.bias_per_k * 20.0 * (1.0 - np.exp(-1.0)), rtol=1e-12)
     np.testing.assert_allclose(bias[3], imu.gyro.bias_per_k * 20.0, rtol=1e-8)
 
 
-def test_errors_drawn_have_the_stated_spreads() -> None:
+def test_drawn_errors_have_the_specified_spreads() -> None:
     parameters = ImuParameters()
-    units = [Imu.drawn(parameters, (0.0, 10.0), np.random.default_rng(seed)) for seed in range(400)]
+    units = [Imu.draw(parameters, (0.0, 10.0), np.random.default_rng(seed)) for seed in range(400)]
     milli_g = 1e-3 * STANDARD_GRAVITY_M_S2
-    # 1,200 values each, known to 2 %; tolerance four times that
-    for drawn, sd in (
+    # 1,200 values each determine the spread to 2 %; the tolerance is four times that.
+    for samples, sd in (
         ([unit.gyro.bias for unit in units], 1.0 * DEG_H),
         ([unit.gyro.scale for unit in units], 100e-6),
         ([unit.gyro.wander.values[0] for unit in units], 0.35 * DEG_H),
@@ -108,10 +110,10 @@ def test_errors_drawn_have_the_stated_spreads() -> None:
         ([unit.accelerometer.scale for unit in units], 300e-6),
         ([unit.accelerometer.bias_per_k for unit in units], 0.02 * milli_g),
     ):
-        assert np.std(drawn) == pytest.approx(sd, rel=0.1)
+        assert np.std(samples) == pytest.approx(sd, rel=0.1)
 
 
-def test_a_span_without_a_sample_is_refused() -> None:
-    imu = Imu.drawn(perfect(), (0.0, 1.0), np.random.default_rng(0))
+def test_span_without_samples_is_rejected() -> None:
+    imu = Imu.draw(perfect(), (0.0, 1.0), np.random.default_rng(0))
     with pytest.raises(ValueError, match="no sample"):
         imu.boundaries(0.0, 0.001)

@@ -1,3 +1,5 @@
+"""Tests of inertial navigation with errors of the unit and of time tags."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -10,7 +12,7 @@ from marsyard.sim.sensor.instrument import Clock, ClockParameters
 from tests.sim.sensor.motions import GRAVITY, Swaying
 from tests.sim.sensor.test_imu import perfect
 
-#: Nods with 60 deg/s, spins, sways and falls, as a descent does.
+#: Nods with 60 deg/s, rotates, oscillates and falls like a descent.
 BUSY = Swaying(
     spin_rad_s=0.3,
     nod_rad=0.2,
@@ -24,20 +26,20 @@ SPAN = (-2.0, 18.0)
 NO_ERRORS = NavigationErrors(np.zeros(3), np.zeros(3))
 
 
-def _navigated(
+def _navigate(
     motion: Swaying, parameters: ImuParameters, errors: NavigationErrors = NO_ERRORS, seed: int = 0
 ) -> tuple[Imu, InertialSolution]:
     rng = np.random.default_rng(seed)
-    imu = Imu.drawn(parameters, SPAN, rng)
+    imu = Imu.draw(parameters, SPAN, rng)
     start = motion.state(SPAN[0])
     attitude, velocity = errors.apply(start.attitude, start.velocity_m_s)
     increments = imu.increments(motion, *SPAN, rng)
     return imu, InertialSolution.propagate(increments, attitude, velocity, GRAVITY)
 
 
-def test_without_errors_the_motion_itself_comes_out() -> None:
-    _, solution = _navigated(BUSY, perfect())
-    # between samples too
+def test_error_free_navigation_reproduces_the_motion() -> None:
+    _, solution = _navigate(BUSY, perfect())
+    # Includes times between samples.
     times = np.linspace(-2.0, 18.0, 137)
     true = BUSY.motion(times)
     assert (solution.attitude(times) * true.attitudes.inv()).magnitude().max() < 1e-5
@@ -50,80 +52,81 @@ def test_without_errors_the_motion_itself_comes_out() -> None:
     np.testing.assert_allclose(solution.mean_velocities(on_sample), means, atol=1e-5)
 
 
-def test_a_gyro_bias_turns_the_attitude_at_its_rate() -> None:
-    imu, solution = _navigated(Swaying(), perfect(gyro_bias_deg_h=100.0))
+def test_gyro_bias_rotates_the_attitude_at_its_rate() -> None:
+    imu, solution = _navigate(Swaying(), perfect(gyro_bias_deg_h=100.0))
     error = solution.attitude(np.array([18.0]))[0].as_rotvec()
     np.testing.assert_allclose(error, imu.gyro.bias * 20.0, rtol=1e-9)
 
 
-def test_under_a_spin_only_the_bias_along_it_accumulates() -> None:
+def test_only_bias_along_the_spin_axis_accumulates() -> None:
     spin = 2.0 * np.pi / 4.0
-    imu, solution = _navigated(Swaying(spin_rad_s=spin), perfect(gyro_bias_deg_h=100.0))
+    imu, solution = _navigate(Swaying(spin_rad_s=spin), perfect(gyro_bias_deg_h=100.0))
     truth = Swaying(spin_rad_s=spin).state(18.0).attitude
     error = (solution.attitude(np.array([18.0]))[0] * truth.inv()).as_rotvec()
-    # five whole turns; errors of second order are 1e-5 of the first
+    # Five complete turns; second-order errors are 1e-5 of the first order.
     assert error[2] == pytest.approx(imu.gyro.bias[2] * 20.0, rel=1e-4)
     assert np.abs(error[:2]).max() < 1e-3 * np.abs(imu.gyro.bias[:2] * 20.0).max()
 
 
-def test_an_accelerometer_bias_grows_with_time_and_a_tilt_adds_the_specific_force_across_it() -> None:
-    imu, solution = _navigated(Swaying(), perfect(accelerometer_bias_mg=1.0))
+def test_accelerometer_bias_and_tilt_cause_velocity_errors() -> None:
+    imu, solution = _navigate(Swaying(), perfect(accelerometer_bias_mg=1.0))
     np.testing.assert_allclose(solution.velocity(np.array([18.0]))[0], imu.accelerometer.bias * 20.0, rtol=1e-9)
     tilt = np.array([1e-3, -2e-3, 5e-3])
-    _, solution = _navigated(Swaying(), perfect(), NavigationErrors(tilt, np.array([3.0, 0.0, 0.0])))
+    _, solution = _navigate(Swaying(), perfect(), NavigationErrors(tilt, np.array([3.0, 0.0, 0.0])))
     expected = np.array([3.0, 0.0, 0.0]) + 20.0 * np.cross(tilt, [0.0, 0.0, GRAVITY])
     np.testing.assert_allclose(solution.velocity(np.array([18.0]))[0], expected, atol=20.0 * GRAVITY * 2e-5)
 
 
-def test_random_walk_of_attitude_and_velocity_has_the_stated_spread() -> None:
+def test_attitude_and_velocity_random_walk_have_specified_spread() -> None:
     attitude, velocity = [], []
     for seed in range(150):
         noisy = perfect(rate_hz=50.0, angular_random_walk_deg_sqrt_h=0.07, velocity_random_walk_ug_sqrt_hz=50.0)
-        _, solution = _navigated(Swaying(), noisy, seed=seed)
+        _, solution = _navigate(Swaying(), noisy, seed=seed)
         attitude.append(np.degrees(solution.attitude(np.array([18.0]))[0].as_rotvec()))
         velocity.append(solution.velocity(np.array([18.0]))[0, 2])
-    # 450 and 150 values, known to 3.3 % and 5.8 %; tolerance three times that. Along z no tilt adds to the velocity
+    # 450 and 150 values determine spreads to 3.3 % and 5.8 %; the tolerance is three times that. Tilt does not affect
+    # the z velocity.
     assert np.std(attitude) == pytest.approx(0.07 * np.sqrt(20.0 / 3600.0), rel=0.1)
     assert np.std(velocity) == pytest.approx(50e-6 * 9.80665 * np.sqrt(20.0), rel=0.18)
 
 
-def test_ten_milliseconds_are_twenty_one_metres_on_the_ground() -> None:
-    # the issue's example: 60 deg/s at 2000 m, 10 ms
+def test_ten_millisecond_tag_error_shifts_ground_by_21_metres() -> None:
+    # Example: 60 deg/s at 2000 m, 10 ms.
     turning = Swaying(spin_rad_s=np.radians(60.0), tilt=Rotation.from_euler("x", 90.0, degrees=True))
-    _, solution = _navigated(turning, perfect())
+    _, solution = _navigate(turning, perfect())
     clock = Clock(ClockParameters(), offset_s=0.01)
     tag = clock.tags(np.array([3.75]), np.random.default_rng(0))
-    turned = (solution.attitude(tag)[0] * turning.state(3.75).attitude.inv()).magnitude()
-    assert 2000.0 * np.tan(turned) == pytest.approx(20.9, abs=0.1)
-    # an offset that the unit's clock shares does nothing
-    imu = Imu.drawn(perfect(clock=ClockParameters(offset_s=0.01)), SPAN, np.random.default_rng(0))
+    rotated = (solution.attitude(tag)[0] * turning.state(3.75).attitude.inv()).magnitude()
+    assert 2000.0 * np.tan(rotated) == pytest.approx(20.9, abs=0.1)
+    # A clock offset shared with the unit has no effect.
+    imu = Imu.draw(perfect(clock=ClockParameters(offset_s=0.01)), SPAN, np.random.default_rng(0))
     increments = imu.increments(turning, *SPAN, np.random.default_rng(0))
     shared = InertialSolution.propagate(increments, turning.state(SPAN[0]).attitude, np.zeros(3), GRAVITY)
     assert (shared.attitude(tag)[0] * turning.state(3.75).attitude.inv()).magnitude() < 1e-9
 
 
-def test_jitter_beyond_the_period_never_makes_time_run_back() -> None:
-    imu = Imu.drawn(perfect(clock=ClockParameters(jitter_sd_s=0.01)), SPAN, np.random.default_rng(0))
+def test_large_jitter_keeps_times_increasing() -> None:
+    imu = Imu.draw(perfect(clock=ClockParameters(jitter_sd_s=0.01)), SPAN, np.random.default_rng(0))
     increments = imu.increments(BUSY, *SPAN, np.random.default_rng(0))
     assert np.all(np.diff(increments.times_s) >= 0.0)
     start = BUSY.state(SPAN[0])
     solution = InertialSolution.propagate(increments, start.attitude, start.velocity_m_s, GRAVITY)
     times = np.concatenate([increments.times_s[:1], np.linspace(-1.9, 17.9, 1000), increments.times_s[-1:]])
     error = (solution.attitude(times) * BUSY.motion(times).attitudes.inv()).magnitude()
-    # at most 1.35 rad/s, and jitter of up to four spreads
+    # At most 1.35 rad/s, and jitter of up to four standard deviations.
     assert error.max() < 1.35 * 0.05
 
 
-def test_navigation_is_known_only_within_its_samples() -> None:
+def test_navigation_is_defined_only_within_its_samples() -> None:
     increments = ImuIncrements(np.array([0.0, 1.0]), 1.0, np.zeros((1, 3)), np.zeros((1, 3)))
     solution = InertialSolution.propagate(increments, Rotation.identity(), np.zeros(3), GRAVITY)
     with pytest.raises(ValueError, match=r"known from 0\.0000 s to 1\.0000 s"):
         solution.velocity(np.array([1.5]))
 
 
-def test_a_bias_of_the_class_is_small_over_the_pictures() -> None:
-    # 1 deg/h over 20 s is 0.006 deg: what spoils attitude is the way there, not the pictures
-    imu, solution = _navigated(BUSY, ImuParameters())
+def test_gyro_bias_is_small_between_images() -> None:
+    # 1 deg/h over 20 s is 0.006 deg: the attitude error accumulates before the images.
+    imu, solution = _navigate(BUSY, ImuParameters())
     error = (solution.attitude(np.array([17.9]))[0] * BUSY.state(17.9).attitude.inv()).magnitude()
     assert np.degrees(error) < 0.1
     assert np.abs(imu.gyro.bias).max() < 5.0 * DEG_H

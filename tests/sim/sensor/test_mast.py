@@ -1,4 +1,4 @@
-"""Where a mast truly points, and what its stereo pair's calibration does to ranges."""
+"""Tests of mast pointing errors and of range errors from stereo calibration."""
 
 from __future__ import annotations
 
@@ -27,45 +27,45 @@ def _rng(seed: int = 1) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def _moved(mast: Mast, azimuths_deg: list[float]) -> list[MastState]:
+def _move_mast(mast: Mast, azimuths_deg: list[float]) -> list[MastState]:
     states, rng = [mast.rest], _rng()
     for azimuth in azimuths_deg:
         states.append(mast.point(states[-1], float(np.radians(azimuth)), 0.0, rng))
     return states[1:]
 
 
-def test_a_mast_without_errors_points_as_told() -> None:
-    mast = Mast.drawn(EXACT, MER_MAST, _rng())
+def test_error_free_mast_points_as_commanded() -> None:
+    mast = Mast.draw(EXACT, MER_MAST, _rng())
     state = mast.point(mast.rest, 0.4, -0.3, _rng())
     assert state.true_rad == state.readings_rad == (0.4, -0.3)
     expected = MER_MAST.rover_from_head(0.4, -0.3)
     assert mast.rover_from_head(state).as_matrix() == pytest.approx(expected.as_matrix())
 
 
-def test_backlash_lags_behind_by_half_and_swallows_short_reversals() -> None:
-    mast = Mast.drawn(EXACT.model_copy(update={"backlash_deg": 0.2}), MER_MAST, _rng())
-    up, again, back_a_little, back, far = (
-        np.degrees(state.true_rad[0]) for state in _moved(mast, [10.0, 10.0, 9.9, 9.5, -20.0])
+def test_backlash_lags_by_half_and_absorbs_short_reversals() -> None:
+    mast = Mast.draw(EXACT.model_copy(update={"backlash_deg": 0.2}), MER_MAST, _rng())
+    up, repeated, back_a_little, back, far = (
+        np.degrees(state.true_rad[0]) for state in _move_mast(mast, [10.0, 10.0, 9.9, 9.5, -20.0])
     )
-    # from below the axis stops 0.1 short, from above 0.1 beyond; a reversal by 0.1 is within the play of 0.2
-    assert [up, again, back_a_little, back, far] == pytest.approx([9.9, 9.9, 9.9, 9.6, -19.9])
-    # the encoder, before the gears, sees none of it
-    assert np.degrees([state.readings_rad[0] for state in _moved(mast, [10.0, 9.9])]) == pytest.approx([10.0, 9.9])
+    # The axis stops 0.1 short from below and 0.1 beyond from above; a reversal by 0.1 is within the backlash of 0.2.
+    assert [up, repeated, back_a_little, back, far] == pytest.approx([9.9, 9.9, 9.9, 9.6, -19.9])
+    # The encoder is before the gears and does not measure it.
+    assert np.degrees([state.readings_rad[0] for state in _move_mast(mast, [10.0, 9.9])]) == pytest.approx([10.0, 9.9])
 
 
-def test_the_zeros_error_is_fixed_to_a_run() -> None:
+def test_zero_error_is_constant_in_a_run() -> None:
     parameters = EXACT.model_copy(update={"zero_deg": 0.3})
-    zeros = np.degrees([Mast.drawn(parameters, MER_MAST, _rng(n)).zeros_rad for n in range(400)])
-    # 800 draws: 0.3 within four standard errors
+    zeros = np.degrees([Mast.draw(parameters, MER_MAST, _rng(n)).zeros_rad for n in range(400)])
+    # 800 draws: 0.3 within four standard errors.
     assert np.std(zeros) == pytest.approx(0.3, abs=4.0 * 0.3 / np.sqrt(1600.0))
-    mast = Mast.drawn(parameters, MER_MAST, _rng())
-    for state in _moved(mast, [10.0, -40.0, 5.0]):
+    mast = Mast.draw(parameters, MER_MAST, _rng())
+    for state in _move_mast(mast, [10.0, -40.0, 5.0]):
         assert np.subtract(state.readings_rad, state.true_rad) == pytest.approx(mast.zeros_rad)
 
 
-def test_encoders_read_whole_counts_and_motors_stop_next_to_commands() -> None:
-    mast = Mast.drawn(EXACT.model_copy(update={"count_deg": 0.05, "settling_deg": 0.2}), MER_MAST, _rng())
-    states = _moved(mast, list(np.linspace(-30.0, 30.0, 400)))
+def test_encoders_and_motors_are_quantised() -> None:
+    mast = Mast.draw(EXACT.model_copy(update={"count_deg": 0.05, "settling_deg": 0.2}), MER_MAST, _rng())
+    states = _move_mast(mast, list(np.linspace(-30.0, 30.0, 400)))
     counts = np.degrees([state.readings_rad[0] for state in states]) / 0.05
     assert counts == pytest.approx(np.rint(counts), abs=1e-9)
     rounded = np.degrees([state.readings_rad[0] - state.true_rad[0] for state in states])
@@ -75,28 +75,28 @@ def test_encoders_read_whole_counts_and_motors_stop_next_to_commands() -> None:
     assert np.std(missed) == pytest.approx(0.2, rel=0.15)
 
 
-def test_the_mast_stops_at_its_limits_and_says_so() -> None:
-    mast = Mast.drawn(EXACT, MER_MAST, _rng())
+def test_mast_stops_at_its_limits_and_reports_it() -> None:
+    mast = Mast.draw(EXACT, MER_MAST, _rng())
     state = mast.point(mast.rest, 0.0, -2.0, _rng())
     assert np.degrees(state.readings_rad[1]) == pytest.approx(-87.0)
 
 
-def test_mer_mast_carries_the_navcam_where_opportunitys_labels_say() -> None:
-    # 1N491020376 and 1N491020519: C and the measured angles; the label's frame has y right, z down, 0.29 m up
+def test_mer_navcam_position_matches_opportunity_labels() -> None:
+    # 1N491020376 and 1N491020519: C and the measured angles. The label frame has y right and z down, 0.29 m higher.
     mast = stereo_mast("mer-navcam")
     for azimuth, elevation, centre in (
         (-0.340449, -0.10962, (0.442604, -0.0611635, -1.25106)),
         (0.254358, -0.20924, (0.508813, -0.0504884, -1.24881)),
     ):
-        left = mast.left.moved(mast.geometry.rover_from_head(azimuth, elevation))
+        left = mast.left.transform(mast.geometry.rover_from_head(azimuth, elevation))
         expected = np.array([centre[0], -centre[1], -centre[2] + 0.29])
         assert left.c == pytest.approx(expected, abs=0.003)
 
 
 @pytest.mark.parametrize("name", MASTS)
-def test_a_perfect_calibration_is_the_design(name: str) -> None:
+def test_ideal_calibration_equals_the_design(name: str) -> None:
     design = stereo_mast(name)
-    head = StereoHead.drawn(design, PERFECT, _rng())
+    head = StereoHead.draw(design, PERFECT, _rng())
     for calibrated, true in ((head.calibrated.left, design.left), (head.calibrated.right, design.right)):
         for vector in ("c", "a", "h", "v"):
             assert getattr(calibrated, vector) == pytest.approx(getattr(true, vector), abs=1e-9)
@@ -104,7 +104,7 @@ def test_a_perfect_calibration_is_the_design(name: str) -> None:
 
 
 def _triangulated_m(left: CameraModel, right: CameraModel, pixels: list[np.ndarray]) -> float:
-    """Range at which the lines of sight of two pixels pass each other."""
+    """Range at the closest approach of the lines of sight of two pixels."""
     sights = [camera.rays(pixel) for camera, pixel in zip((left, right), pixels, strict=True)]
     across = np.stack([sights[0][1], -sights[1][1]], axis=1)
     along = np.linalg.lstsq(across, sights[1][0] - sights[0][0], rcond=None)[0]
@@ -113,9 +113,9 @@ def _triangulated_m(left: CameraModel, right: CameraModel, pixels: list[np.ndarr
 
 @pytest.mark.parametrize("name", ["mer-navcam", "research-navcam"])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_disparity_error_is_a_range_error_of_eq_1(name: str, seed: int) -> None:
+def test_disparity_error_causes_range_error_of_eq_1(name: str, seed: int) -> None:
     design = stereo_mast(name)
-    head = StereoHead.drawn(design, PERFECT.model_copy(update={"disparity_error_px": 0.5}), _rng(seed))
+    head = StereoHead.draw(design, PERFECT.model_copy(update={"disparity_error_px": 0.5}), _rng(seed))
     error, range_m = head.disparity_error_px(10.0), 10.0
     assert 0.0 < abs(error) <= 0.5
     assert head.disparity_error_px(2.0) == pytest.approx(error, rel=0.02)
@@ -124,21 +124,21 @@ def test_a_disparity_error_is_a_range_error_of_eq_1(name: str, seed: int) -> Non
     measured = _triangulated_m(head.calibrated.left, head.calibrated.right, pixels)
     baseline = float(np.linalg.norm(design.left.c - design.right.c))
     expected = range_m**2 / (design.left.focal_lengths[0] * baseline) * error
-    # Eq. 1 is the first order in the error over the disparity (25 px at 10 m for the navcam)
+    # Eq. 1 is the first order in error over disparity (25 px at 10 m for the navcam).
     assert measured - np.hypot(range_m, 0.5 * baseline) == pytest.approx(expected, rel=0.03)
 
 
-def test_disparity_errors_are_drawn_evenly_within_their_bound() -> None:
+def test_disparity_errors_are_uniform_within_their_bound() -> None:
     design = stereo_mast("research-navcam")
     parameters = PERFECT.model_copy(update={"disparity_error_px": 0.5})
-    errors = np.array([StereoHead.drawn(design, parameters, _rng(n)).disparity_error_px(1e4) for n in range(150)])
+    errors = np.array([StereoHead.draw(design, parameters, _rng(n)).disparity_error_px(1e4) for n in range(150)])
     assert np.abs(errors).max() <= 0.5 + 1e-6
     assert np.std(errors) == pytest.approx(0.5 / np.sqrt(3.0), rel=0.15)
 
 
-def test_errors_across_rows_shift_rows_and_common_turns_shift_both_pictures() -> None:
+def test_row_errors_and_common_rotations_shift_images() -> None:
     design, point = stereo_mast("research-navcam"), np.array([50.0, 0.0, 0.0])
-    across = StereoHead.drawn(design, PERFECT.model_copy(update={"epipolar_error_px": 1.0}), _rng(5)).calibrated
+    across = StereoHead.draw(design, PERFECT.model_copy(update={"epipolar_error_px": 1.0}), _rng(5)).calibrated
     rows = [camera.project(point)[0][1] for camera in (across.left, across.right)]
     columns = [camera.project(point)[0][0] for camera in (across.left, across.right)]
     expected = [camera.project(point)[0][0] for camera in (design.left, design.right)]
@@ -146,22 +146,19 @@ def test_errors_across_rows_shift_rows_and_common_turns_shift_both_pictures() ->
     draw = _rng(5)
     draw.uniform()
     assert abs(rows[0] - rows[1]) == pytest.approx(abs(draw.standard_normal()), rel=1e-3)
-    turned = StereoHead.drawn(design, PERFECT.model_copy(update={"alignment_deg": 1.0}), _rng(5))
+    rotated = StereoHead.draw(design, PERFECT.model_copy(update={"alignment_deg": 1.0}), _rng(5))
     shifts = [
         one.project(point)[0] - other.project(point)[0]
-        for one, other in (
-            (turned.calibrated.left, design.left),
-            (turned.calibrated.right, design.right),
-        )
+        for one, other in ((rotated.calibrated.left, design.left), (rotated.calibrated.right, design.right))
     ]
     assert np.linalg.norm(shifts[0]) > 5.0
     assert shifts[0] == pytest.approx(shifts[1], abs=0.5)
-    assert turned.disparity_error_px(20.0) == pytest.approx(0.0, abs=1e-6)
+    assert rotated.disparity_error_px(20.0) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_focal_errors_magnify() -> None:
+def test_focal_length_errors_scale_the_image() -> None:
     design = stereo_mast("research-navcam")
-    head = StereoHead.drawn(design, PERFECT.model_copy(update={"focal_error": 0.01}), _rng(3))
+    head = StereoHead.draw(design, PERFECT.model_copy(update={"focal_error": 0.01}), _rng(3))
     point = np.array([10.0, 2.0, 1.0])
     for calibrated, true in ((head.calibrated.left, design.left), (head.calibrated.right, design.right)):
         centre = np.array(true.image_centre)
@@ -171,6 +168,6 @@ def test_focal_errors_magnify() -> None:
         assert scale != pytest.approx(1.0, abs=1e-6)
 
 
-def test_a_mast_must_be_known() -> None:
+def test_unknown_mast_is_rejected() -> None:
     with pytest.raises(ValueError, match="xc-55"):
         stereo_mast("xc-55")

@@ -1,4 +1,4 @@
-"""Exposure over time against brute force: sums of many sharp pictures, each at its own time."""
+"""Tests of moving exposures against brute force: sums of many sharp images at their own times."""
 
 from collections.abc import Callable
 
@@ -15,7 +15,7 @@ from marsyard.sim.render.backend import default_backend
 from marsyard.sim.render.rays import PixelRays
 from marsyard.sim.sensor import ImageMotion, natural_fall_off
 from marsyard.sim.sensor.kernels import path_kernel
-from marsyard.sim.sensor.motion import moving_exposure
+from marsyard.sim.sensor.optics import moving_exposure
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from tests.sim.sensor.motions import uniform_motion
 
@@ -26,7 +26,7 @@ EXPOSURE_S = 4e-3
 def _brute_force(
     seen: Callable[[float], Picture], shape: tuple[int, int], transfer_row_s: float, clear_row_s: float, rows: int
 ) -> Picture:
-    """Radiance x seconds that packets gather, from pictures at any time; `rows` steps of the transfer at once."""
+    """Radiance x seconds collected by packets from images at any time; `rows` transfer steps at once."""
     total = sum((seen(((n + 0.5) / 24 - 0.5) * EXPOSURE_S) for n in range(24)), np.zeros(shape)) * EXPOSURE_S / 24
     for first in range(1, shape[0], rows):
         lags = range(first, min(first + rows, shape[0]))
@@ -39,8 +39,8 @@ def _brute_force(
     return total
 
 
-def test_the_picture_of_a_turning_camera_is_that_of_many_renderings() -> None:
-    """60 deg/s and 80 m/s over rough ground; a coarse copy of the descent camera with as long a transfer."""
+def test_rotating_camera_matches_many_renderings() -> None:
+    """60 deg/s and 80 m/s over rough ground; a coarse descent camera with the same transfer time."""
     size = 80
     transfer_row_s, clear_row_s = 5e-6 * 1024 / size, 1e-6 * 1024 / size
     parameters = TerrainParameters(samples=512, rms_slope_deg=6.0, outer_scale_m=400.0, albedo_contrast=0.2)
@@ -54,28 +54,30 @@ def test_the_picture_of_a_turning_camera_is_that_of_many_renderings() -> None:
     scene = Scene(surface, (0.0, 0.0), Sun(np.array([0.6, 0.3, np.sqrt(0.55)])), Photometry())
     attitude = Rotation.from_euler("xyz", [20.0, -10.0, 30.0], degrees=True)
     velocity, rate = np.array([20.0, -15.0, -75.0]), np.radians([45.0, -40.0, 5.0])
-    place = np.array([50.0, 80.0, 1400.0])
+    position = np.array([50.0, 80.0, 1400.0])
     response = natural_fall_off(camera)
 
     def seen(time_s: float) -> Picture:
-        turned = Rotation.from_rotvec(rate * time_s) * attitude
-        return np.asarray(renderer.render(scene, rays, rigid(turned, place + velocity * time_s)).radiance * response)
+        rotated = Rotation.from_rotvec(rate * time_s) * attitude
+        return np.asarray(
+            renderer.render(scene, rays, rigid(rotated, position + velocity * time_s)).radiance * response
+        )
 
-    frame = renderer.render(scene, rays, rigid(attitude, place))
+    frame = renderer.render(scene, rays, rigid(attitude, position))
     motion = ImageMotion.of_camera(camera, frame.range_m, frame.world_from_body, velocity, rate)
     assert motion.max_px_s == pytest.approx(np.radians(60.0) * 14.67e-3 / 12e-6, rel=0.1)
-    found = moving_exposure(frame.radiance, response, motion, EXPOSURE_S, transfer_row_s, clear_row_s)
+    result = moving_exposure(frame.radiance, response, motion, EXPOSURE_S, transfer_row_s, clear_row_s)
     expected = _brute_force(seen, (size, size), transfer_row_s, clear_row_s, rows=6)
-    # beyond the border nothing was rendered: as far as the picture moves, it is not compared
+    # Pixels outside the frame have no radiance: a border as wide as the image motion is excluded.
     inside = np.s_[13:-13, 13:-13]
-    error = (found - expected)[inside] / expected.mean()
+    error = (result - expected)[inside] / expected.mean()
     assert np.sqrt((error**2).mean()) < 0.004
-    still = (frame.radiance * response * EXPOSURE_S)[inside]
-    assert np.abs(still / still.mean() - expected[inside] / expected[inside].mean()).std() > 0.02
+    static = (frame.radiance * response * EXPOSURE_S)[inside]
+    assert np.abs(static / static.mean() - expected[inside] / expected[inside].mean()).std() > 0.02
 
 
 @pytest.mark.parametrize("velocity", [(0.0, 1400.0), (1400.0, 0.0), (-1000.0, 800.0), (6.0, -4.0)])
-def test_smear_and_blur_of_a_drifting_picture(velocity: tuple[float, float]) -> None:
+def test_smear_and_blur_of_drifting_image_match_brute_force(velocity: tuple[float, float]) -> None:
     rng = np.random.default_rng(0)
     scene = (1.0 + 0.5 * gaussian_filter(rng.standard_normal((128, 96)), 1.5)).astype(np.float32)
     response = np.linspace(1.0, 0.8, 128)[:, None] * (1.0 + 0.01 * rng.standard_normal((128, 96)))
@@ -86,13 +88,13 @@ def test_smear_and_blur_of_a_drifting_picture(velocity: tuple[float, float]) -> 
         where = [rows - velocity[0] * time_s, columns - velocity[1] * time_s]
         return map_coordinates(scene.astype(np.float64), where, order=3, mode="nearest") * response
 
-    found = moving_exposure(scene, response, uniform_motion(*velocity), EXPOSURE_S, 4e-5, 8e-6)
+    result = moving_exposure(scene, response, uniform_motion(*velocity), EXPOSURE_S, 4e-5, 8e-6)
     expected = _brute_force(seen, scene.shape, 4e-5, 8e-6, rows=1)
-    assert np.sqrt(((found - expected) ** 2).mean()) < 0.0015 * expected.mean()
+    assert np.sqrt(((result - expected) ** 2).mean()) < 0.0015 * expected.mean()
 
 
 @pytest.mark.parametrize("velocity", [(0.0, 1500.0), (1100.0, -900.0), (37.0, 12.0)])
-def test_a_moving_dot_stays_where_it_is_at_mid_exposure(velocity: tuple[float, float]) -> None:
+def test_moving_dot_is_at_its_mid_exposure_position(velocity: tuple[float, float]) -> None:
     rows, columns = np.indices((64, 64))
     dot = np.exp(-0.5 * ((rows - 31.3) ** 2 + (columns - 30.6) ** 2) / 1.5**2).astype(np.float32)
     picture = moving_exposure(dot, np.ones_like(dot), uniform_motion(*velocity), EXPOSURE_S, 0.0, 0.0)
@@ -100,38 +102,38 @@ def test_a_moving_dot_stays_where_it_is_at_mid_exposure(velocity: tuple[float, f
     assert total == pytest.approx(dot.sum(dtype=np.float64) * EXPOSURE_S, rel=1e-4)
     assert (picture * rows).sum() / total == pytest.approx(31.3, abs=0.005)
     assert (picture * columns).sum() / total == pytest.approx(30.6, abs=0.005)
-    # its length along the motion is that of the path: variance L^2 / 12
+    # Its length along the motion is that of the path: variance L^2 / 12.
     along = ((rows - 31.3) * velocity[0] + (columns - 30.6) * velocity[1]) / np.hypot(*velocity)
     path = np.hypot(*velocity) * EXPOSURE_S
     assert (picture * along**2).sum() / total == pytest.approx(1.5**2 + path**2 / 12.0, rel=0.02)
 
 
-def test_the_trail_of_a_moving_dot_leans() -> None:
-    """While it is shifted out, a packet d rows below the dot passes it d row times after the exposure."""
+def test_smear_trail_of_a_moving_dot_is_inclined() -> None:
+    """During readout a packet d rows below the dot passes it d row times after the exposure."""
     rows, columns = np.indices((96, 96))
     dot = np.exp(-0.5 * ((rows - 20.0) ** 2 + (columns - 40.0) ** 2) / 1.5**2).astype(np.float32)
     picture = moving_exposure(dot, np.ones_like(dot), uniform_motion(0.0, 1000.0), EXPOSURE_S, 5e-5, 0.0)
     for row in (40, 60, 90):
         centre = (picture[row] * columns[row]).sum() / picture[row].sum()
         assert centre == pytest.approx(40.0 + 1000.0 * (0.5 * EXPOSURE_S + (row - 20 - 0.5) * 5e-5), abs=0.05)
-    # before the exposure the packets above passed it, the higher the earlier
+    # Before the exposure the packets above passed it; higher packets passed earlier.
     cleared = moving_exposure(dot, np.ones_like(dot), uniform_motion(0.0, 1000.0), EXPOSURE_S, 0.0, 5e-5)
     centre = (cleared[5] * columns[5]).sum() / cleared[5].sum()
     assert centre == pytest.approx(40.0 - 1000.0 * (0.5 * EXPOSURE_S + 14.5 * 5e-5), abs=0.05)
 
 
-def test_slow_motion_joins_the_still_picture() -> None:
+def test_slow_motion_converges_to_static_image() -> None:
     rng = np.random.default_rng(3)
     scene, response = (1.0 + 0.1 * rng.standard_normal((2, 96, 64))).astype(np.float32)
-    found = moving_exposure(scene, response, uniform_motion(1e-6, 1e-6), EXPOSURE_S, 5e-6, 1e-6)
+    result = moving_exposure(scene, response, uniform_motion(1e-6, 1e-6), EXPOSURE_S, 5e-6, 1e-6)
     rate = scene * response
     passed = np.cumsum(rate, axis=0)
-    still = EXPOSURE_S * rate + 5e-6 * (passed - rate) + 1e-6 * (passed[-1:] - passed)
-    # responses are averaged over 32 rows where they weigh the passing scene
-    np.testing.assert_allclose(found, still, rtol=1e-3)
+    static = EXPOSURE_S * rate + 5e-6 * (passed - rate) + 1e-6 * (passed[-1:] - passed)
+    # Responses are averaged over 32 rows where they weight the passing scene.
+    np.testing.assert_allclose(result, static, rtol=1e-3)
 
 
-def test_image_velocity_by_finite_differences() -> None:
+def test_image_velocity_matches_finite_differences() -> None:
     pinhole = Cahv.from_focal_length(
         14.67e-3, 24e-6, (512, 512), axis=np.array([0.0, 0.0, -1.0]), right=np.array([1.0, 0.0, 0.0])
     )
@@ -153,7 +155,7 @@ def test_image_velocity_by_finite_differences() -> None:
     np.testing.assert_allclose(motion.velocity_px_s[:16, :16, ::-1], expected, atol=1e-3)
 
 
-def test_what_has_no_range_moves_with_the_rotation_alone() -> None:
+def test_infinite_range_moves_with_rotation_only() -> None:
     camera = Cahv.from_focal_length(
         6e-3, 12e-6, (128, 96), axis=np.array([1.0, 0.0, 0.0]), right=np.array([0.0, -1.0, 0.0])
     )
@@ -161,11 +163,11 @@ def test_what_has_no_range_moves_with_the_rotation_alone() -> None:
     sky = np.full((96, 128), np.inf)
     assert ImageMotion.of_camera(camera, sky, pose, np.array([50.0, 20.0, 0.0]), np.zeros(3)).max_px_s < 1e-3
     turning = ImageMotion.of_camera(camera, sky, pose, np.zeros(3), np.array([0.0, 0.0, 0.1]))
-    # a turn to the left moves the picture to the right by 500 px/rad
+    # A left turn moves the image to the right by 500 px/rad.
     assert turning.velocity_px_s[1, 2, 1] == pytest.approx(50.0, rel=0.01)
 
 
-def test_path_kernel_is_a_mean_about_the_pixel() -> None:
+def test_path_kernel_is_a_centred_mean() -> None:
     kernel = np.empty((15, 15))
     offsets = np.arange(-7, 8)
     for path in ((0.0, 0.0), (3.3, -7.1), (0.0, 9.0)):
@@ -176,11 +178,9 @@ def test_path_kernel_is_a_mean_about_the_pixel() -> None:
 
 
 @pytest.mark.parametrize("velocity", [(1222.0, 0.0), (0.0, -1222.0), (864.0, 864.0)])
-def test_the_border_of_a_moving_picture_is_nearly_what_a_wider_one_shows(velocity: tuple[float, float]) -> None:
-    """60 deg/s through the descent camera (1222 px/s): the scene held at the border against the scene itself.
-
-    Rows and columns beyond the frame respond to nothing, so that the wider picture is the same frame with its
-    surroundings. Ground with a contrast of 10 % in waves of some 8 pixels.
+def test_border_of_moving_image_approximates_wider_image(velocity: tuple[float, float]) -> None:
+    """60 deg/s through the descent camera (1222 px/s): the scene extrapolated at the border against the true scene.
+    Rows and columns outside the frame have zero response. The ground has 10 % contrast in waves of about 8 pixels.
     """
     margin = 12
     rng = np.random.default_rng(2)
@@ -197,6 +197,6 @@ def test_the_border_of_a_moving_picture_is_nearly_what_a_wider_one_shows(velocit
     rows, columns = (np.asarray(one) for one in np.indices(frame.shape))
     depth: np.ndarray = np.minimum.reduce([rows, columns, rows[::-1], columns[:, ::-1]])
     rms = [float(np.sqrt(np.mean(error[depth == ring] ** 2))) for ring in range(20)]
-    # noise is 1 %
+    # The noise is 1 %.
     assert 1e-4 < rms[0] < 0.03
     assert max(rms[3:]) < 0.0015

@@ -1,4 +1,4 @@
-"""The on-board filter: consistent with its own covariance over flights, and sane where instruments fail."""
+"""Tests of the navigation filter: errors consistent with its covariance, and robust to instrument faults."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ RTK, COMPASS = RtkParameters(), TiltCompassParameters()
 
 
 @cache
-def _path(seed: int) -> FlownPath:
+def _make_path(seed: int) -> FlownPath:
     rng = np.random.default_rng(seed)
     air = Air.draw(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.pictures_s + TAIL_S, rng)
     over, heading = np.array([100.0, 50.0, 10.0]), rng.uniform(0.0, 2.0 * np.pi)
     return transit_flight(CRAFT, TRANSIT, over, 0.3, heading, GRAVITY, air, rng).path
 
 
-def _flown(
+def _run_filter(
     seed: int,
     imu_class: ImuParameters = SMALL_UNIT,
     rtk_class: RtkParameters = RTK,
@@ -45,10 +45,10 @@ def _flown(
     keep_s: tuple[float, ...] = (),
     parameters: FilterParameters = FilterParameters(),  # noqa: B008 - frozen
 ) -> tuple[FlownPath, Imu, NavigationSolution]:
-    path, rng = _path(seed), np.random.default_rng([seed, 1])
+    path, rng = _make_path(seed), np.random.default_rng([seed, 1])
     span = path.span_s
-    imu = Imu.drawn(imu_class, span, rng)
-    receiver, compass = RtkReceiver.drawn(rtk_class, span, rng), TiltCompass.drawn(compass_class, rng)
+    imu = Imu.draw(imu_class, span, rng)
+    receiver, compass = RtkReceiver.draw(rtk_class, span, rng), TiltCompass.draw(compass_class, rng)
     increments = imu.increments(path, *span, rng)
     solutions = receiver.measure(path, receiver.sampling.within(*span), rng)
     readings = compass.measure(path, compass.sampling.within(*span), rng)
@@ -58,7 +58,7 @@ def _flown(
 
 
 def _errors(path: FlownPath, imu: Imu, solution: NavigationSolution, at: np.ndarray) -> np.ndarray:
-    """True less believed, fifteen columns; what gravity makes of scale and misalignment counts as bias."""
+    """True minus estimated state, fifteen columns; the effect of gravity on scale and misalignment counts as bias."""
     times = imu.boundaries(*path.span_s)[at]
     true = path.motion(times)
     lifted = imu.accelerometer.sensitivity_error[:, 2] * GRAVITY
@@ -74,12 +74,14 @@ def _errors(path: FlownPath, imu: Imu, solution: NavigationSolution, at: np.ndar
     )
 
 
-def test_errors_are_what_the_covariance_says() -> None:
-    """Normalised errors squared over independent flights: chi-square, fifteen degrees a flight (99.8 % band)."""
+def test_errors_are_consistent_with_the_covariance() -> None:
+    """Normalised squared errors over independent flights: chi-square with fifteen degrees of freedom per flight (99.8
+    % band).
+    """
     floating = RtkParameters(float_fraction=0.3, float_s=10.0)
     squares = []
     for seed in range(FLIGHTS):
-        path, imu, solution = _flown(seed, rtk_class=floating, keep_s=(-3.0, 0.0, 2.5, 5.0))
+        path, imu, solution = _run_filter(seed, rtk_class=floating, keep_s=(-3.0, 0.0, 2.5, 5.0))
         errors = _errors(path, imu, solution, solution.kept_at)
         covariances = solution.covariances
         squares.append([float(e @ np.linalg.solve(p, e)) for e, p in zip(errors, covariances, strict=True)])
@@ -92,7 +94,7 @@ def test_innovations_are_white() -> None:
     normalised: dict[int, list[float]] = {POSITION_FIX: [], VELOCITY_FIX: []}
     products: dict[int, list[float]] = {POSITION_FIX: [], VELOCITY_FIX: []}
     for seed in range(20):
-        message = _flown(seed)[2].innovations
+        message = _run_filter(seed)[2].innovations
         assert np.mean(message.used) > 0.99
         for kind in normalised:
             for axis in range(3):
@@ -100,81 +102,81 @@ def test_innovations_are_white() -> None:
                 normalised[kind].extend(one)
                 products[kind].extend(one[1:] * one[:-1])
     for kind in normalised:
-        # 7,600 values: a variance is known to 1.6 %, a correlation to 0.011; the bias of what is left out adds to both
+        # 7,600 values determine a variance to 1.6 % and a correlation to 0.011; unmodelled bias adds to both.
         assert np.var(normalised[kind]) == pytest.approx(1.0, abs=0.1)
         assert abs(np.mean(products[kind])) < 0.12
 
 
 def test_better_instruments_make_smaller_errors() -> None:
-    """An inertial unit without errors, and 2 mm and 5 mm/s of white noise only, averaged over a second or so."""
+    """An ideal inertial unit, and white noise of 2 mm and 5 mm/s averaged over about a second."""
     none = {name: 0.0 for name, value in SMALL_UNIT.model_dump().items() if isinstance(value, float)}
     times = {"rate_hz": 100.0, "gyro_wander_s": 100.0, "accelerometer_wander_s": 60.0}
     ideal = ImuParameters.model_validate(none | times | {"clock": {}})
-    still = {"wander_m": (0.0,) * 3, "noise_m": (2e-3,) * 3, "correlation_s": 1.0}
+    static = {"wander_m": (0.0,) * 3, "noise_m": (2e-3,) * 3, "correlation_s": 1.0}
     white = {"velocity_noise_m_s": (5e-3,) * 3, "velocity_wander_m_s": (0.0,) * 3, "clock": {}}
-    exact = RtkParameters.model_validate({"fixed": still, "floating": still} | white)
-    path, imu, solution = _flown(0, ideal, exact)
+    exact = RtkParameters.model_validate({"fixed": static, "floating": static} | white)
+    path, imu, solution = _run_filter(0, ideal, exact)
     errors = _errors(path, imu, solution, np.arange(1000, 1550))
     assert np.abs(errors[:, :3]).max() < 6e-3
     assert np.abs(errors[:, 3:6]).max() < 0.015
 
 
-def test_through_an_outage_it_coasts_as_its_covariance_says() -> None:
-    """Eight seconds on inertial navigation: position drifts by decimetres, as a tilt of 0.2 deg makes it."""
+def test_outage_errors_are_consistent_with_the_covariance() -> None:
+    """Eight seconds of inertial navigation: the position drifts by decimetres, as for a tilt of 0.2 deg."""
     away = RtkParameters(outages=(Outage(start_s=-3.0, duration_s=8.1),), float_fraction=0.0)
     squares, sizes = [], []
     for seed in range(FLIGHTS):
-        path, imu, solution = _flown(seed, rtk_class=away, keep_s=(5.0,))
+        path, imu, solution = _run_filter(seed, rtk_class=away, keep_s=(5.0,))
         error = _errors(path, imu, solution, solution.kept_at)[0]
         squares.append(error[:9] @ np.linalg.solve(solution.covariances[0][:9, :9], error[:9]))
         sizes.append(np.hypot(*error[:2]))
     assert 0.2 < np.sqrt(np.mean(np.square(sizes))) < 3.0
-    # what the instruments are off by in an outage is less than the filter allows for: inclinometers count little
+    # In an outage the errors are below the filter's model, as inclinometers have a low weight.
     low, high = (float(chi2.ppf(p, 9 * FLIGHTS)) / FLIGHTS for p in (0.001, 0.999))
     assert low < np.mean(squares) < high
 
 
-def test_stuck_instruments_stop_to_count() -> None:
+def test_stuck_instruments_are_ignored() -> None:
     stuck = TiltCompassParameters(heading_stuck_s=-8.0, tilt_stuck_s=-8.0)
     tilts: dict[str, list[np.ndarray]] = {name: [] for name in ("free", "stuck")}
     for seed in range(20):
         for name, unit in (("free", COMPASS), ("stuck", stuck)):
-            path, imu, solution = _flown(seed, compass_class=unit)
+            path, imu, solution = _run_filter(seed, compass_class=unit)
             error = _errors(path, imu, solution, np.array([1500]))[0]
             tilts[name].append(np.degrees(error[6:9]))
             if name == "stuck":
                 late = solution.innovations.kinds[solution.innovations.times_s > -7.0]
                 assert set(late) == {POSITION_FIX, VELOCITY_FIX}
     free, left = (np.sqrt(np.mean(np.square(tilts[name]), axis=0)) for name in ("free", "stuck"))
-    # the receiver's velocities give the tilt whether or not the inclinometers work
+    # The receiver's velocities determine the tilt with or without inclinometers.
     assert np.all(left[:2] < 1.5 * free[:2] + 0.05)
     assert left[2] < 4.0
 
 
-def test_it_starts_again_where_it_was_led_astray() -> None:
-    """A filter that begins 20 m off: its covariance would refuse all solutions, but not for more than a second."""
-    path, rng = _path(3), np.random.default_rng(4)
+def test_filter_resets_after_persistent_rejection() -> None:
+    """A filter with an initial error of 20 m rejects all solutions, but resets after one second."""
+    path, rng = _make_path(3), np.random.default_rng(4)
     span = path.span_s
-    imu, receiver = Imu.drawn(SMALL_UNIT, span, rng), RtkReceiver.drawn(RtkParameters(float_fraction=0.0), span, rng)
-    compass = TiltCompass.drawn(COMPASS, rng)
+    imu, receiver = Imu.draw(SMALL_UNIT, span, rng), RtkReceiver.draw(RtkParameters(float_fraction=0.0), span, rng)
+    compass = TiltCompass.draw(COMPASS, rng)
     solutions = receiver.measure(path, receiver.sampling.within(*span), rng)
     readings = compass.measure(path, compass.sampling.within(*span), rng)
     navigation = NavigationFilter(FilterParameters(), SMALL_UNIT, receiver.parameters, COMPASS, GRAVITY)
     start = navigation.initialize(solutions, readings)
-    astray = replace(start, state=start.state + np.eye(16)[0] * 20.0, covariance=0.01 * start.covariance)
-    solution = navigation.run(astray, imu.increments(path, *span, rng), solutions, readings)
-    message = solution.innovations
-    assert not message.used[(message.kinds == POSITION_FIX) & (message.axes == 0)][0]
+    wrong_start = replace(start, state=start.state + np.eye(16)[0] * 20.0, covariance=0.01 * start.covariance)
+    solution = navigation.run(wrong_start, imu.increments(path, *span, rng), solutions, readings)
+    innovations = solution.innovations
+    assert not innovations.used[(innovations.kinds == POSITION_FIX) & (innovations.axes == 0)][0]
     off = np.abs(solution.positions_m - path.motion(imu.boundaries(*span)).positions_m)
     assert off[80, 0] > 15.0
     assert off[200:].max() < 0.1
 
 
-def test_a_pose_is_asked_for_within_the_flight() -> None:
-    path, _, solution = _flown(0)
+def test_pose_is_defined_only_within_the_flight() -> None:
+    path, _, solution = _run_filter(0)
     with pytest.raises(ValueError, match="known from"):
         solution.pose(path.span_s[1] + 1.0)
-    # 5 ms after a boundary a position has moved by 5 ms of its velocity
+    # 5 ms after a boundary the position has moved by 5 ms of its velocity.
     tags = solution.increments.times_s
     moved = solution.pose(tags[700] + 0.005).translation - solution.positions_m[700]
     np.testing.assert_allclose(moved, 0.005 * solution.velocities_m_s[700], atol=1e-9)

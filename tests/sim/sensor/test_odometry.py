@@ -1,4 +1,4 @@
-"""What a rover believes of its pose, against what it did."""
+"""Tests of rover odometry: the estimated pose against the true pose."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MIXED = (
 )
 
 
-def _drives(ground: Ground, commands: tuple[DriveCommand, ...], slip: SlipParameters = NO_SLIP) -> list[Drive]:
+def _drive(ground: Ground, commands: tuple[DriveCommand, ...], slip: SlipParameters = NO_SLIP) -> list[Drive]:
     rng, soil = np.random.default_rng(1), Soil(slip, 1.0)
     stance, drives = settle(MER, ground, 0.0, 0.0, EAST), []
     for command in commands:
@@ -31,15 +31,15 @@ def _drives(ground: Ground, commands: tuple[DriveCommand, ...], slip: SlipParame
 
 
 def _error_rad(estimate: PoseEstimate, true: RigidTransform) -> np.ndarray:
-    """Rotation vector, world axes, that turns the true attitude into the estimated one."""
+    """Rotation vector in world axes from the true to the estimated attitude."""
     return np.asarray((estimate.world_from_rover.rotation * true.rotation.inv()).as_rotvec())
 
 
-def _followed(
+def _estimate_poses(
     drives: list[Drive], parameters: OdometryParameters, seed: int, visual: bool = False
 ) -> tuple[Odometer, PoseEstimate]:
     rng = np.random.default_rng(seed)
-    odometer = Odometer.drawn(parameters, drives[0].start.world_from_rover, rng)
+    odometer = Odometer.draw(parameters, drives[0].start.world_from_rover, rng)
     estimate = odometer.first
     for driven in drives:
         estimate = odometer.step(estimate, driven, rng, visual)
@@ -47,65 +47,66 @@ def _followed(
 
 
 @pytest.mark.parametrize("visual", [False, True])
-def test_without_slip_and_errors_the_estimate_is_the_truth(visual: bool) -> None:
-    drives = _drives(Plane(0.2, -0.1), MIXED)
-    _, estimate = _followed(drives, EXACT, 0, visual)
+def test_estimate_is_exact_without_slip_and_errors(visual: bool) -> None:
+    drives = _drive(Plane(0.2, -0.1), MIXED)
+    _, estimate = _estimate_poses(drives, EXACT, 0, visual)
     assert estimate.world_from_rover.as_matrix() == pytest.approx(drives[-1].end.world_from_rover.as_matrix(), abs=1e-7)
 
 
-def test_wheels_do_not_see_slip_and_pictures_do() -> None:
-    # 15 deg uphill: about half of the way is lost, which the wheels count in full
+def test_visual_odometry_detects_slip_and_wheels_do_not() -> None:
+    # 15 deg uphill: about half of the distance is lost, but the wheels count it.
     slip = SlipParameters(step_spread=0.0, wander_deg_m=0.0)
-    drives = _drives(uphill_east(15.0), (STRAIGHT,) * 3, slip)
+    drives = _drive(uphill_east(15.0), (STRAIGHT,) * 3, slip)
     true = drives[-1].end.world_from_rover
-    _, counted = _followed(drives, EXACT, 0)
-    _, seen = _followed(drives, EXACT, 0, visual=True)
+    _, counted = _estimate_poses(drives, EXACT, 0)
+    _, seen = _estimate_poses(drives, EXACT, 0, visual=True)
     lost = slip.slip_fraction(np.radians(15.0)) * 3 * STRAIGHT.forward_m
     uphill = np.array([np.cos(np.radians(15.0)), 0.0, np.sin(np.radians(15.0))])
     assert counted.error_m(true) == pytest.approx(lost * uphill, abs=1e-7)
     assert seen.error_m(true) == pytest.approx(np.zeros(3), abs=1e-7)
 
 
-def test_gyros_see_turns_that_wheels_lose() -> None:
+def test_gyros_measure_turns_lost_by_wheels() -> None:
     slip = SlipParameters(turn=0.2, step_spread=0.0, wander_deg_m=0.0)
-    drives = _drives(Plane(), (DriveCommand(turn_left_rad=1.0), STRAIGHT), slip)
-    _, estimate = _followed(drives, EXACT, 0)
+    drives = _drive(Plane(), (DriveCommand(turn_left_rad=1.0), STRAIGHT), slip)
+    _, estimate = _estimate_poses(drives, EXACT, 0)
     assert _error_rad(estimate, drives[-1].end.world_from_rover) == pytest.approx(np.zeros(3), abs=1e-8)
 
 
-def test_the_estimate_starts_right_and_a_misalignment_shows_when_the_rover_turns() -> None:
+def test_misalignment_appears_when_the_rover_turns() -> None:
     parameters = EXACT.model_copy(update={"misalignment_deg": 1.0})
     ground = Plane(0.1, 0.05)
-    straight = _drives(ground, (STRAIGHT, STRAIGHT))
-    odometer, estimate = _followed(straight, parameters, 3)
+    straight = _drive(ground, (STRAIGHT, STRAIGHT))
+    odometer, estimate = _estimate_poses(straight, parameters, 3)
     assert odometer.first.world_from_rover is straight[0].start.world_from_rover
     assert _error_rad(estimate, straight[-1].end.world_from_rover) == pytest.approx(np.zeros(3), abs=1e-8)
-    about = _drives(ground, (DriveCommand(turn_left_rad=np.pi),))
-    odometer, estimate = _followed(about, parameters, 3)
+    about = _drive(ground, (DriveCommand(turn_left_rad=np.pi),))
+    odometer, estimate = _estimate_poses(about, parameters, 3)
     wrong = np.linalg.norm(_error_rad(estimate, about[-1].end.world_from_rover))
-    # turned half about, the misalignment shows twice
+    # After half a turn the misalignment appears twice.
     assert wrong == pytest.approx(2.0 * odometer.misalignment.magnitude(), rel=0.01)
 
 
-def test_visual_odometry_is_wrong_by_two_percent_of_eight_metres() -> None:
-    drives = _drives(Plane(), (DriveCommand(forward_m=2.0),) * 4)
+def test_visual_odometry_error_is_two_percent_of_eight_metres() -> None:
+    drives = _drive(Plane(), (DriveCommand(forward_m=2.0),) * 4)
     true = drives[-1].end.world_from_rover
     errors = [
-        np.linalg.norm(_followed(drives, OdometryParameters(), n, visual=True)[1].error_m(true)) for n in range(100)
+        np.linalg.norm(_estimate_poses(drives, OdometryParameters(), n, visual=True)[1].error_m(true))
+        for n in range(100)
     ]
-    # rms of 100 vectors of one to three degrees of freedom: up to 7 % per standard deviation
+    # The rms of 100 vectors with one to three degrees of freedom has a standard deviation of up to 7 %.
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(0.02 * 8.0, rel=0.2)
-    counted = [np.linalg.norm(_followed(drives, OdometryParameters(), n)[1].error_m(true)) for n in range(100)]
+    counted = [np.linalg.norm(_estimate_poses(drives, OdometryParameters(), n)[1].error_m(true)) for n in range(100)]
     assert np.sqrt(np.mean(np.square(counted))) == pytest.approx(0.011 * 8.0, rel=0.2)
 
 
-def test_scale_errors_are_common_to_a_run_and_walks_are_not() -> None:
-    drives = _drives(Plane(), (STRAIGHT,) * 8)
-    half, whole = drives[3].end.world_from_rover, drives[7].end.world_from_rover
+def test_scale_errors_are_constant_and_random_walks_are_not() -> None:
+    drives = _drive(Plane(), (STRAIGHT,) * 8)
+    half, full = drives[3].end.world_from_rover, drives[7].end.world_from_rover
 
     def along(parameters: OdometryParameters) -> tuple[np.ndarray, np.ndarray]:
-        middle = [_followed(drives[:4], parameters, n)[1].error_m(half)[0] for n in range(80)]
-        end = [_followed(drives, parameters, n)[1].error_m(whole)[0] for n in range(80)]
+        middle = [_estimate_poses(drives[:4], parameters, n)[1].error_m(half)[0] for n in range(80)]
+        end = [_estimate_poses(drives, parameters, n)[1].error_m(full)[0] for n in range(80)]
         return np.array(middle), np.array(end)
 
     middle, end = along(EXACT.model_copy(update={"scale_error": 0.01}))
@@ -113,33 +114,33 @@ def test_scale_errors_are_common_to_a_run_and_walks_are_not() -> None:
     assert np.std(end) == pytest.approx(0.01 * 6.4, rel=0.25)
     middle, end = along(EXACT.model_copy(update={"walk_m": 0.01}))
     assert np.std(end) == pytest.approx(0.01 * np.sqrt(6.4), rel=0.25)
-    # half of a walk's variance is there at half the way: their correlation is the root of a half
+    # Half the variance of a walk exists at half the distance: the correlation is the root of one half.
     assert np.corrcoef(middle, end)[0, 1] == pytest.approx(np.sqrt(0.5), abs=0.22)
 
 
-def test_heading_errors_grow_as_stated_and_carry_the_position_aside() -> None:
-    drives = _drives(Plane(), (STRAIGHT,) * 5)
+def test_heading_errors_grow_and_shift_the_position() -> None:
+    drives = _drive(Plane(), (STRAIGHT,) * 5)
     true = drives[-1].end.world_from_rover
     drift = EXACT.model_copy(update={"heading_drift_deg_m": 0.5})
-    odometer, estimate = _followed(drives, drift, 2)
+    odometer, estimate = _estimate_poses(drives, drift, 2)
     assert estimate.heading_error_rad == pytest.approx(4.0 * odometer.heading_drift_rad_m)
     assert _error_rad(estimate, true) == pytest.approx([0.0, 0.0, estimate.heading_error_rad], abs=1e-9)
-    # the error at the start of each of five drives carries it 0.8 m aside: (0 + 1 + 2 + 3 + 4) steps of 0.8 m each
+    # The initial heading error of each of five drives shifts it sideways: (0 + 1 + 2 + 3 + 4) steps of 0.8 m each.
     assert estimate.error_m(true)[1] == pytest.approx(odometer.heading_drift_rad_m * 0.8 * 0.8 * 10.0, rel=1e-3)
     walk = EXACT.model_copy(update={"heading_walk_deg": 0.2})
-    errors = [np.degrees(_followed(drives, walk, n)[1].heading_error_rad) for n in range(100)]
+    errors = [np.degrees(_estimate_poses(drives, walk, n)[1].heading_error_rad) for n in range(100)]
     assert np.std(errors) == pytest.approx(0.2 * 2.0, rel=0.22)
-    turn = _drives(Plane(), (DriveCommand(turn_left_rad=2.0),))
-    odometer, estimate = _followed(turn, EXACT.model_copy(update={"heading_scale_error": 0.01}), 4)
+    turn = _drive(Plane(), (DriveCommand(turn_left_rad=2.0),))
+    odometer, estimate = _estimate_poses(turn, EXACT.model_copy(update={"heading_scale_error": 0.01}), 4)
     assert estimate.heading_error_rad == pytest.approx(2.0 * odometer.heading_scale)
 
 
-def test_where_visual_odometry_fails_the_wheels_are_believed() -> None:
+def test_wheel_odometry_replaces_failed_visual_odometry() -> None:
     slip = SlipParameters(step_spread=0.0, wander_deg_m=0.0)
-    drives = _drives(uphill_east(15.0), (STRAIGHT,), slip)
+    drives = _drive(uphill_east(15.0), (STRAIGHT,), slip)
     failing = EXACT.model_copy(update={"visual": VisualOdometryParameters(failure_fraction=1.0)})
-    _, failed = _followed(drives, failing, 0, visual=True)
-    _, counted = _followed(drives, EXACT, 0)
+    _, failed = _estimate_poses(drives, failing, 0, visual=True)
+    _, counted = _estimate_poses(drives, EXACT, 0)
     assert failed.visual_failed
     assert not counted.visual_failed
     assert failed.world_from_rover.as_matrix() == pytest.approx(counted.world_from_rover.as_matrix())

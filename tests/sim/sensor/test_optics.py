@@ -1,3 +1,5 @@
+"""Tests of optics: point spread, fall-off and dust."""
+
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,7 @@ FORWARD: dict[str, Any] = {"axis": np.array([0.0, 0.0, -1.0]), "right": np.array
 
 
 @pytest.mark.parametrize("parameters", [MER, OpticsParameters(pixel_aperture=True), OpticsParameters(diffusion_px=1.0)])
-def test_point_spread_keeps_light_and_place(parameters: OpticsParameters) -> None:
+def test_point_spread_keeps_total_light_and_position(parameters: OpticsParameters) -> None:
     scene = np.zeros((41, 41), dtype=np.float32)
     scene[20, 17] = 1.0
     picture = apply_point_spread(scene, parameters).astype(np.float64)
@@ -23,20 +25,20 @@ def test_point_spread_keeps_light_and_place(parameters: OpticsParameters) -> Non
     assert (picture * columns).sum() / picture.sum() == pytest.approx(17.0, abs=1e-3)
 
 
-def test_light_is_kept_at_the_border_too() -> None:
+def test_light_is_kept_at_the_border() -> None:
     scene = np.random.default_rng(0).random((30, 25), dtype=np.float32)
     assert apply_point_spread(scene, MER).sum(dtype=np.float64) == pytest.approx(scene.sum(dtype=np.float64), rel=1e-6)
 
 
-def test_point_spread_has_the_stated_modulation_transfer() -> None:
-    """At half the Nyquist frequency, by the closed form; the kernel gathers the 1.5 % of light beyond its ends."""
+def test_point_spread_has_the_specified_modulation_transfer() -> None:
+    """At half the Nyquist frequency by the closed form; the kernel contains the 1.5 % of light beyond its ends."""
     frequency = 0.25
     s = frequency * MER.diffraction_px
     diffraction = 2.0 / np.pi * (np.arccos(s) - s * np.sqrt(1.0 - s * s))
     diffusion = np.exp(-2.0 * (np.pi * MER.diffusion_px * frequency) ** 2)
     taps = line_spread(MER)
-    found = (taps * np.cos(2.0 * np.pi * frequency * np.arange(-6, 7))).sum()
-    assert found == pytest.approx(diffraction * diffusion, rel=0.02)
+    result = (taps * np.cos(2.0 * np.pi * frequency * np.arange(-6, 7))).sum()
+    assert result == pytest.approx(diffraction * diffusion, rel=0.02)
 
 
 def test_without_spread_the_scene_is_untouched() -> None:
@@ -44,17 +46,17 @@ def test_without_spread_the_scene_is_untouched() -> None:
     assert apply_point_spread(scene, OpticsParameters(diffraction_px=0.0, diffusion_px=0.0)) is scene
 
 
-def test_fall_off_is_the_fourth_power_of_the_cosine_for_a_perspective_lens() -> None:
+def test_perspective_fall_off_is_cosine_to_the_fourth() -> None:
     camera = Cahv.from_field_of_view(horizontal_rad=np.radians(60.0), size=(101, 101), centre=np.zeros(3), **FORWARD)
     fall_off = natural_fall_off(camera)
     assert fall_off[50, 50] == pytest.approx(1.0)
     cosine = camera.rays(camera.pixel_grid())[1] @ camera.a
-    # finite differences over pixels of 0.6 deg
+    # Finite differences over pixels of 0.6 deg.
     np.testing.assert_allclose(fall_off, cosine**4, rtol=2e-3)
 
 
-def test_fall_off_of_an_equidistant_fisheye() -> None:
-    """A pixel's solid angle falls with sin(theta) / theta there, and the pupil turns by a twentieth of theta."""
+def test_equidistant_fisheye_fall_off_matches_formula() -> None:
+    """The solid angle of a pixel decreases with sin(theta) / theta, and the pupil tilts by a twentieth of theta."""
     pinhole = Cahv.from_focal_length(5.58e-3, 96e-6, (128, 128), centre=np.zeros(3), **FORWARD)
     camera = Cahvore.from_cahv(pinhole, r=np.zeros(3), linearity=0.0)
     theta = np.arccos(np.clip(camera.rays(camera.pixel_grid())[1] @ camera.a, -1.0, 1.0))
@@ -62,15 +64,15 @@ def test_fall_off_of_an_equidistant_fisheye() -> None:
     np.testing.assert_allclose(natural_fall_off(camera)[20:-20, 20:-20], expected[20:-20, 20:-20], rtol=5e-3)
 
 
-def test_dust_attenuates_softly_and_is_unknown_to_the_ground() -> None:
+def test_dust_attenuates_and_is_not_calibrated() -> None:
     dusty = OpticsParameters(dust_discs=4, dust_depth=0.4, dust_radius_px=12.0)
     transmission = dust_transmission((128, 128), dusty, np.random.default_rng(4))
     assert transmission.max() == 1.0
     assert 0.6**4 <= transmission.min() <= 0.6 + 1e-6
-    # four shadows of 12 px over a picture of 128 px: 11 % of it, more or less
+    # Four shadows of 12 px in an image of 128 px cover about 11 %.
     assert 0.03 < (transmission < 0.99).mean() < 0.4
     assert np.abs(np.diff(transmission, axis=1)).max() < 0.4 * 1.5 / 8.0
     even = np.ones((128, 128), dtype=np.float32)
-    clean, soiled = (Detector.drawn(even, DetectorParameters(optics=o), np.random.default_rng(1)) for o in (MER, dusty))
+    clean, soiled = (Detector.draw(even, DetectorParameters(optics=o), np.random.default_rng(1)) for o in (MER, dusty))
     assert soiled.response.sum() < clean.response.sum()
     np.testing.assert_array_equal(soiled.calibration.flat_field, clean.calibration.flat_field)

@@ -1,3 +1,5 @@
+"""Tests of camera presets: fields of view, baselines and signal levels."""
+
 import numpy as np
 import pytest
 from pydantic import BaseModel, ValidationError
@@ -11,7 +13,7 @@ class _Campaign(BaseModel):
 
 
 def _fields_deg(name: str) -> tuple[float, float]:
-    """Angles between the middles of opposite edges."""
+    """Angles between the centres of opposite edges."""
     camera = preset(name).cameras()[0]
     columns, rows = camera.size
     u, v = (columns - 1) / 2, (rows - 1) / 2
@@ -26,19 +28,19 @@ def _fields_deg(name: str) -> tuple[float, float]:
         ("mer-descent-flown", 45.0, 45.0, 1.0),
         ("mer-descent-field", 45.0, 45.0, 1.0),
         ("mer-navcam", 45.0, 45.0, 1.0),
-        # 1024 pixels of 12 um behind 5.58 mm are 126 deg for an equidistant lens
+        # 1024 pixels of 12 um behind 5.58 mm are 126 deg for an equidistant lens.
         ("mer-hazcam", 124.0, 124.0, 3.0),
-        # the tracking paper's fields are those of 4.8 mm x 3.6 mm, ours of 4.65 um pixels
+        # The tracking paper states the fields for 4.8 mm x 3.6 mm; the preset has pixels of 4.65 um.
         ("research-navcam", 49.0, 37.0, 6.0),
         ("research-pancam", 17.0, 13.0, 0.5),
     ],
 )
-def test_fields_of_view(name: str, across: float, down: float, tolerance: float) -> None:
+def test_presets_have_the_specified_fields_of_view(name: str, across: float, down: float, tolerance: float) -> None:
     assert _fields_deg(name) == pytest.approx((across, down), abs=tolerance)
 
 
-def test_the_helicopters_camera_has_a_lens_with_distortion() -> None:
-    """640 x 480 pixels of 7.4 um behind 6 mm, CAHVOR: corners are drawn in by 1.8 % of 400 px."""
+def test_helicopter_camera_has_lens_distortion() -> None:
+    """640 x 480 pixels of 7.4 um behind 6 mm, CAHVOR: the distortion at the corners is 1.8 % of 400 px."""
     camera = preset("xc-55").cameras()[0]
     assert isinstance(camera, Cahvor)
     ideal = Cahv.from_focal_length(
@@ -46,8 +48,8 @@ def test_the_helicopters_camera_has_a_lens_with_distortion() -> None:
     )
     corner = np.array([[639.5, 479.5]]) - 0.5
     point = 10.0 * ideal.rays(corner)[1]
-    (drawn,), _ = camera.project(point)
-    towards_middle = np.linalg.norm(corner[0] - [319.5, 239.5]) - np.linalg.norm(drawn - [319.5, 239.5])
+    (samples,), _ = camera.project(point)
+    towards_middle = np.linalg.norm(corner[0] - [319.5, 239.5]) - np.linalg.norm(samples - [319.5, 239.5])
     assert towards_middle == pytest.approx(0.018 * 400.0, abs=0.3)
 
 
@@ -55,21 +57,21 @@ def test_the_helicopters_camera_has_a_lens_with_distortion() -> None:
     ("name", "baseline_m"),
     [("mer-navcam", 0.20), ("mer-hazcam", 0.10), ("research-navcam", 0.20), ("research-pancam", 0.30)],
 )
-def test_pairs(name: str, baseline_m: float) -> None:
+def test_stereo_presets_have_the_specified_baseline(name: str, baseline_m: float) -> None:
     left, right = preset(name).cameras()
     np.testing.assert_allclose(left.c - right.c, [0.0, baseline_m, 0.0], atol=1e-12)
     for camera in (left, right):
         assert camera.theta < 0
-        # up is up and forward is forward
+        # Up and forward have the expected signs.
         assert camera.a[0] > 0.99
         np.testing.assert_allclose(camera.down, [0.0, 0.0, -1.0], atol=1e-12)
-    # what is ahead lies further right for the left camera
+    # Points ahead are farther right in the left camera.
     ahead = np.array([2.0, 0.0, 0.0])
     assert left.project(ahead)[0][0] > right.project(ahead)[0][0]
 
 
-def test_pancam_toes_in() -> None:
-    """2 deg between the cameras are 120 px of the 516 px of disparity at 2 m."""
+def test_pancam_has_toe_in() -> None:
+    """2 deg between the cameras are 120 of the 516 px of disparity at 2 m."""
     left, right = preset("research-pancam").cameras()
     ahead = np.array([2.0, 0.0, 0.0])
     disparity = left.project(ahead)[0][0] - right.project(ahead)[0][0]
@@ -81,12 +83,12 @@ def test_hazcam_is_a_fisheye() -> None:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_picture_of_each(name: str) -> None:
-    """Ground of radiance factor 0.3 fills about 60 % of the full well on axis; the descent camera is set for less."""
+def test_each_preset_exposes_an_image(name: str) -> None:
+    """Ground of radiance factor 0.3 fills about 60 % of the full well on axis, and less for the descent camera."""
     camera = preset(name)
     fall_off = natural_fall_off(camera.cameras()[0])[::8, ::8]
     p = camera.detector.model_copy(update={"rows_summed": 1, "transfer_row_s": 0.0, "clear_row_s": 0.0})
-    detector = Detector.drawn(np.ascontiguousarray(fall_off), p, np.random.default_rng(0))
+    detector = Detector.draw(np.ascontiguousarray(fall_off), p, np.random.default_rng(0))
     counts = detector.expose(0.3 * np.ones_like(fall_off), np.random.default_rng(1))
     rows, columns = counts.shape
     level = np.median(counts[rows // 2 - 5 : rows // 2 + 5, columns // 2 - 5 : columns // 2 + 5]) / p.full_scale_dn
@@ -94,22 +96,22 @@ def test_a_picture_of_each(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_responsivity_is_that_of_the_sunlight_that_is_stated_with_it(name: str) -> None:
+def test_responsivity_matches_the_stated_sunlight(name: str) -> None:
     camera = preset(name)
     of_earth = camera.light.responsivity_e_s(1.0)
     assert camera.detector.responsivity_e_s == pytest.approx(camera.detector.sunlight * of_earth, rel=1e-12)
-    # MER's cameras are at Mars, but for the descent camera that was flown over deserts
+    # MER's cameras are on Mars, except for the descent camera, which was flown over deserts.
     assert camera.detector.sunlight == pytest.approx(
         0.444 if name in ("mer-descent-flown", "mer-navcam", "mer-hazcam") else 1.0, abs=1e-3
     )
 
 
-def test_unknown_name() -> None:
+def test_unknown_preset_is_rejected() -> None:
     with pytest.raises(ValueError, match=r"no camera preset 'mer-pancam'; allowed: mer-descent-flown, "):
         preset("mer-pancam")
 
 
-def test_a_campaign_names_a_preset_and_changes_it() -> None:
+def test_campaign_can_modify_a_preset() -> None:
     chosen = _Campaign.model_validate(
         {"detector": {"preset": "mer-descent-field", "temperature_c": 23.0, "optics": {"dust_discs": 3}}}
     ).detector

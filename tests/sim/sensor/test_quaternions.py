@@ -1,3 +1,5 @@
+"""Tests of quaternion products against SciPy's rotations."""
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -5,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.sim.sensor.imu import accumulate_quaternions, multiply_quaternions
 
 
-def test_products_are_those_of_rotations() -> None:
+def test_quaternion_products_match_rotations() -> None:
     left, right = Rotation.random(50, rng=1), Rotation.random(50, rng=2)
     product = Rotation.from_quat(multiply_quaternions(left.as_quat(), right.as_quat()))
     np.testing.assert_allclose(product.as_matrix(), (left * right).as_matrix(), atol=1e-14)
@@ -18,5 +20,5 @@ def test_accumulated_quaternions_equal_rotation_products(count: int) -> None:
     for step in steps:
         product = product * step
         expected.append(product.as_matrix())
-    found = Rotation.from_quat(accumulate_quaternions(steps.as_quat()))
-    np.testing.assert_allclose(found.as_matrix(), expected, atol=1e-12)
+    result = Rotation.from_quat(accumulate_quaternions(steps.as_quat()))
+    np.testing.assert_allclose(result.as_matrix(), expected, atol=1e-12)

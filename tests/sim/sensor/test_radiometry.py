@@ -1,3 +1,5 @@
+"""Tests of the radiometry of detectors against published values."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -18,14 +20,14 @@ def _signal_to_noise(p: DetectorParameters, radiance_factor: float) -> float:
     return float(np.mean(signal / noise))
 
 
-def test_sunlight_is_the_solar_constant() -> None:
+def test_total_sunlight_equals_the_solar_constant() -> None:
     wavelength_nm = np.linspace(150.0, 20000.0, 100000)
     energy = 6.62607015e-34 * 2.99792458e8 / (wavelength_nm * 1e-9)
-    # 1361 W/m2, of which 0.2 % lie outside
+    # 1361 W/m2, of which 0.2 % are outside the band.
     assert np.trapezoid(solar_photons(wavelength_nm) * energy, wavelength_nm) == pytest.approx(1361.0, rel=0.003)
 
 
-def test_neutral_density_filters() -> None:
+def test_neutral_density_filters_match_the_paper() -> None:
     """Section III.B.2: optical density 0.67 and 22 %, 0.97 and 11 %."""
     for camera, fraction in ((FLOWN, 0.22), (FIELD, 0.11)):
         bare = replace(camera.light, neutral_density=None)
@@ -34,38 +36,38 @@ def test_neutral_density_filters() -> None:
 
 
 @pytest.mark.parametrize(
-    ("temperature_c", "ratio", "share"), [(-34.0, 102.0, None), (0.0, 100.0, 0.02), (23.0, 87.0, 0.15)]
+    ("temperature_c", "ratio", "dark_fraction"), [(-34.0, 102.0, None), (0.0, 100.0, 0.02), (23.0, 87.0, 0.15)]
 )
 def test_paper_signal_to_noise_and_dark_current_fractions(
-    temperature_c: float, ratio: float, share: float | None
+    temperature_c: float, ratio: float, dark_fraction: float | None
 ) -> None:
-    """Section III.B.3, one set of constants: the ratio within 2, fractions within a factor of 1.2."""
+    """Section III.B.3 with one set of constants: the ratio within 2, fractions within a factor of 1.2."""
     for camera in (FLOWN, FIELD):
         p = camera.detector.model_copy(update={"temperature_c": temperature_c})
         assert _signal_to_noise(p, DARKEST_RADIANCE_FACTOR) == pytest.approx(ratio, abs=2.0)
         without = _signal_to_noise(p.model_copy(update={"dark_e_s": 0.0}), DARKEST_RADIANCE_FACTOR)
-        found = 1.0 - _signal_to_noise(p, DARKEST_RADIANCE_FACTOR) / without
-        if share is None:
-            assert found < 0.001
+        result = 1.0 - _signal_to_noise(p, DARKEST_RADIANCE_FACTOR) / without
+        if dark_fraction is None:
+            assert result < 0.001
         else:
-            assert share / 1.2 < found < share * 1.2
+            assert dark_fraction / 1.2 < result < dark_fraction * 1.2
 
 
-def test_field_test_gathers_as_many_electrons_as_flight() -> None:
-    flown, field = FLOWN.detector, FIELD.detector
-    electrons = flown.responsivity_e_s * flown.exposure_s
+def test_field_test_and_flight_collect_similar_charge() -> None:
+    flight, field = FLOWN.detector, FIELD.detector
+    electrons = flight.responsivity_e_s * flight.exposure_s
     assert field.responsivity_e_s * field.exposure_s == pytest.approx(electrons)
-    # 44 % of the sunlight through 22 % of glass is a little less than all of it through 11 %
-    assert flown.responsivity_e_s / field.responsivity_e_s == pytest.approx(0.44 * 0.22 / 0.11, rel=0.03)
-    assert 0.003 < field.exposure_s < flown.exposure_s < 0.005
+    # 44 % of the sunlight through a 22 % filter is slightly less than all of it through 11 %.
+    assert flight.responsivity_e_s / field.responsivity_e_s == pytest.approx(0.44 * 0.22 / 0.11, rel=0.03)
+    assert 0.003 < field.exposure_s < flight.exposure_s < 0.005
 
 
 def test_default_detector_is_the_flown_descent_camera() -> None:
     p = DetectorParameters()
-    flown = FLOWN.detector.model_dump()
-    assert p.responsivity_e_s == pytest.approx(flown.pop("responsivity_e_s"), rel=2e-3)
-    assert p.optics.diffraction_px == pytest.approx(flown.pop("optics")["diffraction_px"], abs=0.01)
-    assert p.model_dump(include=set(flown)) == flown
+    flight = FLOWN.detector.model_dump()
+    assert p.responsivity_e_s == pytest.approx(flight.pop("responsivity_e_s"), rel=2e-3)
+    assert p.optics.diffraction_px == pytest.approx(flight.pop("optics")["diffraction_px"], abs=0.01)
+    assert p.model_dump(include=set(flight)) == flight
     assert p.dark_e_s == DARK_E_S
 
 

@@ -1,4 +1,4 @@
-"""Radar, laser and receiver: what they share, then each one's own geometry."""
+"""Tests of radar, laser and satellite receiver: common properties and the geometry of each."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from marsyard.sim.sensor.ranging import RangingUnit, first_return, range_along
 from marsyard.sim.terrain import Surface
 from tests.sim.sensor.motions import Swaying
 
-#: Carrier phases against a base station near by: 2 cm (the class of NovAtel's RT2 with its integers fixed).
+#: Carrier phases with a nearby base station: 2 cm (the class of NovAtel's RT2 with fixed integers).
 RTK = GpsParameters(
     horizontal_noise_m=0.01,
     vertical_noise_m=0.015,
@@ -36,24 +36,24 @@ SIDE, SPACING = 1024, 5.0
 MIDDLE = 0.5 * SIDE * SPACING
 
 
-def _surface(heights: Float64[np.ndarray, "rows columns"], spacing: float = SPACING) -> Surface:
+def _make_surface(heights: Float64[np.ndarray, "rows columns"], spacing: float = SPACING) -> Surface:
     samples = np.zeros((*heights.shape, 2), dtype=np.float32)
     samples[..., 0] = heights
     return Surface.from_samples(samples, spacing)
 
 
-def _plane(slope: float) -> Surface:
-    """Rises to the east through height 0 in the middle; falls back at the border, far away."""
-    return _surface(np.tile(slope * (np.arange(SIDE) * SPACING - MIDDLE), (SIDE, 1)))
+def _make_plane(slope: float) -> Surface:
+    """A plane that rises to the east through height 0 at the centre and falls at the distant border."""
+    return _make_surface(np.tile(slope * (np.arange(SIDE) * SPACING - MIDDLE), (SIDE, 1)))
 
 
-def _rough(seed: int) -> Surface:
+def _make_rough_surface(seed: int) -> Surface:
     """Gaussian relief with a power law, 30 m RMS over 2 km."""
     rng = np.random.default_rng(seed)
     wavenumbers = np.hypot(np.fft.fftfreq(SIDE)[:, None], np.fft.rfftfreq(SIDE)[None, :])
     wavenumbers[0, 0] = np.inf
     heights = np.fft.irfft2(wavenumbers**-1.7 * np.fft.rfft2(rng.standard_normal((SIDE, SIDE))), s=(SIDE, SIDE))
-    return _surface(30.0 * heights / heights.std(), 2.0)
+    return _make_surface(30.0 * heights / heights.std(), 2.0)
 
 
 def _axis(tilt_deg: float, azimuth_deg: float = 90.0) -> Float64[np.ndarray, "3"]:
@@ -62,37 +62,39 @@ def _axis(tilt_deg: float, azimuth_deg: float = 90.0) -> Float64[np.ndarray, "3"
 
 
 Instrument = RadarAltimeter | Gps
-FLAT = _surface(np.zeros((64, 64)))
+FLAT = _make_surface(np.zeros((64, 64)))
 
 
-def _radar(rng: np.random.Generator, **errors: object) -> Instrument:
-    return RadarAltimeter.drawn(RadarParameters.model_validate(errors), FLAT, rng)
+def _make_radar(rng: np.random.Generator, **errors: object) -> Instrument:
+    return RadarAltimeter.draw(RadarParameters.model_validate(errors), FLAT, rng)
 
 
-def _gps(rng: np.random.Generator, **errors: object) -> Instrument:
-    return Gps.drawn(GpsParameters.model_validate(errors), (-10.0, 30.0), rng)
+def _make_gps(rng: np.random.Generator, **errors: object) -> Instrument:
+    return Gps.draw(GpsParameters.model_validate(errors), (-10.0, 30.0), rng)
 
 
 PERFECT: dict[Callable[..., Instrument], dict[str, object]] = {
-    _radar: {"scale_error": 0.0, "noise": 0.0, "count_m": 0.0, "clock": {}},
-    _gps: dict.fromkeys(("horizontal_noise_m", "vertical_noise_m", "horizontal_wander_m", "vertical_wander_m"), 0.0),
+    _make_radar: {"scale_error": 0.0, "noise": 0.0, "count_m": 0.0, "clock": {}},
+    _make_gps: dict.fromkeys(
+        ("horizontal_noise_m", "vertical_noise_m", "horizontal_wander_m", "vertical_wander_m"), 0.0
+    ),
 }
 each = pytest.mark.parametrize("make", PERFECT, ids=["radar", "gps"])
 
 
 @each
-def test_without_errors_truth_is_read(make: Callable[..., Instrument]) -> None:
+def test_error_free_readings_equal_the_truth(make: Callable[..., Instrument]) -> None:
     instrument = make(np.random.default_rng(0), **PERFECT[make])
     times = instrument.sampling.within(0.0, 10.0)
     readings = instrument.measure(DESCENT, times, np.random.default_rng(1))
     true = DESCENT.motion(times).positions_m
-    # flat ground at height 0
+    # Flat ground at height 0.
     np.testing.assert_allclose(readings.values, true if readings.values.ndim == 2 else true[:, 2], atol=1e-6)
     np.testing.assert_array_equal(readings.times_s, times)
 
 
 @each
-def test_readings_are_those_of_the_true_time_whatever_the_tag(make: Callable[..., Instrument]) -> None:
+def test_readings_belong_to_the_true_time(make: Callable[..., Instrument]) -> None:
     clock = {"offset_s": 0.02, "jitter_sd_s": 0.001}
     instrument = make(np.random.default_rng(0), **PERFECT[make] | {"clock": clock})
     times = np.arange(400) * 0.02
@@ -100,13 +102,13 @@ def test_readings_are_those_of_the_true_time_whatever_the_tag(make: Callable[...
     heights = readings.values[:, 2] if readings.values.ndim == 2 else readings.values
     np.testing.assert_allclose(heights, 2000.0 - 75.0 * times, atol=1e-6)
     error = readings.times_s - times
-    # 400 values: mean and spread are known to 5e-5 s and 3.5 %
+    # 400 values determine mean and spread to 5e-5 s and 3.5 %.
     assert error.mean() == pytest.approx(0.02, abs=2e-4)
     assert error.std() == pytest.approx(0.001, rel=0.15)
 
 
 @each
-def test_the_same_streams_give_the_same_readings(make: Callable[..., Instrument]) -> None:
+def test_equal_streams_give_equal_readings(make: Callable[..., Instrument]) -> None:
     def read() -> Readings:
         return make(np.random.default_rng(5)).measure(DESCENT, np.array([0.0, 1.0]), np.random.default_rng(6))
 
@@ -114,40 +116,40 @@ def test_the_same_streams_give_the_same_readings(make: Callable[..., Instrument]
     np.testing.assert_array_equal(read().times_s, read().times_s)
 
 
-def test_readings_come_at_the_rate_from_a_phase_of_their_own() -> None:
+def test_readings_have_constant_rate_and_random_phase() -> None:
     sampling = Sampling(10.0, 0.03)
     np.testing.assert_allclose(sampling.within(0.0, 0.35), [0.03, 0.13, 0.23, 0.33])
     np.testing.assert_allclose(sampling.latest(np.array([0.0, 0.1, 0.329, 3.75])), [-0.07, 0.03, 0.23, 3.73])
-    phases = [Sampling.drawn(10.0, np.random.default_rng(seed)).phase_s for seed in range(200)]
+    phases = [Sampling.draw(10.0, np.random.default_rng(seed)).phase_s for seed in range(200)]
     assert 0.0 <= min(phases) < 0.01
     assert 0.09 < max(phases) < 0.1
 
 
-def test_radar_scale_is_common_and_noise_is_not() -> None:
-    still = Swaying(position_m=(0.0, 0.0, 1000.0))
+def test_radar_scale_is_common_and_noise_is_independent() -> None:
+    static = Swaying(position_m=(0.0, 0.0, 1000.0))
     parameters = RadarParameters(scale_error=0.01, noise=0.001, count_m=0.0)
     common, noise = [], []
     for seed in range(300):
         rng = np.random.default_rng(seed)
-        radar = RadarAltimeter.drawn(parameters, FLAT, rng)
-        first, second = radar.measure(still, np.array([0.0, 1.0]), rng).values
+        radar = RadarAltimeter.draw(parameters, FLAT, rng)
+        first, second = radar.measure(static, np.array([0.0, 1.0]), rng).values
         common.append(0.5 * (first + second) - 1000.0)
         noise.append((first - second) / np.sqrt(2.0))
-    # 300 values, known to 4 %; tolerance three times that
+    # 300 values determine the spread to 4 %; the tolerance is three times that.
     assert np.std(common) == pytest.approx(10.0, rel=0.12)
     assert np.std(noise) == pytest.approx(1.0, rel=0.12)
 
 
-def test_by_default_one_per_cent_of_altitude_is_three_standard_deviations() -> None:
+def test_default_radar_error_is_one_percent_at_3_sigma() -> None:
     p = RadarParameters()
     assert 3.0 * np.hypot(p.scale_error, p.noise) == pytest.approx(0.01, rel=0.01)
 
 
-def test_a_radar_counts_and_hears_nothing_beyond_its_range() -> None:
+def test_radar_is_quantised_and_limited_in_range() -> None:
     parameters = RadarParameters(
         scale_error=0.0, noise=0.0, count_m=0.5, max_range_m=1990.0, min_range_m=1700.0, clock=ClockParameters()
     )
-    radar = RadarAltimeter.drawn(parameters, FLAT, np.random.default_rng(0))
+    radar = RadarAltimeter.draw(parameters, FLAT, np.random.default_rng(0))
     values = radar.measure(DESCENT, np.array([0.0, 1.0, 1.001, 5.0]), np.random.default_rng(0)).values
     np.testing.assert_array_equal(values, [np.nan, 1925.0, 1925.0, np.nan])
     with pytest.raises(ValueError, match="less than max_range_m"):
@@ -155,103 +157,103 @@ def test_a_radar_counts_and_hears_nothing_beyond_its_range() -> None:
 
 
 @pytest.mark.parametrize("slope_deg", [0.0, 5.0, 12.0])
-def test_over_a_slope_the_radar_reads_the_perpendicular(slope_deg: float) -> None:
-    surface = _plane(np.tan(np.radians(slope_deg)))
+def test_radar_over_a_slope_measures_the_perpendicular(slope_deg: float) -> None:
+    surface = _make_plane(np.tan(np.radians(slope_deg)))
     position = np.array([MIDDLE, MIDDLE, 1000.0])
-    found = first_return(surface, position, _axis(0.0), np.radians(30.0), 5000.0)
-    assert found == pytest.approx(1000.0 * np.cos(np.radians(slope_deg)), abs=0.1)
+    result = first_return(surface, position, _axis(0.0), np.radians(30.0), 5000.0)
+    assert result == pytest.approx(1000.0 * np.cos(np.radians(slope_deg)), abs=0.1)
 
 
-def test_within_a_narrow_beam_a_slope_is_read_at_the_edge() -> None:
-    surface = _plane(np.tan(np.radians(20.0)))
+def test_narrow_beam_measures_a_slope_at_its_edge() -> None:
+    surface = _make_plane(np.tan(np.radians(20.0)))
     position = np.array([MIDDLE, MIDDLE, 1000.0])
-    found = first_return(surface, position, _axis(0.0), np.radians(5.0), 5000.0)
-    # the ray 5 deg uphill of nadir: r cos 5 = 1000 - r sin 5 tan 20
+    result = first_return(surface, position, _axis(0.0), np.radians(5.0), 5000.0)
+    # The ray 5 deg uphill of nadir: r cos 5 = 1000 - r sin 5 tan 20.
     expected = 1000.0 / (np.cos(np.radians(5.0)) + np.sin(np.radians(5.0)) * np.tan(np.radians(20.0)))
-    assert found == pytest.approx(expected, rel=5e-4)
+    assert result == pytest.approx(expected, rel=5e-4)
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 20.0, 30.0, 40.0, 60.0])
-def test_a_tilt_beyond_half_the_beam_lengthens_the_reading(tilt_deg: float) -> None:
+def test_tilt_beyond_half_beam_width_increases_the_range(tilt_deg: float) -> None:
     position = np.array([0.0, 0.0, 1500.0])
-    found = first_return(FLAT, position, _axis(tilt_deg, 33.0), np.radians(30.0), 5000.0)
+    result = first_return(FLAT, position, _axis(tilt_deg, 33.0), np.radians(30.0), 5000.0)
     beyond = max(np.radians(tilt_deg - 30.0), 0.0)
-    assert found == pytest.approx(1500.0 / np.cos(beyond), rel=5e-4)
+    assert result == pytest.approx(1500.0 / np.cos(beyond), rel=5e-4)
 
 
-def test_next_to_a_cliff_the_radar_reads_its_edge() -> None:
+def test_radar_near_a_cliff_measures_its_edge() -> None:
     heights = np.zeros((SIDE, SIDE))
     edge = SIDE // 2 + 60
     heights[:, edge:] = 200.0
     position = np.array([MIDDLE, MIDDLE, 1500.0])
-    found = first_return(_surface(heights), position, _axis(0.0), np.radians(30.0), 5000.0)
-    # the spline makes a ramp of the step, whose top lies one cell beyond the edge
-    assert found == pytest.approx(np.hypot(61 * SPACING, 1300.0), abs=0.1)
-    # its top lies 13 deg from nadir: a beam of 10 deg to either side does not see it
-    assert first_return(_surface(heights), position, _axis(0.0), np.radians(10.0), 5000.0) == pytest.approx(1500.0)
+    result = first_return(_make_surface(heights), position, _axis(0.0), np.radians(30.0), 5000.0)
+    # The spline makes a ramp of the step; its top is one cell beyond the edge.
+    assert result == pytest.approx(np.hypot(61 * SPACING, 1300.0), abs=0.1)
+    # Its top is 13 deg from nadir, outside a beam of 10 deg to each side.
+    assert first_return(_make_surface(heights), position, _axis(0.0), np.radians(10.0), 5000.0) == pytest.approx(1500.0)
 
 
 @pytest.mark.parametrize(("height", "tilt_deg"), [(2000.0, 0.0), (1400.0, 25.0), (2000.0, 38.0)])
-def test_first_return_is_that_of_a_dense_scan(height: float, tilt_deg: float) -> None:
-    surface = _rough(int(height + tilt_deg))
+def test_first_return_matches_a_dense_scan(height: float, tilt_deg: float) -> None:
+    surface = _make_rough_surface(int(height + tilt_deg))
     position, axis = np.array([300.0, 700.0, height]), _axis(tilt_deg, 200.0)
     line = np.arange(-1500.0, 1500.0, 2.0)
     x, y = np.meshgrid(line, line)
     down = height - surface.height(300.0 + x, 700.0 + y)
     ranges = np.sqrt(x**2 + y**2 + down**2)
-    seen = x * axis[0] + y * axis[1] - down * axis[2] >= ranges * np.cos(np.radians(30.0))
-    found = first_return(surface, position, axis, np.radians(30.0), 5000.0)
-    # the bar: 0.05 % of the altitude
-    assert found == pytest.approx(ranges[seen].min(), abs=5e-4 * height)
+    observed = x * axis[0] + y * axis[1] - down * axis[2] >= ranges * np.cos(np.radians(30.0))
+    result = first_return(surface, position, axis, np.radians(30.0), 5000.0)
+    # Requirement: 0.05 % of the altitude.
+    assert result == pytest.approx(ranges[observed].min(), abs=5e-4 * height)
 
 
-def test_a_radar_sees_nothing_above_the_horizon() -> None:
+def test_radar_above_the_horizon_has_no_return() -> None:
     for height in (1000.0, 1.0):
         assert first_return(FLAT, np.array([0.0, 0.0, height]), _axis(150.0), np.radians(30.0), 5000.0) == np.inf
 
 
-def test_a_radar_on_a_ledge_finds_the_ground_far_below() -> None:
+def test_radar_on_a_ledge_finds_the_ground_below() -> None:
     heights = np.zeros((SIDE, SIDE))
     edge = SIDE // 2
     heights[:, :edge] = 400.0
-    # 1 m above the ledge, 20 m from its edge, looking 60 deg down to the east with a narrow beam
+    # 1 m above the ledge, 20 m from its edge, with a narrow beam 60 deg down to the east.
     position = np.array([edge * SPACING - 20.0, MIDDLE, 401.0])
-    found = first_return(_surface(heights), position, _axis(60.0), np.radians(2.0), 5000.0)
-    assert found < 10.0
+    result = first_return(_make_surface(heights), position, _axis(60.0), np.radians(2.0), 5000.0)
+    assert result < 10.0
     position = np.array([edge * SPACING + 15.0, MIDDLE, 401.0])
-    found = first_return(_surface(heights), position, _axis(60.0), np.radians(2.0), 5000.0)
-    assert found == pytest.approx(401.0 / np.cos(np.radians(58.0)), rel=5e-3)
+    result = first_return(_make_surface(heights), position, _axis(60.0), np.radians(2.0), 5000.0)
+    assert result == pytest.approx(401.0 / np.cos(np.radians(58.0)), rel=5e-3)
 
 
-def test_a_laser_reads_the_slant_range_of_its_axis() -> None:
-    # body -z turned by 20 deg about north points to the west and down: r cos 20 = 100 + 0.1 r sin 20
+def test_laser_measures_slant_range_along_its_axis() -> None:
+    # Body -z rotated by 20 deg about north points west and down: r cos 20 = 100 + 0.1 r sin 20.
     axis = np.array([-np.sin(np.radians(20.0)), 0.0, -np.cos(np.radians(20.0))])
     expected = 100.0 / (np.cos(np.radians(20.0)) - 0.1 * np.sin(np.radians(20.0)))
     position = np.array([MIDDLE, MIDDLE, 100.0])
-    assert range_along(_plane(0.1), position, axis, 300.0) == pytest.approx(expected, abs=1e-4)
-    assert range_along(_plane(0.1), position, axis, 90.0) == np.inf
+    assert range_along(_make_plane(0.1), position, axis, 300.0) == pytest.approx(expected, abs=1e-4)
+    assert range_along(_make_plane(0.1), position, axis, 90.0) == np.inf
     assert range_along(FLAT, position, np.array([0.0, 0.0, 1.0]), 300.0) == np.inf
 
 
-def test_a_laser_unit_reads_with_its_errors() -> None:
+def test_laser_unit_adds_its_errors() -> None:
     perfect = LaserParameters(noise_m=0.0, count_m=0.0, clock=ClockParameters())
-    unit = RangingUnit.drawn(perfect, np.random.default_rng(0))
+    unit = RangingUnit.draw(perfect, np.random.default_rng(0))
     readings = unit.readings(np.arange(3.0), np.array([10.0, np.inf, 301.0]), np.random.default_rng(0))
     np.testing.assert_array_equal(readings.values, [10.0, np.nan, np.nan])
 
 
-def test_true_altitude_is_above_the_ground_straight_below() -> None:
+def test_true_altitude_is_vertical_height_above_ground() -> None:
     positions = np.array([[MIDDLE + 100.0, MIDDLE, 500.0], [MIDDLE - 50.0, MIDDLE, 500.0]])
-    np.testing.assert_allclose(height_above_ground(_plane(0.2), positions), [480.0, 510.0], atol=1e-3)
+    np.testing.assert_allclose(height_above_ground(_make_plane(0.2), positions), [480.0, 510.0], atol=1e-3)
 
 
-def test_a_receiver_has_the_stated_spreads() -> None:
+def test_receiver_errors_have_the_specified_spreads() -> None:
     errors, time = [], np.array([2.0])
     true = DESCENT.motion(time).positions_m[0]
     for seed in range(200):
         rng = np.random.default_rng(seed)
-        gps = Gps.drawn(RTK, (0.0, 10.0), rng)
+        gps = Gps.draw(RTK, (0.0, 10.0), rng)
         errors.append(gps.measure(DESCENT, time, rng).values[0] - true)
-    # 400 and 200 values, known to 3.5 % and 5 %; tolerance three times that
+    # 400 and 200 values determine spreads to 3.5 % and 5 %; the tolerance is three times that.
     assert np.std(np.array(errors)[:, :2]) == pytest.approx(np.hypot(0.01, 0.01), rel=0.11)
     assert np.std(np.array(errors)[:, 2]) == pytest.approx(np.hypot(0.015, 0.02), rel=0.15)

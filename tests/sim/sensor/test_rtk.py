@@ -1,4 +1,4 @@
-"""The carrier-phase receiver: sizes and correlation of its errors, changes of solution, outages, what it reports."""
+"""Tests of the carrier-phase receiver: error sizes and correlation, solution changes, outages and reported accuracy."""
 
 from __future__ import annotations
 
@@ -12,64 +12,64 @@ MOTION = Swaying(position_m=(10.0, 20.0, 30.0), velocity_m_s=(1.0, -0.5, 0.2), s
 SPAN = (0.0, 400.0)
 
 
-def _measured(seed: int, times: np.ndarray, **changes: object) -> tuple[RtkReceiver, RtkSolutions]:
+def _measure(seed: int, times: np.ndarray, **changes: object) -> tuple[RtkReceiver, RtkSolutions]:
     rng = np.random.default_rng(seed)
-    receiver = RtkReceiver.drawn(RtkParameters.model_validate(changes), SPAN, rng)
+    receiver = RtkReceiver.draw(RtkParameters.model_validate(changes), SPAN, rng)
     return receiver, receiver.measure(MOTION, times, rng)
 
 
 @pytest.mark.parametrize("kind", ["fixed", "floating"])
-def test_errors_have_the_stated_sizes_and_the_reported_deviation_is_theirs(kind: str) -> None:
-    share = 1.0 if kind == "floating" else 0.0
+def test_errors_match_specified_and_reported_deviation(kind: str) -> None:
+    fraction = 1.0 if kind == "floating" else 0.0
     times = np.array([5.0])
     true = MOTION.motion(times)
-    drawn = [_measured(seed, times, float_fraction=share) for seed in range(400)]
-    off = np.array([(s.positions_m - true.positions_m)[0] for _, s in drawn])
-    # 400 values are known to 3.5 %; tolerance is three times that
+    samples = [_measure(seed, times, float_fraction=fraction) for seed in range(400)]
+    off = np.array([(s.positions_m - true.positions_m)[0] for _, s in samples])
+    # 400 values determine the spread to 3.5 %; the tolerance is three times that.
     np.testing.assert_allclose(off.std(axis=0), getattr(RtkParameters(), kind).total_m, rtol=0.11)
-    reported = np.array([s.reported_m[0] for _, s in drawn])
+    reported = np.array([s.reported_m[0] for _, s in samples])
     factors = np.log(reported / getattr(RtkParameters(), kind).total_m)
     assert np.std(factors[:, 0]) == pytest.approx(0.1, rel=0.11)
-    faster = np.array([(s.velocities_m_s - true.velocities_m_s)[0] for _, s in drawn])
+    faster = np.array([(s.velocities_m_s - true.velocities_m_s)[0] for _, s in samples])
     np.testing.assert_allclose(faster.std(axis=0), np.hypot([0.03, 0.03, 0.05], [0.01, 0.01, 0.02]), rtol=0.11)
-    assert all(s.fixed[0] == (kind == "fixed") for _, s in drawn)
+    assert all(s.fixed[0] == (kind == "fixed") for _, s in samples)
 
 
-def test_the_wander_is_correlated_over_its_time() -> None:
-    """Of a Gauss-Markov error, exp(-1) is left in common a correlation time later."""
+def test_slow_error_has_the_specified_correlation_time() -> None:
+    """A Gauss-Markov error has a correlation of exp(-1) after one correlation time."""
     times = np.array([0.0, 1.0, 120.0])
     off = np.array(
         [
-            (_measured(seed, times, float_fraction=1.0)[1].positions_m - MOTION.motion(times).positions_m)[:, :2] / 0.5
+            (_measure(seed, times, float_fraction=1.0)[1].positions_m - MOTION.motion(times).positions_m)[:, :2] / 0.5
             for seed in range(400)
         ]
     )
     correlation = np.corrcoef(np.moveaxis(off, 1, 0).reshape(3, -1))
     assert correlation[0, 1] == pytest.approx(np.exp(-1.0 / 120.0), abs=0.01)
-    # 800 values: three deviations of (1 - r^2) / sqrt(800)
+    # 800 values: three standard deviations of (1 - r^2) / sqrt(800).
     assert correlation[0, 2] == pytest.approx(np.exp(-1.0), abs=0.09)
 
 
-def test_solutions_change_with_the_stated_share_and_duration() -> None:
+def test_solution_types_have_specified_fraction_and_duration() -> None:
     times = np.arange(0.0, 400.0, 0.5)
     floating = np.array(
-        [_measured(seed, times, float_fraction=0.25, float_s=10.0)[0].floats(times) for seed in range(200)]
+        [_measure(seed, times, float_fraction=0.25, float_s=10.0)[0].floats(times) for seed in range(200)]
     )
-    # 200 flights of about 10 cycles each
+    # 200 flights of about 10 cycles each.
     assert floating.mean() == pytest.approx(0.25, abs=0.02)
     np.testing.assert_allclose(floating[:, [0, -1]].mean(axis=0), 0.25, atol=0.1)
     begins = np.count_nonzero(floating[:, 1:] & ~floating[:, :-1]) / (200 * 400.0)
     assert begins == pytest.approx(1.0 / 40.0, rel=0.1)
 
 
-def test_an_outage_is_silent_and_only_that() -> None:
+def test_outage_has_no_solutions() -> None:
     times = np.arange(0.0, 10.0, 0.1)
-    _, solutions = _measured(0, times, outages=(Outage(start_s=3.0, duration_s=2.0),))
+    _, solutions = _measure(0, times, outages=(Outage(start_s=3.0, duration_s=2.0),))
     silent = np.isnan(solutions.positions_m).all(axis=1)
     np.testing.assert_array_equal(silent, (times >= 3.0) & (times < 5.0))
     assert np.isfinite(solutions.velocities_m_s[~silent]).all()
 
 
-def test_a_share_that_leaves_nothing_is_refused() -> None:
+def test_zero_fraction_is_rejected() -> None:
     with pytest.raises(ValueError, match="float_fraction"):
         RtkParameters(float_fraction=0.999, float_s=1.0)

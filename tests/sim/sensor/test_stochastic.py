@@ -1,24 +1,26 @@
+"""Tests of exponentially correlated random processes."""
+
 import numpy as np
 import pytest
 
 from marsyard.sim.sensor.instrument import GaussMarkov
 
 
-def test_variance_and_correlation_are_as_stated_from_the_start() -> None:
+def test_process_is_stationary_from_the_start() -> None:
     rng = np.random.default_rng(0)
-    process = GaussMarkov.drawn(np.repeat([2.0, 5.0], 2000), 100.0, (-50.0, 250.0), rng)
+    process = GaussMarkov.draw(np.repeat([2.0, 5.0], 2000), 100.0, (-50.0, 250.0), rng)
     early, later = process.at(np.array([-50.0])), process.at(np.array([50.0]))
-    # 2,000 channels each: a spread is known to 1.6 %, a correlation to 2 %; tolerances four times that
+    # 2,000 channels determine a spread to 1.6 % and a correlation to 2 %; tolerances are four times that.
     for part, sd in ((slice(0, 2000), 2.0), (slice(2000, 4000), 5.0)):
         assert np.std(early[0, part]) == pytest.approx(sd, rel=0.065)
         assert np.std(later[0, part]) == pytest.approx(sd, rel=0.065)
-        # one correlation time apart
+        # One correlation time apart.
         assert np.corrcoef(early[0, part], later[0, part])[0, 1] == pytest.approx(np.exp(-1.0), abs=0.08)
 
 
-def test_a_process_is_known_only_where_it_was_drawn() -> None:
-    process = GaussMarkov.drawn(np.ones(3), 100.0, (0.0, 10.0), np.random.default_rng(0))
+def test_process_is_defined_only_within_its_samples() -> None:
+    process = GaussMarkov.draw(np.ones(3), 100.0, (0.0, 10.0), np.random.default_rng(0))
     with pytest.raises(ValueError, match=r"drawn from 0\.000 s"):
         process.at(np.array([-1.0]))
     with pytest.raises(ValueError, match="finite span"):
-        GaussMarkov.drawn(np.ones(3), 100.0, (-np.inf, 10.0), np.random.default_rng(0))
+        GaussMarkov.draw(np.ones(3), 100.0, (-np.inf, 10.0), np.random.default_rng(0))

@@ -1,4 +1,4 @@
-"""Compass and inclinometers: what gravity, acceleration, lag, dip and iron make of their readings."""
+"""Tests of compass and inclinometers: effects of gravity, acceleration, lag, magnetic dip and iron."""
 
 from __future__ import annotations
 
@@ -25,77 +25,76 @@ PERFECT: dict[str, object] = dict.fromkeys(
 
 def _read(motion: Swaying, times: np.ndarray, seed: int = 0, **changes: object) -> TiltCompassReadings:
     rng = np.random.default_rng(seed)
-    unit = TiltCompass.drawn(TiltCompassParameters.model_validate(PERFECT | changes), rng)
+    unit = TiltCompass.draw(TiltCompassParameters.model_validate(PERFECT | changes), rng)
     return unit.measure(motion, times, rng)
 
 
-def test_at_rest_it_reads_attitude() -> None:
+def test_static_readings_equal_the_attitude() -> None:
     tilt = Rotation.from_euler("ZYX", [70.0, 5.0, -8.0], degrees=True)
     readings = _read(Swaying(tilt=tilt), np.array([0.0, 1.0]))
     np.testing.assert_allclose(readings.up_body, np.tile(tilt.as_matrix()[2], (2, 1)), atol=1e-9)
     np.testing.assert_allclose(np.degrees(readings.headings_rad), 20.0, atol=1e-9)
 
 
-def test_acceleration_tilts_up_and_through_the_dip_turns_the_heading() -> None:
-    """Eastward acceleration a: up leans by atan(a / g) to the east, and brings dip's part of the field into the level.
-
-    Field (0, cos d, -sin d); level axes north' = north and east' = (g, 0, -a) / |.|: the heading of the body's x axis
-    (east) is the angle from north' to its level part, 90 deg less atan(east' field / north' field).
+def test_acceleration_tilts_vertical_and_rotates_heading() -> None:
+    """Eastward acceleration a tilts the vertical by atan(a / g) and rotates a part of the dip into the horizontal
+    plane. Field (0, cos d, -sin d); horizontal axes north' = north and east' = (g, 0, -a) / |.|. The heading of the
+    body x axis (east) is 90 deg minus atan(east' field / north' field).
     """
     motion, dip = Swaying(acceleration_m_s2=(0.5, 0.0, 0.0)), np.radians(59.0)
     readings = _read(motion, np.array([0.0]))
     size = np.hypot(0.5, GRAVITY)
     np.testing.assert_allclose(readings.up_body[0], [0.5 / size, 0.0, GRAVITY / size], atol=1e-9)
-    turned = np.arctan2(0.5 / size * np.sin(dip), np.cos(dip))
-    assert np.degrees(turned) > 10.0
-    assert readings.headings_rad[0] == pytest.approx(0.5 * np.pi - turned, abs=1e-9)
+    rotated = np.arctan2(0.5 / size * np.sin(dip), np.cos(dip))
+    assert np.degrees(rotated) > 10.0
+    assert readings.headings_rad[0] == pytest.approx(0.5 * np.pi - rotated, abs=1e-9)
     level = _read(motion, np.array([0.0]), dip_deg=0.0)
     assert level.headings_rad[0] == pytest.approx(0.5 * np.pi, abs=1e-9)
 
 
 def test_inclinometers_lag_as_a_first_order_system() -> None:
-    """A swaying of 1 rad/s through a lag of 0.2 s: amplitude over sqrt(1 + w^2 t^2), phase atan(w t) behind."""
+    """An oscillation of 1 rad/s with a lag of 0.2 s: amplitude over sqrt(1 + w^2 t^2), phase delay atan(w t)."""
     motion, times = Swaying(sway_m=0.1, sway_rad_s=1.0), np.arange(10.0, 20.0, 0.05)
     leaned = _read(motion, times).up_body[:, 0]
     expected = -0.1 / GRAVITY / np.hypot(1.0, 0.2) * np.sin(times - np.arctan(0.2))
     np.testing.assert_allclose(leaned, expected, atol=2e-5)
 
 
-def test_the_lag_does_not_depend_on_how_readings_are_asked_for() -> None:
+def test_lag_does_not_depend_on_requested_times() -> None:
     motion, times = Swaying(sway_m=0.1, sway_rad_s=3.0), np.arange(0.0, 6.0, 0.25)
     together = _read(motion, times).up_body
     np.testing.assert_allclose(_read(motion, times[12:]).up_body, together[12:], atol=1e-5)
 
 
-def test_iron_turns_the_heading_once_and_twice_round() -> None:
+def test_iron_causes_one_and_two_cycle_heading_errors() -> None:
     parameters = TiltCompassParameters.model_validate(
         PERFECT | {"heading_bias_deg": 0.8, "hard_iron_deg": 0.5, "soft_iron_deg": 0.25}
     )
     around = np.radians(np.arange(0.0, 360.0, 45.0))
     off = []
     for seed in range(300):
-        unit = TiltCompass.drawn(parameters, np.random.default_rng(seed))
+        unit = TiltCompass.draw(parameters, np.random.default_rng(seed))
         expected = unit.deviation_rad(around)
-        turned = [Swaying(tilt=Rotation.from_euler("z", 0.5 * np.pi - azimuth)) for azimuth in around]
+        rotated = [Swaying(tilt=Rotation.from_euler("z", 0.5 * np.pi - azimuth)) for azimuth in around]
         one = np.random.default_rng(0)
         if seed < 3:
-            read = [unit.measure(motion, np.array([0.0]), one).headings_rad[0] for motion in turned]
+            read = [unit.measure(motion, np.array([0.0]), one).headings_rad[0] for motion in rotated]
             np.testing.assert_allclose(np.angle(np.exp(1j * (read - around - expected))), 0.0, atol=1e-9)
         off.append(np.degrees(expected))
     modes = np.fft.rfft(np.array(off), axis=1) / around.size
-    # constant, then each component of once and twice round: 300 or 600 values
+    # Constant, then each component of one and two cycles: 300 or 600 values.
     assert modes[:, 0].real.std() == pytest.approx(0.8, rel=0.12)
     assert np.sqrt(2.0 * np.mean(np.abs(modes[:, 1]) ** 2)) == pytest.approx(0.5, rel=0.09)
     assert np.sqrt(2.0 * np.mean(np.abs(modes[:, 2]) ** 2)) == pytest.approx(0.25, rel=0.09)
     np.testing.assert_allclose(np.abs(modes[:, 3]), 0.0, atol=1e-9)
 
 
-def test_noise_and_bias_have_the_stated_sizes() -> None:
-    still, times = Swaying(), np.arange(0.0, 40.0, 0.1)
-    up = _read(still, times, tilt_noise_deg=0.15, heading_noise_deg=0.3)
+def test_noise_and_bias_have_the_specified_size() -> None:
+    static, times = Swaying(), np.arange(0.0, 40.0, 0.1)
+    up = _read(static, times, tilt_noise_deg=0.15, heading_noise_deg=0.3)
     assert np.degrees(up.up_body[:, :2]).std() == pytest.approx(0.15, rel=0.08)  # 800 values
     assert np.degrees(up.headings_rad).std() == pytest.approx(0.3, rel=0.11)
-    biases = [np.degrees(_read(still, times[:1], seed, tilt_bias_deg=0.2).up_body[0, :2]) for seed in range(300)]
+    biases = [np.degrees(_read(static, times[:1], seed, tilt_bias_deg=0.2).up_body[0, :2]) for seed in range(300)]
     assert np.std(biases) == pytest.approx(0.2, rel=0.09)
 
 

@@ -1,4 +1,4 @@
-"""Real terrain from files: heights at the posts, holes filled and counted, blended into a periodic surround."""
+"""Tests of imported terrain: heights at the posts, filled holes, and blending into a periodic surround."""
 
 import sys
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 
 from marsyard.sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
 from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, choose_grid, embed, fill_holes, read_rasters
-from marsyard.sim.terrain.statistics import terrain_statistics
+from marsyard.sim.terrain.surface import terrain_statistics
 
 ROWS, COLUMNS = 90, 110
 
@@ -20,7 +20,7 @@ def dem() -> np.ndarray:
 
 @pytest.fixture
 def npz(tmp_path: Path) -> Path:
-    """Row 0 in the north; a hole of six posts; a picture twice as dense, brighter to the east."""
+    """Row 0 in the north; a hole of six posts; an image with twice the density, brighter to the east."""
     heights = dem().astype(np.float32)
     heights[40:42, 50:53] = np.nan
     picture = np.broadcast_to(np.linspace(80, 160, 2 * COLUMNS), (2 * ROWS, 2 * COLUMNS)).astype(np.uint8).copy()
@@ -31,7 +31,7 @@ def npz(tmp_path: Path) -> Path:
     return path
 
 
-def around(source: RealTerrain, **changes: object) -> TerrainParameters:
+def make_surround(source: RealTerrain, **changes: object) -> TerrainParameters:
     values: dict[str, object] = {
         "samples": 256,
         "spacing_m": 1.0,
@@ -43,7 +43,7 @@ def around(source: RealTerrain, **changes: object) -> TerrainParameters:
     return TerrainParameters.model_validate(values)
 
 
-def made(parameters: TerrainParameters) -> Surface:
+def build_surface(parameters: TerrainParameters) -> Surface:
     return synthesise(parameters, np.random.default_rng(1))
 
 
@@ -51,39 +51,39 @@ def test_the_surface_passes_through_the_posts(npz: Path) -> None:
     source = RealTerrain(dtm=npz, border_m=10.0, roughen=False)
     extent = embed(source, 256, 1.0).extent
     assert (extent.holes, extent.ortho_holes) == (6, 8 * COLUMNS)
-    surface = made(around(source))
-    whole, _ = fill_holes(read_rasters(source)[0].values)
+    surface = build_surface(make_surround(source))
+    full, _ = fill_holes(read_rasters(source)[0].values)
     x, y = np.meshgrid(extent.west_m + np.arange(11, COLUMNS - 11), extent.south_m + np.arange(11, ROWS - 11))
-    expected = whole[11:-11, 11:-11] - whole.mean()
+    expected = full[11:-11, 11:-11] - full.mean()
     np.testing.assert_allclose(surface.height(x, y), expected, atol=1e-4)
-    # north is up: the file's first row is the northernmost
-    np.testing.assert_allclose(whole[-1], dem()[0], atol=1e-4)
+    # The first row of the file is the northernmost row.
+    np.testing.assert_allclose(full[-1], dem()[0], atol=1e-4)
 
 
 @pytest.mark.parametrize("spacing_m", [0.5, 1.5])
 def test_resampling_keeps_the_heights(npz: Path, spacing_m: float) -> None:
     source = RealTerrain(dtm=npz, border_m=10.0, roughen=False)
-    surface = made(around(source, samples=512 if spacing_m < 1 else 128, spacing_m=spacing_m))
+    surface = build_surface(make_surround(source, samples=512 if spacing_m < 1 else 128, spacing_m=spacing_m))
     extent = embed(source, surface.levels[0].shape[0], spacing_m).extent
     x, y = np.meshgrid(np.arange(15.0, 45.0), np.arange(15.0, 35.0))
     expected = 3.0 * np.sin(x / 9.0) + 2.0 * np.cos((ROWS - 1 - y) / 7.0) + 0.05 * x + 100.0
-    ours = surface.height(extent.west_m + x, extent.south_m + y)
-    # smooth terrain with waves of 44 m and more: cubic interpolation is good to centimetres
-    np.testing.assert_allclose(ours - ours.mean(), expected - expected.mean(), atol=0.02)
+    actual = surface.height(extent.west_m + x, extent.south_m + y)
+    # Smooth terrain with waves of at least 44 m: cubic interpolation is accurate to centimetres.
+    np.testing.assert_allclose(actual - actual.mean(), expected - expected.mean(), atol=0.02)
 
 
 def test_the_seam_has_no_step(npz: Path) -> None:
     source = RealTerrain(dtm=npz, border_m=15.0)
-    surface = made(around(source, rms_slope_deg=3.0))
+    surface = build_surface(make_surround(source, rms_slope_deg=3.0))
     x, y = np.meshgrid(np.arange(256.0), np.arange(256.0))
     slope = np.degrees(np.arctan(np.hypot(*np.moveaxis(surface.gradient(x, y), -1, 0))))
-    # the DTM's own slopes reach 25 deg; a step of a metre between two posts would be 45 deg
+    # The DTM has slopes of 25 deg; a step of one metre between two posts would be 45 deg.
     assert slope.max() < 42.0
 
 
-def test_detail_below_the_posting_is_added_where_asked_for(npz: Path) -> None:
+def test_detail_below_the_post_spacing_is_optional(npz: Path) -> None:
     smooth, rough = (
-        made(around(RealTerrain(dtm=npz, roughen=r), samples=1024, spacing_m=0.25, rms_slope_deg=4.0))
+        build_surface(make_surround(RealTerrain(dtm=npz, roughen=r), samples=1024, spacing_m=0.25, rms_slope_deg=4.0))
         for r in (False, True)
     )
     middle = np.s_[480:560, 480:560, 0]
@@ -92,32 +92,34 @@ def test_detail_below_the_posting_is_added_where_asked_for(npz: Path) -> None:
     assert abs(added.mean()) < 0.2 * added.std(), "nothing above the posting"
 
 
-def test_brightness_comes_from_the_picture_moved_back_by_its_offset(npz: Path) -> None:
+def test_brightness_uses_the_image_offset(npz: Path) -> None:
     source = RealTerrain(dtm=npz, border_m=5.0, roughen=False)
-    surface = made(around(source, albedo=0.2, albedo_contrast=0.0))
+    surface = build_surface(make_surround(source, albedo=0.2, albedo_contrast=0.0))
     extent = embed(source, 256, 1.0).extent
     along = surface.albedo(extent.west_m + np.arange(10.0, 100.0), np.full(90, extent.south_m + 40.0))
     assert along[-1] / along[0] == pytest.approx((80 + 80 * 99.5 / 110) / (80 + 80 * 9.5 / 110), rel=0.02)
-    moved = made(around(source.model_copy(update={"ortho_east_m": 8.0}), albedo=0.2, albedo_contrast=0.0))
+    moved = build_surface(
+        make_surround(source.model_copy(update={"ortho_east_m": 8.0}), albedo=0.2, albedo_contrast=0.0)
+    )
     shifted = moved.albedo(extent.west_m + np.arange(10.0, 90.0), np.full(80, extent.south_m + 40.0))
     np.testing.assert_allclose(shifted, along[8:88], rtol=0.02)
 
 
-def test_a_file_that_changes_makes_another_terrain(npz: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_changed_file_gives_another_terrain(npz: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path / "cache"))
-    bank = TerrainBank(around(RealTerrain(dtm=npz)), seed=1)
+    bank = TerrainBank(make_surround(RealTerrain(dtm=npz)), seed=1)
     before = bank.terrain(0).levels[0].tobytes()
     np.savez(npz, dem=dem() * 2.0, dem_gsd=1.0)
     assert bank.terrain(0).levels[0].tobytes() != before
 
 
-def test_the_hirise_tile_works(shared_data: Path) -> None:
-    """Its ortho lies about 2 m east and 1 m south of its heights."""
+def test_hirise_tile_is_imported(shared_data: Path) -> None:
+    """Its orthoimage is about 2 m east and 1 m south of its heights."""
     source = RealTerrain(
         dtm=shared_data / "gale_hirise" / "gale_1m_dem_0p5m_ortho.npz", ortho_east_m=2.0, ortho_north_m=-1.0
     )
     assert choose_grid(source) == (1024, 1.0)
-    surface = made(around(source, samples=512))
+    surface = build_surface(make_surround(source, samples=512))
     extent = embed(source, 512, 1.0).extent
     assert (extent.east_m - extent.west_m, extent.north_m - extent.south_m) == (347.0, 336.0)
     inside = surface.levels[0][100:400, 100:400, 0]
@@ -134,28 +136,28 @@ def test_the_hirise_tile_works(shared_data: Path) -> None:
         ({"dem": np.zeros((9, 9)), "dem_gsd": 1.0}, "leaves nothing of it"),
     ],
 )
-def test_says_what_is_wrong_with_a_file(tmp_path: Path, content: dict[str, object], message: str) -> None:
+def test_file_errors_are_reported(tmp_path: Path, content: dict[str, object], message: str) -> None:
     path = tmp_path / "wrong.npz"
     np.savez(path, **content)  # type: ignore[arg-type]
     with pytest.raises(TerrainFileError, match=message):
         embed(RealTerrain(dtm=path), 256, 1.0)
 
 
-def test_says_that_a_file_is_not_there(tmp_path: Path) -> None:
+def test_missing_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(TerrainFileError, match="does not exist"):
         read_rasters(RealTerrain(dtm=tmp_path / "none.npz"))
 
 
-def test_says_what_to_install_for_geotiff(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_geotiff_reader_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "dtm.tif").write_bytes(b"")
     monkeypatch.setitem(sys.modules, "rasterio", None)
     with pytest.raises(TerrainFileError, match="pip install rasterio"):
         read_rasters(RealTerrain(dtm=tmp_path / "dtm.tif"))
 
 
-# affine warns about its own operators
+# affine warns about its operators
 @pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")
-def test_reads_geotiff_in_its_own_units_with_holes(tmp_path: Path) -> None:
+def test_geotiff_units_and_holes_are_read(tmp_path: Path) -> None:
     rasterio = pytest.importorskip("rasterio")
     heights = dem().astype(np.float32)
     heights[3, 4] = -9999.0
@@ -184,8 +186,8 @@ def test_reads_geotiff_in_its_own_units_with_holes(tmp_path: Path) -> None:
         read_rasters(RealTerrain(dtm=path))
 
 
-def test_statistics_are_those_of_posts_with_heights(tmp_path: Path) -> None:
-    """Half a tile of ridges is missing: its slopes and relief are those of the other half, not of the filled ground."""
+def test_statistics_use_only_valid_posts(tmp_path: Path) -> None:
+    """Half a tile of ridges is missing: slopes and relief are those of the valid half."""
     x, y = np.meshgrid(np.arange(160.0), np.arange(140.0))
     heights = 3.0 * np.sin(x / 9.0) + 2.0 * np.cos(y / 7.0)
     heights[:, 80:] = np.nan
@@ -196,16 +198,16 @@ def test_statistics_are_those_of_posts_with_heights(tmp_path: Path) -> None:
     assert real.extent.hole_fraction == pytest.approx(0.5)
     assert real.real_samples(256).sum() == np.isfinite(heights).sum()
     assert real.filled_samples(256).sum() == np.isnan(heights).sum()
-    measured = terrain_statistics(made(around(source)), real.real_samples(256))
-    whole = heights[:, :80]
-    rises = (whole[30:] - whole[:-30], whole[:, 30:] - whole[:, :-30])
+    measured = terrain_statistics(build_surface(make_surround(source)), real.real_samples(256))
+    full = heights[:, :80]
+    rises = (full[30:] - full[:-30], full[:, 30:] - full[:, :-30])
     expected = np.mean([np.degrees(np.arctan(np.abs(rise) / 30.0)).mean() for rise in rises])
-    # the outermost 2 m blend into the surround
+    # The outermost 2 m blend into the surround.
     assert measured.mean_slope_30_m_deg == pytest.approx(expected, rel=0.02)
-    assert measured.relief_m == pytest.approx(float(np.ptp(whole)), rel=0.02)
+    assert measured.relief_m == pytest.approx(float(np.ptp(full)), rel=0.02)
 
 
-def test_a_file_with_many_holes_is_refused_unless_they_are_allowed(tmp_path: Path) -> None:
+def test_many_holes_are_rejected_unless_allowed(tmp_path: Path) -> None:
     heights = dem()
     heights[:, :9] = np.nan  # 8.2 % of 110 columns
     path = tmp_path / "holes.npz"

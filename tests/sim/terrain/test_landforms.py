@@ -1,4 +1,4 @@
-"""Landforms: each has the shape it promises, and none disturbs another."""
+"""Tests of landforms: each has its specified shape and is independent of the others."""
 
 import os
 import subprocess
@@ -14,16 +14,16 @@ from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.landforms import Dunes, Fans, Ground, Gullies, Lava, Playa, Ramp, Swell
 from marsyard.sim.terrain.landforms.ground import draw_smooth_fields, refine, substream
 from marsyard.sim.terrain.landforms.kernels import Bedforms, add_cracks, add_dunes, stamp_craters
-from marsyard.sim.terrain.statistics import mean_slope_deg
+from marsyard.sim.terrain.surface import mean_slope_deg
 
 SMOOTH = TerrainParameters(samples=512, rms_slope_deg=0.0, craters_per_km2=0.0, albedo_contrast=0.0)
 
 
-def made(**changes: object) -> TerrainParameters:
+def make_parameters(**changes: object) -> TerrainParameters:
     return SMOOTH.model_copy(update=changes)
 
 
-def heights(parameters: TerrainParameters, seed: int = 1) -> np.ndarray:
+def synthesize_heights(parameters: TerrainParameters, seed: int = 1) -> np.ndarray:
     return synthesise(parameters, np.random.default_rng(seed)).levels[0][..., 0].astype(np.float64)
 
 
@@ -40,21 +40,25 @@ ALL = {
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_same_seed_same_bytes_and_another_seed_others(name: str) -> None:
-    parameters = made(**{name: ALL[name]})
-    first, again, other = heights(parameters), heights(parameters), heights(parameters, seed=2)
-    assert first.tobytes() == again.tobytes()
+def test_equal_seeds_give_equal_bytes(name: str) -> None:
+    parameters = make_parameters(**{name: ALL[name]})
+    first, repeated, other = (
+        synthesize_heights(parameters),
+        synthesize_heights(parameters),
+        synthesize_heights(parameters, seed=2),
+    )
+    assert first.tobytes() == repeated.tobytes()
     assert np.isfinite(first).all()
     assert np.ptp(first) > 0.0
     assert (name == "ramp") == np.array_equal(first, other)
 
 
 @pytest.mark.parametrize("name", ["dunes", "lava", "swell", "ramp", "gullies", "playa"])
-def test_adding_a_landform_changes_no_other(name: str) -> None:
-    """Heights add up: with all else the same, a landform contributes the same whatever else is there."""
-    rough = made(rms_slope_deg=2.0, ripples=ALL["ripples"])
-    contribution = heights(made(**{name: ALL[name]}))
-    difference = heights(rough.model_copy(update={name: ALL[name]})) - heights(rough)
+def test_added_landform_does_not_change_others(name: str) -> None:
+    """Heights are additive: the contribution of a landform does not depend on the other landforms."""
+    rough = make_parameters(rms_slope_deg=2.0, ripples=ALL["ripples"])
+    contribution = synthesize_heights(make_parameters(**{name: ALL[name]}))
+    difference = synthesize_heights(rough.model_copy(update={name: ALL[name]})) - synthesize_heights(rough)
     np.testing.assert_allclose(difference, contribution, atol=1e-3)
 
 
@@ -77,13 +81,13 @@ def test_bytes_do_not_depend_on_the_number_of_threads() -> None:
     assert len(hashes) == 1
 
 
-def test_dunes_have_their_wavelength_height_and_slip_faces() -> None:
+def test_dunes_have_specified_wavelength_height_and_slip_faces() -> None:
     dunes = Dunes(wavelength_m=64.0, height_m=4.0, wind_from_deg=270.0, crest_length=6.0, regularity=4.0)
-    surface = synthesise(made(samples=1024, spacing_m=1.0, dunes=dunes), np.random.default_rng(3))
+    surface = synthesise(make_parameters(samples=1024, spacing_m=1.0, dunes=dunes), np.random.default_rng(3))
     z = surface.levels[0][..., 0].astype(np.float64)
     power = (np.abs(np.fft.rfft(z, axis=1)) ** 2).mean(axis=0)
     assert np.argmax(power[1:]) + 1 == pytest.approx(1024 / 64, abs=1.5)
-    # downwind is east: the lee slopes are the steepest, at the angle of repose, and face east
+    # Downwind is east: the lee slopes are steepest, at the angle of repose, and face east.
     x, y = np.meshgrid(np.arange(0, 1024, 0.5), np.arange(0, 1024, 16.0))
     slope = surface.gradient(x, y)[..., 0]
     steepest = np.degrees(np.arctan(-np.quantile(slope, 0.01)))
@@ -93,19 +97,19 @@ def test_dunes_have_their_wavelength_height_and_slip_faces() -> None:
 
 
 def test_dunes_end_in_defects_without_steps() -> None:
-    """Where crests fork the height is continuous: no slope much beyond that of the slip faces."""
+    """Where crests fork the height is continuous: no slope is much steeper than the slip faces."""
     dunes = Dunes(wavelength_m=60.0, height_m=3.0, crest_length=1.8, regularity=0.9)
-    surface = synthesise(made(samples=1024, spacing_m=1.0, dunes=dunes), np.random.default_rng(3))
+    surface = synthesise(make_parameters(samples=1024, spacing_m=1.0, dunes=dunes), np.random.default_rng(3))
     x, y = np.meshgrid(np.arange(0, 1024, 1.0), np.arange(0, 1024, 1.0))
     slope = np.degrees(np.arctan(np.hypot(*np.moveaxis(surface.gradient(x, y), -1, 0))))
-    # at forks crests crowd together, and slip faces are a little steeper there
+    # Crests are dense at forks, where slip faces are slightly steeper.
     assert np.quantile(slope, 0.9999) < 42.0
     assert slope.max() < 55.0
 
 
-def test_wind_turns_the_crests() -> None:
-    crests_north = heights(made(dunes=Dunes(wavelength_m=60.0, wind_from_deg=270.0)))
-    crests_east = heights(made(dunes=Dunes(wavelength_m=60.0, wind_from_deg=180.0)))
+def test_wind_direction_rotates_the_crests() -> None:
+    crests_north = synthesize_heights(make_parameters(dunes=Dunes(wavelength_m=60.0, wind_from_deg=270.0)))
+    crests_east = synthesize_heights(make_parameters(dunes=Dunes(wavelength_m=60.0, wind_from_deg=180.0)))
 
     def rough_along(z: np.ndarray, axis: int) -> float:
         return float(np.abs(np.roll(z, -20, axis=axis) - z).mean())
@@ -114,22 +118,22 @@ def test_wind_turns_the_crests() -> None:
     assert rough_along(crests_east, 0) > 2 * rough_along(crests_east, 1)
 
 
-def test_lava_is_rough_at_metres_and_gentle_beyond() -> None:
-    surface = synthesise(made(samples=1024, lava=Lava()), np.random.default_rng(1))
+def test_lava_is_rough_at_metres_and_smooth_at_larger_scales() -> None:
+    surface = synthesise(make_parameters(samples=1024, lava=Lava()), np.random.default_rng(1))
     assert mean_slope_deg(surface, 6.0) > 2.5 * mean_slope_deg(surface, 90.0)
     assert mean_slope_deg(surface, 90.0) < 2.0
 
 
 @pytest.mark.parametrize("slope_deg", [8.0, 17.5, 25.0])
 @pytest.mark.parametrize("uphill", ["east", "north"])
-def test_a_ramp_has_its_slope_where_told(slope_deg: float, uphill: Literal["east", "north"]) -> None:
+def test_ramp_has_its_slope_in_the_stated_direction(slope_deg: float, uphill: Literal["east", "north"]) -> None:
     ramp = Ramp(slope_deg=slope_deg, length_m=20.0, uphill=uphill)
-    surface = synthesise(made(spacing_m=0.2, ramp=ramp), np.random.default_rng(0))
+    surface = synthesise(make_parameters(spacing_m=0.2, ramp=ramp), np.random.default_rng(0))
     period = surface.period_m
     along = np.linspace(0.25 * period - 8.5, 0.25 * period + 8.5, 50)
     across = np.linspace(0.0, period, 50)
-    place = (along, across) if uphill == "east" else (across, along)
-    gradient = surface.gradient(*place)
+    position = (along, across) if uphill == "east" else (across, along)
+    gradient = surface.gradient(*position)
     forward, sideways = (0, 1) if uphill == "east" else (1, 0)
     np.testing.assert_allclose(np.degrees(np.arctan(gradient[:, forward])), slope_deg, atol=0.05)
     np.testing.assert_allclose(gradient[:, sideways], 0.0, atol=1e-4)
@@ -137,13 +141,13 @@ def test_a_ramp_has_its_slope_where_told(slope_deg: float, uphill: Literal["east
     np.testing.assert_allclose(level, 0.0, atol=1e-4)
 
 
-def test_a_swell_has_its_relief() -> None:
-    assert np.ptp(heights(made(swell=Swell(relief_m=120.0)))) == pytest.approx(120.0, rel=0.01)
+def test_swell_has_the_specified_relief() -> None:
+    assert np.ptp(synthesize_heights(make_parameters(swell=Swell(relief_m=120.0)))) == pytest.approx(120.0, rel=0.01)
 
 
-def test_fans_slope_down_to_an_almost_level_playa() -> None:
+def test_fans_descend_to_an_almost_level_playa() -> None:
     fans = Fans(radius_m=250.0, apex_spacing_m=150.0, divides=1, slope_deg=4.0, washes_per_fan=0)
-    surface = synthesise(made(samples=512, rms_slope_deg=1.0, fans=fans), np.random.default_rng(2))
+    surface = synthesise(make_parameters(samples=512, rms_slope_deg=1.0, fans=fans), np.random.default_rng(2))
     x = np.linspace(0.0, surface.period_m, 200)
     on_fan = np.degrees(np.arctan(np.abs(surface.gradient(x, np.full_like(x, 110.0))[:, 1])))
     on_playa = surface.gradient(x, np.full_like(x, 384.0))
@@ -155,7 +159,7 @@ def test_fans_slope_down_to_an_almost_level_playa() -> None:
 
 def test_gullies_have_steep_walls() -> None:
     gullies = Gullies(width_m=6.0, wall_slope_deg=35.0, per_km2=400.0, length_m=60.0)
-    surface = synthesise(made(spacing_m=0.25, samples=512, gullies=gullies), np.random.default_rng(1))
+    surface = synthesise(make_parameters(spacing_m=0.25, samples=512, gullies=gullies), np.random.default_rng(1))
     x, y = np.meshgrid(np.arange(0, 128, 0.25), np.arange(0, 128, 0.25))
     slope = np.degrees(np.arctan(np.hypot(*np.moveaxis(surface.gradient(x, y), -1, 0))))
     assert 25.0 < np.quantile(slope, 0.995) < 45.0
@@ -169,9 +173,9 @@ def test_refinement_keeps_the_surface_exactly() -> None:
     coarse = rng.normal(size=(16, 16)).astype(np.float32)
     fine = refine(coarse, 64)
     x, y = rng.uniform(0, 16, 200), rng.uniform(0, 16, 200)
-    theirs = map_coordinates(coarse.astype(float), [y, x], order=3, mode="grid-wrap", prefilter=False)
-    ours = map_coordinates(fine.astype(float), [4 * y, 4 * x], order=3, mode="grid-wrap", prefilter=False)
-    np.testing.assert_allclose(ours, theirs, atol=2e-6)
+    expected = map_coordinates(coarse.astype(float), [y, x], order=3, mode="grid-wrap", prefilter=False)
+    actual = map_coordinates(fine.astype(float), [4 * y, 4 * x], order=3, mode="grid-wrap", prefilter=False)
+    np.testing.assert_allclose(actual, expected, atol=2e-6)
 
 
 def test_smooth_fields_have_unit_power() -> None:
@@ -182,7 +186,7 @@ def test_smooth_fields_have_unit_power() -> None:
     assert np.mean(powers) == pytest.approx(1.0, abs=0.05)
 
 
-def test_landforms_on_a_coarser_grid_come_back_in_place() -> None:
+def test_landforms_on_a_coarser_grid_keep_their_position() -> None:
     ground = Ground(np.zeros((64, 64), np.float32), np.zeros((64, 64), np.float32), 1.0)
     part = ground.coarser(4.0)
     assert (part.side, part.spacing_m, part.period_m) == (16, 4.0, 64.0)
@@ -191,7 +195,7 @@ def test_landforms_on_a_coarser_grid_come_back_in_place() -> None:
     assert tuple(map(int, np.unravel_index(ground.height.argmax(), (64, 64)))) == (16, 32)
 
 
-def test_substreams_depend_on_their_name_alone() -> None:
+def test_substreams_depend_only_on_their_name() -> None:
     rng = np.random.default_rng(7)
     first = substream(rng, "dunes").random(3)
     rng.random(100)
@@ -202,19 +206,19 @@ def test_substreams_depend_on_their_name_alone() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "message"),
+    ("invalid", "message"),
     [
         ({"dunes": Dunes(wavelength_m=5000.0)}, r"dunes\.wavelength_m is 5000"),
         ({"ramp": Ramp(length_m=2000.0)}, r"ramp\.length_m is 2000"),
     ],
 )
-def test_refuses_landforms_that_do_not_fit(wrong: dict[str, object], message: str) -> None:
+def test_inconsistent_landforms_are_rejected(invalid: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        synthesise(made(**wrong), np.random.default_rng(0))
+        synthesise(make_parameters(**invalid), np.random.default_rng(0))
 
 
-def test_dunes_are_the_stated_shape_of_the_stated_phase() -> None:
-    """The kernel's own spline and arctangent against SciPy's and NumPy's."""
+def test_dune_kernel_matches_scipy() -> None:
+    """Compare the spline and arctangent of the kernel with SciPy and NumPy."""
     side, spacing, crest, steepest = 128, 3.0, 4.0, 0.6
     modulation = np.random.default_rng(2).normal(size=(32, 32, 2)).astype(np.float32)
     wave = 2.0 * np.pi / (side * spacing) * np.array([5.0, -3.0])
@@ -241,7 +245,7 @@ def test_dunes_are_the_stated_shape_of_the_stated_phase() -> None:
 
 
 def test_ejecta_lie_in_seven_and_twelve_rays() -> None:
-    """Outside a round crater: the blanket falls with the cube of the distance, and its rays with the azimuth."""
+    """Outside a round crater the ejecta blanket falls with the cube of distance, and its rays vary with azimuth."""
     side, spacing, radius, rim, reach, phase = 128, 1.0, 12.0, 0.8, 4.0, 0.7
     height, tone = np.zeros((2, side, side), dtype=np.float32)
     crater = np.array([[64.0, 64.0, radius, 3.0, rim, 0.1, 0.3, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phase]])
@@ -257,28 +261,28 @@ def test_ejecta_lie_in_seven_and_twelve_rays() -> None:
     np.testing.assert_allclose(tone[outside], 0.2 * light[outside], atol=1e-6)
 
 
-def test_cracks_are_the_borders_of_a_periodic_voronoi_diagram() -> None:
+def test_cracks_follow_periodic_voronoi_borders() -> None:
     side, spacing, count, width = 96, 0.5, 8, 0.8
     cell = side * spacing / count
     points = np.random.default_rng(4).uniform(0.1, 0.9, (count, count, 2))
     height, tone = np.zeros((2, side, side), dtype=np.float32)
     add_cracks(height, tone, spacing, points, cell, width, 0.2, -0.1)
     row, column = np.mgrid[:count, :count]
-    places = (points + np.stack([column, row], axis=-1)).reshape(-1, 2)
+    positions = (points + np.stack([column, row], axis=-1)).reshape(-1, 2)
     y, x = np.mgrid[:side, :side] * spacing / cell
     distance, number = map(
-        np.asarray, cKDTree(places, boxsize=np.full(2, float(count))).query(np.stack([x, y], axis=-1), k=2)
+        np.asarray, cKDTree(positions, boxsize=np.full(2, float(count))).query(np.stack([x, y], axis=-1), k=2)
     )
-    between = (places[number[..., 1]] - places[number[..., 0]] + count / 2) % count - count / 2
+    between = (positions[number[..., 1]] - positions[number[..., 0]] + count / 2) % count - count / 2
     border = 0.5 * (distance[..., 1] ** 2 - distance[..., 0] ** 2) / np.linalg.norm(between, axis=-1) * cell
-    share = np.clip(1.0 - border / width, 0.0, None)
-    # the two nearest points lie within a cell to each side but where cells are wide
-    assert np.mean(np.isclose(height, -0.2 * share, atol=1e-6)) > 0.999
-    assert np.mean(np.isclose(tone, -0.1 * share, atol=1e-6)) > 0.999
+    fraction = np.clip(1.0 - border / width, 0.0, None)
+    # The two nearest points are within one cell on each side, except for wide cells.
+    assert np.mean(np.isclose(height, -0.2 * fraction, atol=1e-6)) > 0.999
+    assert np.mean(np.isclose(tone, -0.1 * fraction, atol=1e-6)) > 0.999
 
 
-def test_dunes_may_be_finer_than_the_ground() -> None:
-    """What the ground's samples cannot hold is sampled as it is, their modulation too."""
+def test_dunes_finer_than_the_grid_are_sampled_directly() -> None:
+    """Features and modulation too fine for the grid are sampled directly."""
     tiny = Dunes(wavelength_m=1.0, height_m=0.05, regularity=0.3, crest_length=0.5)
-    z = heights(made(samples=64, spacing_m=3.0, ripples=tiny))
+    z = synthesize_heights(make_parameters(samples=64, spacing_m=3.0, ripples=tiny))
     assert 0.0 < np.ptp(z) < 0.1

@@ -1,3 +1,5 @@
+"""Tests of rock shapes, size distribution, placement and level of detail."""
+
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +30,7 @@ TARGET = PlacedRock(name="target", east_m=3.0, north_m=60.0, diameter_m=1.5, sha
 
 @pytest.fixture(scope="module")
 def ground() -> Surface:
-    """A bumpy ground of 64 m, its slopes up to 20 deg."""
+    """A bumpy ground of 64 m with slopes up to 20 deg."""
     side, spacing = 256, 0.25
     turn = 2 * np.pi * np.arange(side) / side
     samples = np.full((side, side, 2), 0.2, dtype=np.float32)
@@ -36,7 +38,7 @@ def ground() -> Surface:
     return Surface.from_samples(samples, spacing)
 
 
-def make(ground: Surface, seed: int = 1, **changes: object) -> RockField:
+def make_field(ground: Surface, seed: int = 1, **changes: object) -> RockField:
     values = {"abundance": 0.2, "smallest_m": 0.1, "placed": (TARGET,), **changes}
     parameters = RockParameters.model_validate(values)
     return RockField.on(ground, parameters, np.random.default_rng(seed))
@@ -48,7 +50,7 @@ def mesh_of(shapes: ShapeSet, number: int) -> trimesh.Trimesh:
 
 @pytest.fixture(scope="module")
 def field(ground: Surface) -> RockField:
-    return make(ground)
+    return make_field(ground)
 
 
 @pytest.mark.parametrize(("detail", "triangles"), [(COARSE, 80), (MEDIUM, 320), (FINE, 1280), (FINEST, 5120)])
@@ -64,21 +66,21 @@ def test_shapes_are_closed_and_of_unit_size(detail: int, triangles: int) -> None
     np.testing.assert_allclose(np.linalg.norm(shapes.normals, axis=2), 1.0, atol=1e-12)
 
 
-def test_the_finest_shapes_have_their_height_diameter_and_normals() -> None:
+def test_finest_shapes_have_specified_height_diameter_and_normals() -> None:
     shapes = rock_shapes(FINEST)
     azimuth = np.radians(np.arange(0, 180, 5))
     for number in range(SHAPES):
         vertices = shapes.vertices[number]
         assert vertices[:, 2].max() == pytest.approx(UNIT_HEIGHT)
-        seen = vertices[vertices[:, 2] >= 0.0, :2]
-        across = np.ptp(seen @ np.stack([np.cos(azimuth), np.sin(azimuth)]), axis=0)
+        observed = vertices[vertices[:, 2] >= 0.0, :2]
+        across = np.ptp(observed @ np.stack([np.cos(azimuth), np.sin(azimuth)]), axis=0)
         assert (across.max() + across.min()) / 2 == pytest.approx(1.0, abs=0.005 if number < SHAPES_OF_FORM else 0.01)
-        # triangles cut corners: their mean normals agree but for edges
+        # Triangles cut corners: their mean normals agree except at edges.
         agreement = np.sum(mesh_of(shapes, number).vertex_normals * shapes.normals[number], axis=1)
         assert np.median(agreement) > (0.999 if number < SHAPES_OF_FORM else 0.96)
 
 
-def test_shapes_differ() -> None:
+def test_shapes_are_different() -> None:
     vertices = rock_shapes(MEDIUM).vertices
     for one in range(SHAPES):
         for other in range(one):
@@ -86,32 +88,32 @@ def test_shapes_differ() -> None:
 
 
 def _rocks_per_m2(abundance: float, smallest_m: float, largest_m: float) -> float:
-    """Number of rocks between two diameters: the covered fraction's density over the area of a rock, integrated."""
+    """Number of rocks between two diameters: the covered fraction's density over the rock area, integrated."""
     q = decay_per_m(abundance)
     return float(quad(lambda d: abundance * q * np.exp(-q * d) / (0.25 * np.pi * d * d), smallest_m, largest_m)[0])
 
 
 @pytest.mark.parametrize("abundance", [0.02, 0.1, 0.4])
-def test_sizes_follow_golombek(abundance: float) -> None:
-    """The area under rocks above each diameter is the model's, within 10 %, wherever rocks are many enough to say."""
+def test_rock_sizes_follow_golombek(abundance: float) -> None:
+    """The area of rocks above each diameter matches the model within 10 %, where the number of rocks is sufficient."""
     parameters = RockParameters(abundance=abundance, smallest_m=0.05, largest_m=10.0)
     area = 1.5e4 if abundance > 0.02 else 1.0e5
     diameters = draw_diameters(parameters, area, np.random.default_rng(3))
-    for least in (0.05, 0.1, 0.2, 0.4):
-        above = diameters[diameters >= least]
-        share = np.sum(np.pi / 4 * above**2) / area
-        # one sigma of a compound Poisson sum
+    for min_diameter in (0.05, 0.1, 0.2, 0.4):
+        above = diameters[diameters >= min_diameter]
+        fraction = np.sum(np.pi / 4 * above**2) / area
+        # One sigma of a compound Poisson sum.
         sigma = np.sqrt(np.sum((np.pi / 4 * above**2) ** 2)) / area
-        expected = abundance * np.exp(-decay_per_m(abundance) * least)
-        assert share == pytest.approx(expected, abs=max(0.1 * expected, 3 * sigma))
-        if least < 0.2:
+        expected = abundance * np.exp(-decay_per_m(abundance) * min_diameter)
+        assert fraction == pytest.approx(expected, abs=max(0.1 * expected, 3 * sigma))
+        if min_diameter < 0.2:
             assert 3 * sigma < 0.1 * expected, "enough rocks for the bar of 10 %"
-        number = area * _rocks_per_m2(abundance, least, 10.0)
+        number = area * _rocks_per_m2(abundance, min_diameter, 10.0)
         assert above.size == pytest.approx(number, abs=max(0.02 * number, 4 * np.sqrt(number)))
 
 
 def test_no_two_rocks_overlap(field: RockField) -> None:
-    """Every pair in reach of one another, across the border as well; rocks stay apart in plan."""
+    """All neighbouring pairs, including across the border; rocks do not overlap in plan view."""
     reach = rock_shapes(COARSE).reach[field.shape] * field.diameter_m
     tree = cKDTree(field.position_m[:, :2], boxsize=np.full(2, field.period_m))
     pairs = tree.query_pairs(2 * reach.max(), output_type="ndarray")
@@ -121,16 +123,16 @@ def test_no_two_rocks_overlap(field: RockField) -> None:
     assert np.all(np.hypot(*apart.T) >= reach[pairs].sum(axis=1))
 
 
-def test_the_densest_ground_can_be_filled(ground: Surface) -> None:
-    field = make(ground, abundance=0.4, smallest_m=0.06, placed=())
+def test_max_rock_density_is_reached(ground: Surface) -> None:
+    field = make_field(ground, abundance=0.4, smallest_m=0.06, placed=())
     covered = np.sum(np.pi / 4 * field.diameter_m**2) / field.period_m**2
     assert covered == pytest.approx(0.4 * np.exp(-0.06 * decay_per_m(0.4)), rel=0.1)
 
 
-def test_same_seed_same_rocks_another_seed_others(ground: Surface, field: RockField) -> None:
-    again, other = make(ground), make(ground, seed=2)
+def test_equal_seeds_give_equal_rocks(ground: Surface, field: RockField) -> None:
+    repeated, other = make_field(ground), make_field(ground, seed=2)
     for name in ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up"):
-        assert getattr(field, name).tobytes() == getattr(again, name).tobytes()
+        assert getattr(field, name).tobytes() == getattr(repeated, name).tobytes()
     assert len(other) != len(field) or not np.array_equal(other.position_m, field.position_m)
 
 
@@ -146,14 +148,14 @@ def test_rocks_stand_on_the_ground_along_its_normal(ground: Surface, field: Rock
     )
 
 
-def test_a_placed_rock_is_found_by_name_and_lies_where_told(ground: Surface, field: RockField) -> None:
+def test_placed_rock_has_its_name_and_position(ground: Surface, field: RockField) -> None:
     number = field.by_name("target")
     assert field.diameter_m[number] == 1.5
     np.testing.assert_allclose(field.position_m[number, :2], [3.0, 60.0])
     mesh = field.rock(number)
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert body.is_watertight
-    # along its own vertical it rises half its diameter above the ground point
+    # Along its vertical it rises half its diameter above the ground point.
     along = (mesh.vertices - field.position_m[number]) @ field.up[number]
     assert along.max() == pytest.approx(0.75)
     assert along.min() < -0.1
@@ -161,7 +163,7 @@ def test_a_placed_rock_is_found_by_name_and_lies_where_told(ground: Surface, fie
         field.by_name("adirondack")
 
 
-def test_near_returns_rocks_about_the_place_in_any_period(field: RockField) -> None:
+def test_near_returns_rocks_around_a_position_in_any_period(field: RockField) -> None:
     home = field.near(2.0, 1.0, 9.0, detail=COARSE)
     assert set(np.unique(home.rock_of_face)) == {
         n
@@ -176,7 +178,7 @@ def test_near_returns_rocks_about_the_place_in_any_period(field: RockField) -> N
     np.testing.assert_allclose(np.linalg.norm(home.vertex_normals, axis=1), 1.0, atol=1e-12)
 
 
-def test_near_chooses_detail_by_size_over_distance_and_leaves_out_the_small(field: RockField) -> None:
+def test_detail_follows_apparent_size_and_small_rocks_are_omitted(field: RockField) -> None:
     mesh = field.near(3.0, 58.0, 30.0, smallest_m=0.3, above_m=1.5)
     rocks, triangles = np.unique(mesh.rock_of_face, return_counts=True)
     assert field.diameter_m[rocks].min() >= 0.3
@@ -187,19 +189,19 @@ def test_near_chooses_detail_by_size_over_distance_and_leaves_out_the_small(fiel
     assert nothing.vertices.shape == (0, 3)
 
 
-def test_clinker_is_rougher_than_blocks_and_has_shapes_of_its_own(ground: Surface) -> None:
-    """Angles between neighbouring triangles: a block's faces are flat."""
+def test_clinker_is_rougher_than_blocks_and_has_separate_shapes(ground: Surface) -> None:
+    """Angles between neighbouring triangles: the faces of a block are flat."""
     shapes = rock_shapes(FINEST)
     meshes = [trimesh.Trimesh(vertices, shapes.faces, process=False) for vertices in shapes.vertices]
     bends = [float(np.median(mesh.face_adjacency_angles)) for mesh in meshes]
     assert max(bends[:SHAPES_OF_FORM]) < 0.07 < 0.18 < min(bends[SHAPES_OF_FORM:])
-    field = make(ground, form="clinker", placed=())
+    field = make_field(ground, form="clinker", placed=())
     assert set(np.unique(field.shape)) == set(range(SHAPES_OF_FORM, SHAPES))
-    assert set(np.unique(make(ground, placed=()).shape)) == set(range(SHAPES_OF_FORM))
+    assert set(np.unique(make_field(ground, placed=()).shape)) == set(range(SHAPES_OF_FORM))
 
 
-def test_a_terrain_smaller_than_the_view_repeats(field: RockField) -> None:
-    """Each copy of a rock is a body of its own with the rock's number, wherever the copies follow one another."""
+def test_small_terrain_repeats_in_the_view(field: RockField) -> None:
+    """Each copy of a rock is a separate body with the number of the rock."""
     mesh = field.near(10.0, 10.0, 100.0, smallest_m=1.4, detail=COARSE)
     rocks, triangles = np.unique(mesh.rock_of_face, return_counts=True)
     assert triangles.max() > 80 * 4
@@ -214,7 +216,7 @@ def test_a_terrain_smaller_than_the_view_repeats(field: RockField) -> None:
         assert np.all(mesh.rock_of_face[mesh.body_of_face == one] == number)
 
 
-def test_faces_are_turned_outwards(field: RockField) -> None:
+def test_faces_point_outwards(field: RockField) -> None:
     mesh = field.near(20.0, 20.0, 10.0, detail=MEDIUM)
     corners = mesh.vertices[mesh.faces]
     outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -223,30 +225,30 @@ def test_faces_are_turned_outwards(field: RockField) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "message"),
+    ("invalid", "message"),
     [
         ({"abundance": 0.5}, "less than or equal to 0.4"),
         ({"smallest_m": 4.0}, "must be larger than smallest_m"),
         ({"placed": (TARGET, TARGET)}, "names must be unique"),
     ],
 )
-def test_refuses_impossible_rocks(wrong: dict[str, object], message: str) -> None:
+def test_invalid_rocks_are_rejected(invalid: dict[str, object], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
-        RockParameters.model_validate(wrong)
+        RockParameters.model_validate(invalid)
 
 
-def test_refuses_more_rocks_than_fit_in_memory_and_unknown_shapes(ground: Surface) -> None:
+def test_too_many_rocks_and_unknown_shapes_are_rejected(ground: Surface) -> None:
     with pytest.raises(ValueError, match=r"choose a larger rocks\.smallest_m"):
         draw_diameters(RockParameters(abundance=0.4, smallest_m=0.01), 1.0e6, np.random.default_rng(0))
     strange = PlacedRock(name="strange", east_m=0.0, north_m=0.0, diameter_m=1.0, shape=99)
     with pytest.raises(ValueError, match="'strange' has shape 99"):
-        make(ground, placed=(strange,))
+        make_field(ground, placed=(strange,))
 
 
 @pytest.mark.parametrize("number", [0, 9, 15, 16, 27])
 @pytest.mark.parametrize("detail", [COARSE, MEDIUM, FINE])
-def test_a_coarse_rock_cannot_be_told_from_the_finest(number: int, detail: int) -> None:
-    """Bar: 0.25 px rms above the ground, from the plane of the coarse triangle that is nearest."""
+def test_coarse_rock_matches_the_finest_within_subpixels(number: int, detail: int) -> None:
+    """Requirement: 0.25 px rms above the ground, from the plane of the nearest coarse triangle."""
     coarse = mesh_of(rock_shapes(detail), number)
     samples, triangles = trimesh.sample.sample_surface(coarse, 200_000, seed=1)
     finest = trimesh.sample.sample_surface(mesh_of(rock_shapes(FINEST), number), 4_000, seed=2)[0]
@@ -256,7 +258,7 @@ def test_a_coarse_rock_cannot_be_told_from_the_finest(number: int, detail: int) 
     assert 0.15 < np.sqrt(np.mean(away**2)) * max_pixels()[number, detail] < 0.28
 
 
-def test_rocks_are_drawn_as_finely_as_the_camera_sees(field: RockField) -> None:
+def test_rock_detail_follows_camera_resolution(field: RockField) -> None:
     faces = [rock_shapes(detail).faces.shape[0] for detail in (COARSE, MEDIUM, FINE, FINEST)]
     for pixel_rad in (3e-4, 1e-3, 1e-2):
         mesh = field.near(32.0, 32.0, 25.0, smallest_m=0.3, above_m=1.5, pixel_rad=pixel_rad)
@@ -278,7 +280,7 @@ def test_stored_shapes_equal_the_built_ones(tmp_path: Path, monkeypatch: pytest.
         one = rock_shapes(COARSE)
         results.append([one.vertices, one.normals, one.reach, max_pixels()])
         files = sorted((tmp_path / "terrain").glob("rocks-*.npy"))
-    # vertices of four levels, normals of the coarsest and the finest, sizes in pixels
+    # Vertices of four levels, normals of the coarsest and finest level, sizes in pixels.
     assert len(files) == 7
     for built, stored in zip(*results, strict=True):
         np.testing.assert_array_equal(built, stored)

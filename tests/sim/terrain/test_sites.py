@@ -1,4 +1,4 @@
-"""Sites: their figures beside the field test paper's (section III.A), measured as `marsyard terrain stats` does."""
+"""Tests of sites: statistics against the field test paper (section III.A), as by `marsyard terrain stats`."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -9,7 +9,7 @@ import pytest
 from marsyard.sim.terrain import Environment, Surface, TerrainParameters, site, sites, synthesise
 from marsyard.sim.terrain.rocks import RockField
 from marsyard.sim.terrain.sites import PAPER
-from marsyard.sim.terrain.statistics import TerrainStatistics, image_contrast, mean_slope_deg, terrain_statistics
+from marsyard.sim.terrain.surface import TerrainStatistics, image_contrast, mean_slope_deg, terrain_statistics
 
 FIELD = ("pisgah", "kelso", "ivanpah")
 MARS = ("gusev", "meridiani")
@@ -18,41 +18,41 @@ NAMES = (*FIELD, *MARS, "mars-yard", "heli-benign", "heli-hazardous")
 
 @pytest.fixture(scope="module")
 def measured() -> dict[str, TerrainStatistics]:
-    """Figures of the whole extent of 6 km, at half the density of posts: a quarter of the work."""
-    found = {}
+    """Statistics of the full extent of 6 km at half the post density, which reduces run time."""
+    result = {}
     for name in (*FIELD, *MARS):
         parameters = site(name).terrain("descent")
         halved = parameters.model_copy(
             update={"samples": parameters.samples // 2, "spacing_m": 2 * parameters.spacing_m}
         )
-        found[name] = terrain_statistics(synthesise(halved, np.random.default_rng(1)))
-    return found
+        result[name] = terrain_statistics(synthesise(halved, np.random.default_rng(1)))
+    return result
 
 
-def test_all_sites_of_the_issue_are_there() -> None:
+def test_all_sites_exist() -> None:
     assert tuple(sites()) == NAMES
     with pytest.raises(ValueError, match="no site is called 'jezero'; allowed: pisgah"):
         site("jezero")
 
 
 @pytest.mark.parametrize("name", FIELD + MARS)
-def test_albedo_and_slopes_are_the_papers(name: str, measured: dict[str, TerrainStatistics]) -> None:
+def test_albedo_and_slopes_match_the_paper(name: str, measured: dict[str, TerrainStatistics]) -> None:
     paper, figures = PAPER[name], measured[name]
     assert paper.albedo[0] - 1e-6 <= figures.albedo <= paper.albedo[1] + 1e-6
-    least, most = paper.mean_slope_deg
-    assert least <= figures.mean_slope_30_m_deg <= most
-    assert least <= figures.mean_slope_90_m_deg <= most
+    min_value, max_value = paper.mean_slope_deg
+    assert min_value <= figures.mean_slope_30_m_deg <= max_value
+    assert min_value <= figures.mean_slope_90_m_deg <= max_value
 
 
 @pytest.mark.parametrize("name", ["pisgah", "gusev", "meridiani"])
-def test_a_small_bank_keeps_the_papers_figures(name: str) -> None:
-    """2048 samples 2 m apart, 44 MB on disk instead of 178: for banks of hundreds of terrains."""
+def test_small_bank_terrains_match_the_paper(name: str) -> None:
+    """2048 samples 2 m apart, 44 MB on disk instead of 178 MB: for banks of hundreds of terrains."""
     figures = terrain_statistics(
         synthesise(site(name).terrain("descent", {"samples": 2048, "spacing_m": 2.0}), np.random.default_rng(2))
     )
-    least, most = PAPER[name].mean_slope_deg
-    assert least <= figures.mean_slope_30_m_deg <= most
-    assert least <= figures.mean_slope_90_m_deg <= most
+    min_value, max_value = PAPER[name].mean_slope_deg
+    assert min_value <= figures.mean_slope_30_m_deg <= max_value
+    assert min_value <= figures.mean_slope_90_m_deg <= max_value
 
 
 def test_kelso_rises_over_200_m_and_ivanpah_is_the_flattest(measured: dict[str, TerrainStatistics]) -> None:
@@ -63,13 +63,13 @@ def test_kelso_rises_over_200_m_and_ivanpah_is_the_flattest(measured: dict[str, 
 
 
 def test_contrast_at_pisgah_is_like_that_at_the_mars_sites(measured: dict[str, TerrainStatistics]) -> None:
-    """'Similar to contrast measured on descent images synthesized' at most MER sites: within a third."""
+    """'Similar to contrast measured on descent images synthesized' at most MER sites: within one third."""
     for name in MARS:
         assert measured["pisgah"].contrast == pytest.approx(measured[name].contrast, rel=1 / 3)
     assert measured["pisgah"].contrast < 0.1
 
 
-def test_sites_have_what_their_users_need() -> None:
+def test_sites_have_complete_parameters() -> None:
     for one in sites().values():
         assert one.descent is not None or one.ground is not None
         assert one.ground_texture.amplitudes
@@ -86,8 +86,8 @@ def test_sites_have_what_their_users_need() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_grounds_can_be_made_with_their_rocks(name: str) -> None:
-    """A sixteenth of the extent each way keeps the posts, and what stands on them."""
+def test_site_grounds_can_be_built_with_rocks(name: str) -> None:
+    """A sixteenth of the extent in each direction keeps the posts and rocks."""
     parameters = site(name).terrain("ground")
     scale = {"samples": 512} if name != "kelso" else {"samples": 1024, "spacing_m": 0.1}
     surface = synthesise(parameters.model_copy(update=scale), np.random.default_rng(1))
@@ -103,10 +103,10 @@ def test_mean_slope_of_a_plane_wave_and_of_a_part() -> None:
     turn = 2 * np.pi * np.arange(side) / side
     samples[..., 0] = 10.0 * np.sin(2 * turn)[None, :]
     surface = Surface.from_samples(samples, spacing)
-    # a sine's mean absolute slope is 2 / pi of its steepest; none across it
+    # The mean absolute slope of a sine is 2 / pi of its maximum, and zero across it.
     steepest = 10.0 * 2 * 2 * np.pi / 512
     assert mean_slope_deg(surface, 16.0) == pytest.approx(np.degrees(steepest * 2 / np.pi) / 2, rel=0.02)
-    # around the crossing at x = 256 m the slope is the steepest all along
+    # Near the crossing at x = 256 m the slope is maximal along the complete line.
     part_of = np.zeros((side, side), dtype=np.bool_)
     part_of[:251, 123:134] = True
     part = mean_slope_deg(surface, 4.0, part_of)
@@ -114,7 +114,7 @@ def test_mean_slope_of_a_plane_wave_and_of_a_part() -> None:
     assert np.isnan(mean_slope_deg(surface, 300.0))
 
 
-def test_contrast_of_a_level_checkered_ground_is_its_albedos() -> None:
+def test_contrast_of_checkered_level_ground_equals_albedo_contrast() -> None:
     samples = np.zeros((64, 64, 2), dtype=np.float32)
     samples[..., 1] = 0.2
     samples[:, :32, 1] = 0.1
@@ -127,8 +127,8 @@ def test_light_of_the_sky_grows_with_dust() -> None:
     assert shares[0] == 0.0
     assert all(a < b for a, b in pairwise(shares))
     assert Environment(optical_depth=0.0).direct_share(high) == 1.0
-    # Without absorption and with isotropic scattering Eddington's approximation has a closed form: over black ground
-    # (2 + 3 mu + (2 - 3 mu) exp(-tau / mu)) / (4 + 3 tau) of the light comes through (Shettle & Weinman 1970).
+    # Without absorption and with isotropic scattering Eddington's approximation has a closed form. Over black ground
+    # the transmitted fraction is (2 + 3 mu + (2 - 3 mu) exp(-tau / mu)) / (4 + 3 tau) (Shettle & Weinman 1970).
     clear = Environment(optical_depth=1.0, single_scattering_albedo=0.9999999, asymmetry=0.0)
     for mu in (1.0, 0.5):
         sun = np.arcsin(mu)
@@ -137,7 +137,7 @@ def test_light_of_the_sky_grows_with_dust() -> None:
         assert total == pytest.approx(expected, abs=1e-4)
 
 
-def test_a_terrain_with_its_landforms_can_be_set_from_a_file() -> None:
+def test_terrain_with_landforms_is_read_from_a_file() -> None:
     parameters = TerrainParameters.model_validate(
         {
             "samples": 256,
@@ -150,7 +150,7 @@ def test_a_terrain_with_its_landforms_can_be_set_from_a_file() -> None:
     assert TerrainParameters.model_validate_json(parameters.model_dump_json()) == parameters
 
 
-def test_a_sites_terrain_can_be_changed_in_parts() -> None:
+def test_site_terrain_can_be_partly_changed() -> None:
     before = site("gusev").terrain("ground")
     after = site("gusev").terrain("ground", {"samples": 512, "rocks": {"abundance": 0.2}, "ripples": None})
     assert before.rocks is not None
@@ -175,13 +175,13 @@ def test_a_sites_terrain_can_be_changed_in_parts() -> None:
         ({"dunes": 3.0}, r"terrain\.dunes: .*; given: 3.0"),
     ],
 )
-def test_says_what_is_wrong_with_a_change(changes: dict[str, object], message: str) -> None:
+def test_change_errors_are_reported(changes: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         site("gusev").terrain("descent", changes)
 
 
-def test_real_terrain_lies_in_a_sites_surround(shared_data: Path) -> None:
-    """The HiRISE tile wherever a preset is: heights of the file, rocks and roughness of the site."""
+def test_imported_terrain_lies_in_a_site_surround(shared_data: Path) -> None:
+    """The HiRISE tile can replace a preset: heights of the file, rocks and roughness of the site."""
     tile = shared_data / "gale_hirise" / "gale_1m_dem_0p5m_ortho.npz"
     changes = {"samples": 512, "spacing_m": 1.0, "source": {"dtm": tile, "ortho_east_m": 2.0, "ortho_north_m": -1.0}}
     parameters = site("gusev").terrain("descent", changes)
@@ -194,13 +194,13 @@ def test_real_terrain_lies_in_a_sites_surround(shared_data: Path) -> None:
 
 
 def test_the_suns_disc_shrinks_with_distance() -> None:
-    # 0.0093 rad across at 1 AU, 0.35 deg at Mars' mean distance
+    # 0.0093 rad across at 1 AU, 0.35 deg at the mean distance of Mars.
     assert site("kelso").environment.sun_radius_rad == pytest.approx(0.00465)
     assert np.degrees(2.0 * site("gusev").environment.sun_radius_rad) == pytest.approx(0.35, abs=0.01)
 
 
-def test_relief_is_that_of_the_surface_not_of_its_control_values() -> None:
-    """A chequerboard of control values of +1 and -1 m is a surface of +1/9 and -1/9 m at the knots: (4 - 2)**2 / 36."""
+def test_relief_is_measured_on_the_surface() -> None:
+    """A chequerboard of control values of +1 and -1 m is +1/9 and -1/9 m at the knots: (4 - 2)**2 / 36."""
     samples = np.full((32, 32, 2), 0.2, dtype=np.float32)
     rows, columns = np.indices((32, 32))
     samples[..., 0] = np.where((rows + columns) % 2 == 0, 1.0, -1.0)

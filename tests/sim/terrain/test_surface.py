@@ -1,3 +1,5 @@
+"""Tests of terrain surfaces against SciPy's cubic B-spline."""
+
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
@@ -15,25 +17,25 @@ def surface() -> Surface:
 @pytest.fixture(scope="module")
 def places() -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(6)
-    # several periods to either side: the ground repeats
+    # Several periods to each side: the ground is periodic.
     return rng.uniform(-500.0, 500.0, 400), rng.uniform(-500.0, 500.0, 400)
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
-def test_is_the_cubic_b_spline_that_scipy_evaluates(
+def test_height_matches_scipy_cubic_b_spline(
     surface: Surface, places: tuple[np.ndarray, np.ndarray], level: int
 ) -> None:
     x, y = places
     spacing = surface.spacing_m * 2**level
-    for channel, ours in ((0, surface.height(x, y, level)), (1, surface.albedo(x, y, level))):
+    for channel, actual in ((0, surface.height(x, y, level)), (1, surface.albedo(x, y, level))):
         control = surface.levels[level][..., channel].astype(np.float64)
-        theirs = map_coordinates(control, [y / spacing, x / spacing], order=3, mode="grid-wrap", prefilter=False)
-        np.testing.assert_allclose(ours, theirs, atol=1e-12)
+        expected = map_coordinates(control, [y / spacing, x / spacing], order=3, mode="grid-wrap", prefilter=False)
+        np.testing.assert_allclose(actual, expected, atol=1e-12)
 
 
 def test_gradient_is_the_derivative_of_height(surface: Surface, places: tuple[np.ndarray, np.ndarray]) -> None:
     x, y = places
-    # central differences of a piecewise cubic: the error is h^2/6 times a third derivative of order 1
+    # Central differences of a piecewise cubic: the error is h^2/6 times a third derivative of order 1.
     step = 1e-4
     along_x = (surface.height(x + step, y) - surface.height(x - step, y)) / (2 * step)
     along_y = (surface.height(x, y + step) - surface.height(x, y - step)) / (2 * step)
@@ -42,7 +44,7 @@ def test_gradient_is_the_derivative_of_height(surface: Surface, places: tuple[np
 
 @pytest.mark.parametrize("level", [0, 2])
 def test_ceilings_bound_the_height(surface: Surface, level: int) -> None:
-    """Nowhere higher than the control values around a block, and no higher than the highest of these."""
+    """At most the maximum control value around a block, and at most the global maximum."""
     ceiling, spacing = surface.ceilings[level], surface.spacing_m * 2.0**level
     block = CEILING_BLOCK * spacing
     x, y = np.random.default_rng(7).uniform(-surface.period_m, 2.0 * surface.period_m, (2, 40000))
@@ -56,15 +58,15 @@ def test_ceilings_bound_the_height(surface: Surface, level: int) -> None:
         assert ceiling[row, column] == samples[np.ix_(*around)].max()
 
 
-def test_repeats_with_its_period(surface: Surface, places: tuple[np.ndarray, np.ndarray]) -> None:
+def test_surface_is_periodic(surface: Surface, places: tuple[np.ndarray, np.ndarray]) -> None:
     x, y = places
     np.testing.assert_allclose(
         surface.height(x + surface.period_m, y - 2 * surface.period_m), surface.height(x, y), atol=1e-11
     )
 
 
-def test_levels_of_a_smooth_ground_agree_in_place() -> None:
-    """A long wave keeps its phase on every level: levels are not shifted against each other."""
+def test_resolution_levels_are_aligned() -> None:
+    """A long wave has the same phase on each level."""
     side, spacing = 256, 2.0
     period = side * spacing
     x = np.arange(side) * spacing
@@ -79,6 +81,6 @@ def test_levels_of_a_smooth_ground_agree_in_place() -> None:
 
 
 @pytest.mark.parametrize("shape", [(8, 8, 2), (48, 48, 2), (64, 32, 2)])
-def test_refuses_shapes_it_cannot_halve(shape: tuple[int, ...]) -> None:
+def test_shapes_that_cannot_be_halved_are_rejected(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="power of two"):
         Surface.from_samples(np.zeros(shape, dtype=np.float32), 1.0)

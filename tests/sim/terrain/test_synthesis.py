@@ -1,3 +1,5 @@
+"""Tests of synthetic terrain: statistics, albedo and craters."""
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -8,26 +10,26 @@ from marsyard.sim.terrain.landforms.kernels import stamp_craters
 from marsyard.sim.terrain.landforms.relief import DEGRADED_DEPTH, FRESH_DEPTH, draw_craters
 
 
-def test_same_stream_same_bytes() -> None:
+def test_equal_streams_give_equal_bytes() -> None:
     parameters = TerrainParameters(samples=128)
     first = synthesise(parameters, np.random.default_rng(3))
-    again = synthesise(parameters, np.random.default_rng(3))
+    repeated = synthesise(parameters, np.random.default_rng(3))
     other = synthesise(parameters, np.random.default_rng(4))
-    for a, b in zip(first.levels, again.levels, strict=True):
+    for a, b in zip(first.levels, repeated.levels, strict=True):
         assert a.tobytes() == b.tobytes()
     assert first.levels[0].tobytes() != other.levels[0].tobytes()
 
 
-def test_variance_is_as_expected_on_average() -> None:
-    # 200 draws of about ten independent large-scale modes each: the mean variance is good to about 3 %
+def test_mean_variance_matches_expectation() -> None:
+    # 200 draws of about ten independent large-scale modes each determine the mean variance to about 3 %.
     spectrum = Spectrum.power_law(128, 1.0, 0.5, 60.0)
     variances = [spectrum.field(np.random.default_rng(seed), 2.0).var() for seed in range(200)]
     assert np.mean(variances) == pytest.approx(4.0, rel=0.04)
 
 
 @pytest.mark.parametrize("hurst", [0.5, 0.8])
-def test_slope_over_the_baseline_and_hurst_exponent(hurst: float) -> None:
-    """The structure function gives the RMS slope asked for at the baseline, and grows with the Hurst exponent."""
+def test_structure_function_has_specified_slope_and_exponent(hurst: float) -> None:
+    """The structure function has the specified RMS slope at the baseline and grows with the Hurst exponent."""
     parameters = TerrainParameters(
         samples=1024, hurst=hurst, rms_slope_deg=3.0, slope_baseline_m=30.0, outer_scale_m=20000.0, craters_per_km2=0.0
     )
@@ -42,11 +44,11 @@ def test_slope_over_the_baseline_and_hurst_exponent(hurst: float) -> None:
     slope_deg = np.degrees(np.arctan(rms[2] / (lags[2] * parameters.spacing_m)))
     assert slope_deg == pytest.approx(3.0, rel=0.1)
     measured_hurst = np.polyfit(np.log(lags), np.log(rms), 1)[0]
-    # the band limits of the grid bend the structure function by a few hundredths
+    # The band limits of the grid change the structure function by a few hundredths.
     assert measured_hurst == pytest.approx(hurst, abs=0.05)
 
 
-def test_albedo_has_the_stated_mean_and_contrast() -> None:
+def test_albedo_has_the_specified_mean_and_contrast() -> None:
     parameters = TerrainParameters(samples=1024, albedo=0.25, albedo_contrast=0.1, outer_scale_m=200.0)
     albedo = synthesise(parameters, np.random.default_rng(1)).levels[0][..., 1]
     assert albedo.mean() == pytest.approx(0.25, rel=0.02)
@@ -72,10 +74,10 @@ def test_crater_depths_run_from_degraded_to_fresh() -> None:
     assert from_rim_to_floor.max() == pytest.approx(FRESH_DEPTH, rel=0.02)
 
 
-def test_a_fresh_crater_has_its_depth_rim_and_place_across_the_border() -> None:
+def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:
     height, tone = np.zeros((256, 256), dtype=np.float32), np.zeros((256, 256), dtype=np.float32)
     radius, depth, rim = 20.0, 6.4, 1.6
-    # sharp rim, round outline; centred on the corner, so that it is cut by the periodic border
+    # Sharp rim and round outline, centred on the corner of the periodic border.
     crater = [0.0, 0.0, radius, depth, rim, 0.0, 0.0, 0.1, *np.zeros(6), 0.3]
     stamp_craters(height, tone, 1.0, np.array([crater]), 3.0)
     centred = np.roll(height, (128, 128), axis=(0, 1))
@@ -87,7 +89,7 @@ def test_a_fresh_crater_has_its_depth_rim_and_place_across_the_border() -> None:
     assert np.roll(tone, 128, axis=1)[0, 128] == pytest.approx(0.1)
 
 
-def test_a_filled_crater_has_a_flat_floor_at_its_depth() -> None:
+def test_filled_crater_has_a_flat_floor_at_its_depth() -> None:
     height, tone = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
     crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.4, 0.0, *np.zeros(6), 0.0]
     stamp_craters(height, tone, 1.0, np.array([crater]), 3.0)
@@ -96,13 +98,13 @@ def test_a_filled_crater_has_a_flat_floor_at_its_depth() -> None:
     assert not tone.any()
 
 
-def test_refuses_crater_sizes_in_the_wrong_order() -> None:
+def test_unordered_crater_sizes_are_rejected() -> None:
     parameters = TerrainParameters(samples=64, crater_diameter_min_m=50.0, crater_diameter_max_m=20.0)
     with pytest.raises(ValueError, match="must be larger than crater_diameter_min_m"):
         synthesise(parameters, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("wrong", [{"samples": 4}, {"spacing_m": -1.0}, {"hurst": 1.5}, {"relief": 3.0}])
-def test_refuses_impossible_parameters(wrong: dict[str, float]) -> None:
+@pytest.mark.parametrize("invalid", [{"samples": 4}, {"spacing_m": -1.0}, {"hurst": 1.5}, {"relief": 3.0}])
+def test_invalid_parameters_are_rejected(invalid: dict[str, float]) -> None:
     with pytest.raises(ValidationError):
-        TerrainParameters.model_validate(wrong)
+        TerrainParameters.model_validate(invalid)

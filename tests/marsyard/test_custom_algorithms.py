@@ -1,4 +1,4 @@
-"""Algorithms of one's own on the command line: the protocol's suite, cases to be answered elsewhere, their scores."""
+"""Tests of custom algorithms on the command line: conformance checks, exported cases and scores."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from marsyard.cli.app import app
-from tests.campaigns.fake_campaign import rows_of
+from tests.campaigns.fake_campaign import read_case_rows
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
@@ -43,20 +43,20 @@ confidence = 0.5
 """
 
 
-def test_the_suite_outlives_what_it_examines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_conformance_survives_crashes_and_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "hostile_here.py").write_text(HOSTILE)
     monkeypatch.chdir(tmp_path)
-    ended = CliRunner().invoke(app, ["conformance", "hostile_here:Hostile", "--time-limit", "3"])
-    assert ended.exit_code == 1
-    assert "FAIL dark" in ended.output
-    assert "CRASHED: the worker process died: SIGABRT (-6)" in ended.output
-    assert "FAIL saturated" in ended.output
-    assert "TIMED_OUT: took longer than its limit of 11 s" in ended.output
-    assert "next: no picture may make it hang" in ended.output
-    assert "7 of 9 checks passed" in ended.output
+    result = CliRunner().invoke(app, ["conformance", "hostile_here:Hostile", "--time-limit", "3"])
+    assert result.exit_code == 1
+    assert "FAIL dark" in result.output
+    assert "CRASHED: the worker process died: SIGABRT (-6)" in result.output
+    assert "FAIL saturated" in result.output
+    assert "TIMED_OUT: took longer than its limit of 11 s" in result.output
+    assert "next: no picture may make it hang" in result.output
+    assert "7 of 9 checks passed" in result.output
 
 
-LEAVING = """
+STATE_CHANGING = """
 import os, threading, time
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 
@@ -74,24 +74,22 @@ class Leaving:
 """
 
 
-def test_the_suite_ends_and_finds_what_an_algorithm_changes_in_its_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "leaving_here.py").write_text(LEAVING)
+def test_conformance_reports_changed_process_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "leaving_here.py").write_text(STATE_CHANGING)
     monkeypatch.chdir(tmp_path)
-    ended = CliRunner().invoke(app, ["conformance", "leaving_here:Leaving"])
-    assert ended.exit_code == 1, ended.output
-    assert ended.output.count("it changed the state of its process: the working folder") == 3
-    assert "child processes that it left running (python)" in ended.output
-    assert "threads that it left running (Thread-" in ended.output
-    assert "next: set it back before returning" in ended.output
-    assert "6 of 9 checks passed" in ended.output
+    result = CliRunner().invoke(app, ["conformance", "leaving_here:Leaving"])
+    assert result.exit_code == 1, result.output
+    assert result.output.count("it changed the state of its process: the working folder") == 3
+    assert "child processes that it left running (python)" in result.output
+    assert "threads that it left running (Thread-" in result.output
+    assert "next: set it back before returning" in result.output
+    assert "6 of 9 checks passed" in result.output
 
 
-def test_the_suite_for_programs() -> None:
-    ended = CliRunner().invoke(app, ["conformance", "phase-correlation", "--json"])
-    assert ended.exit_code == 0
-    reported = json.loads(ended.output)
+def test_conformance_is_printed_as_json() -> None:
+    result = CliRunner().invoke(app, ["conformance", "phase-correlation", "--json"])
+    assert result.exit_code == 0
+    reported = json.loads(result.output)
     assert (reported["algorithm"], reported["task"], reported["passed"], len(reported["checks"])) == (
         "phase-correlation",
         "velocity",
@@ -111,26 +109,28 @@ def test_the_suite_for_programs() -> None:
         (["exec:./nothing"], "is not there, or may not be run"),
     ],
 )
-def test_what_is_no_algorithm_is_reported(arguments: list[str], message: str) -> None:
-    ended = CliRunner().invoke(app, ["conformance", *arguments])
-    assert ended.exit_code == 2
-    assert message in ended.output
+def test_unknown_algorithms_are_rejected(arguments: list[str], message: str) -> None:
+    result = CliRunner().invoke(app, ["conformance", *arguments])
+    assert result.exit_code == 2
+    assert message in result.output
 
 
-def test_cases_are_exported_answered_and_scored(tmp_path: Path) -> None:
+def test_exported_cases_are_scored(tmp_path: Path) -> None:
     campaign, cases, table = tmp_path / "fake.toml", tmp_path / "cases", tmp_path / "answers.csv"
     campaign.write_text(CAMPAIGN)
-    ended = CliRunner().invoke(app, ["export", str(campaign), "--out", str(cases), "--jobs", "1"])
-    assert ended.exit_code == 0, ended.output
-    assert f"their truth, not to be handed away: {cases}-truth" in ended.output
+    result = CliRunner().invoke(app, ["export", str(campaign), "--out", str(cases), "--jobs", "1"])
+    assert result.exit_code == 0, result.output
+    assert f"their truth, not to be handed away: {cases}-truth" in result.output
     assert len(list((cases / "cases").iterdir())) == 2
     table.write_text("case,velocity_east_m_s,velocity_north_m_s\n0,12.5,-7\n")
-    ended = CliRunner().invoke(app, ["score", str(cases), str(table)])
-    assert ended.exit_code == 2
-    assert "no answer to 1 of 2 cases: 1" in ended.output
+    result = CliRunner().invoke(app, ["score", str(cases), str(table)])
+    assert result.exit_code == 2
+    assert "no answer to 1 of 2 cases: 1" in result.output
     table.write_text("case,velocity_east_m_s,velocity_north_m_s\n0,12.5,-7\n1,12,-7\n")
-    ended = CliRunner().invoke(app, ["score", str(cases), str(table), "--out", str(tmp_path / "scored"), "--jobs", "1"])
-    assert ended.exit_code == 0, ended.output
-    assert "verdict: PASS" in ended.output
-    assert [row["velocity_error_m_s"] for row in rows_of(tmp_path / "scored")] == [0.5, 0.0]
+    result = CliRunner().invoke(
+        app, ["score", str(cases), str(table), "--out", str(tmp_path / "scored"), "--jobs", "1"]
+    )
+    assert result.exit_code == 0, result.output
+    assert "verdict: PASS" in result.output
+    assert [row["velocity_error_m_s"] for row in read_case_rows(tmp_path / "scored")] == [0.5, 0.0]
     assert (tmp_path / "scored" / "report.html").exists()

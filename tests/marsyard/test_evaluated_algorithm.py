@@ -1,4 +1,4 @@
-"""Records and reports name the algorithm that was judged, and the command that runs the campaign again."""
+"""Tests that records and reports name the evaluated algorithm and the command that repeats the campaign."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from typer.testing import CliRunner
 
 from marsyard.cli.app import app
 from marsyard.reports.dashboard.site import write_site
-from tests.campaigns.fake_campaign import rows_of
+from tests.campaigns.fake_campaign import read_case_rows
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
     pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
 ]
 
-OWN = """
+ALGORITHM = """
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 
 class Mine:
@@ -53,26 +53,26 @@ population = "all"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a spaced name, an own algorithm and an own campaign, run with options of every kind."""
-    here: Path = tmp_path_factory.mktemp("a folder")
-    (here / "mine.py").write_text(OWN)
-    (here / "own file.toml").write_text(CAMPAIGN.replace("own campaign", "own-campaign"))
+    """Run a campaign with a custom algorithm in a folder whose name has a space."""
+    path: Path = tmp_path_factory.mktemp("a folder")
+    (path / "mine.py").write_text(ALGORITHM)
+    (path / "own file.toml").write_text(CAMPAIGN.replace("own campaign", "own-campaign"))
     command = [str(Path(sys.executable).with_name("marsyard")), "run", "own file.toml", "-n", "3", "--seed", "9"]
     command += ["--algorithm", "mine:Mine", "--algorithm", "homography", "--set", 'description="it\'s mine"']
-    ended = subprocess.run(
-        [*command, "--jobs", "1", "--out", "run"], cwd=here, capture_output=True, text=True, timeout=120, check=False
+    result = subprocess.run(
+        [*command, "--jobs", "1", "--out", "run"], cwd=path, capture_output=True, text=True, timeout=120, check=False
     )
-    assert ended.returncode in (1, 3), ended.stderr
-    return here
+    assert result.returncode in (1, 3), result.stderr
+    return path
 
 
-def _record(folder: Path) -> Mapping[str, Any]:
+def _read_record(folder: Path) -> Mapping[str, Any]:
     stored: Mapping[str, Any] = json.loads((folder / "run" / "campaign.json").read_text())
     return stored
 
 
-def test_the_record_describes_the_algorithms(folder: Path) -> None:
-    judged, compared = _record(folder)["algorithms"]
+def test_record_describes_the_algorithms(folder: Path) -> None:
+    judged, compared = _read_record(folder)["algorithms"]
     assert (judged["spec"], judged["role"], judged["path"]) == ("mine:Mine", "judged", "mine:Mine")
     assert (judged["version"], judged["options"]) == ("3.1", {"gain": 0.5})
     assert re.fullmatch("[0-9a-f]{16}", judged["source_hash"])
@@ -82,8 +82,8 @@ def test_the_record_describes_the_algorithms(folder: Path) -> None:
     assert compared["options"]
 
 
-def test_reports_name_the_judged_algorithm(folder: Path) -> None:
-    source = _record(folder)["algorithms"][0]["source_hash"]
+def test_reports_name_the_evaluated_algorithm(folder: Path) -> None:
+    source = _read_record(folder)["algorithms"][0]["source_hash"]
     page = html.unescape((folder / "run" / "report.html").read_text())
     header = page.partition("<nav")[0]
     assert "mine:Mine" in header
@@ -96,47 +96,54 @@ def test_reports_name_the_judged_algorithm(folder: Path) -> None:
     assert (row["algorithm"], row["algorithm_version"]) == ("mine:Mine", "3.1")
     assert (row["algorithm_options"], row["algorithm_source"]) == ('{"gain": 0.5}', source)
     suite = Xml.parse(folder / "run" / "junit.xml").getroot()  # noqa: S314
-    properties = {one.get("name"): one.get("value") for one in suite.iter("property")}
+    properties = {entry.get("name"): entry.get("value") for entry in suite.iter("property")}
     assert (properties["algorithm"], properties["algorithm_source"]) == ("mine:Mine", source)
     twin = json.loads((folder / "run" / "report.json").read_text())
-    assert [one["name"] for one in twin["algorithm_details"] if one["judged"]] == ["mine:Mine"]
+    assert [entry["name"] for entry in twin["algorithm_details"] if entry["judged"]] == ["mine:Mine"]
 
 
-def test_dashboards_name_the_judged_algorithm(folder: Path, tmp_path: Path) -> None:
+def test_dashboard_names_the_evaluated_algorithm(folder: Path, tmp_path: Path) -> None:
     site = write_site(tmp_path / "site", [folder / "run"])
     index = site.index.read_text()
     evidence = re.search(r'data-requirement="v".*?</tr>', index, re.DOTALL)
     assert evidence is not None
     assert "mine:Mine 3.1" in evidence[0]
     page = html.unescape(next((tmp_path / "site" / "c").glob("*/index.html")).read_text())
-    source = _record(folder)["algorithms"][0]["source_hash"]
+    source = _read_record(folder)["algorithms"][0]["source_hash"]
     assert all(text in page for text in ("mine:Mine 3.1", source, '{"gain": 0.5}'))
     matrix = list(csv.DictReader(io.StringIO((tmp_path / "site" / "verification.csv").read_text())))
     assert next(row for row in matrix if row["requirement"] == "v")["algorithm"] == "mine:Mine"
 
 
-def test_the_command_in_the_report_runs_the_same_cases_again(folder: Path, tmp_path: Path) -> None:
+def test_command_in_the_report_repeats_the_campaign(folder: Path, tmp_path: Path) -> None:
     page = (folder / "run" / "report.html").read_text()
-    shown = re.search(r"Run the campaign again</dt><dd>(.*?)</dd>", page, re.DOTALL)
-    assert shown is not None
-    enter, command = [html.unescape(line) for line in re.findall(r"<code>(.*?)</code>", shown[1])]
-    assert shlex.split(enter) == ["cd", str(folder)]
+    command_block = re.search(r"Run the campaign again</dt><dd>(.*?)</dd>", page, re.DOTALL)
+    assert command_block is not None
+    change_folder, command = [html.unescape(line) for line in re.findall(r"<code>(.*?)</code>", command_block[1])]
+    assert shlex.split(change_folder) == ["cd", str(folder)]
     program = shlex.quote(str(Path(sys.executable).with_name("marsyard")))
-    again = tmp_path / "again"
-    line = command.replace("marsyard", program, 1) + f" --jobs 1 --out {shlex.quote(str(again))}"
-    script = f"{enter} && {line}"
-    ended = subprocess.run(["/bin/sh", "-c", script], cwd="/", capture_output=True, text=True, timeout=120, check=False)
-    assert ended.returncode in (1, 3), ended.stderr
-    first, second = (json.loads((one / "campaign.json").read_text()) for one in (folder / "run", again))
+    repeated_run = tmp_path / "again"
+    line = command.replace("marsyard", program, 1) + f" --jobs 1 --out {shlex.quote(str(repeated_run))}"
+    script = f"{change_folder} && {line}"
+    result = subprocess.run(
+        ["/bin/sh", "-c", script], cwd="/", capture_output=True, text=True, timeout=120, check=False
+    )
+    assert result.returncode in (1, 3), result.stderr
+    first, second = (
+        json.loads((run_folder / "campaign.json").read_text()) for run_folder in (folder / "run", repeated_run)
+    )
     assert first["configuration"] == second["configuration"]
     assert first["algorithms"] == second["algorithms"]
     keep = ("case", "outcome", "image_hash", "algorithm", "homography.velocity_error_m_s")
-    rows = [[{key: row[key] for key in keep} for row in rows_of(one)] for one in (folder / "run", again)]
+    rows = [
+        [{key: row[key] for key in keep} for row in read_case_rows(run_folder)]
+        for run_folder in (folder / "run", repeated_run)
+    ]
     assert rows[0] == rows[1]
     assert len(rows[0]) == 3
 
 
-def test_appended_blocks_are_part_of_the_command(folder: Path) -> None:
+def test_appended_blocks_are_in_the_command(folder: Path) -> None:
     from marsyard.reports.sections import rerun_commands
     from marsyard.reports.stored import read_run
 
@@ -146,14 +153,14 @@ def test_appended_blocks_are_part_of_the_command(folder: Path) -> None:
     assert rerun_commands(changed)[-1] == "marsyard append runs/own-campaign-again 20"
 
 
-def test_records_of_earlier_versions_are_still_reported(folder: Path, tmp_path: Path) -> None:
+def test_records_of_earlier_versions_are_reported(folder: Path, tmp_path: Path) -> None:
     old = tmp_path / "old"
     old.mkdir()
     (old / "cases.parquet").write_bytes((folder / "run" / "cases.parquet").read_bytes())
-    record = {key: value for key, value in _record(folder).items() if key not in ("command", "algorithms")}
+    record = {key: value for key, value in _read_record(folder).items() if key not in ("command", "algorithms")}
     (old / "campaign.json").write_text(json.dumps(record))
-    ended = CliRunner().invoke(app, ["report", str(old)])
-    assert ended.exit_code in (1, 3), ended.output
+    result = CliRunner().invoke(app, ["report", str(old)])
+    assert result.exit_code in (1, 3), result.output
     page = (old / "report.html").read_text()
     assert "marsyard run own-campaign -n 3 --seed 9" in page
     assert "The record does not hold the command" in page

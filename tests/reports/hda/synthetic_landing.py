@@ -1,4 +1,4 @@
-"""A made-up landing: two pictures over a hill with a rock, all stages' products, and rows of made-up campaigns."""
+"""Products of a synthetic landing over sinusoidal terrain with one rock, and rows of synthetic campaigns."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ CELL_M, HEIGHT_M, FOCAL_PX = 0.25, 10.0, 240.0
 
 
 def synthetic_products() -> dict[str, Any]:
-    """Products as `marsyard.scenarios.landing.score.products` gives them; the camera looks straight down, x to the
-    east."""
+    """Products in the layout of `marsyard.scenarios.landing.score.products`, for a nadir camera with x to the east."""
     rng = np.random.default_rng(1)
     rows, columns = SHAPE
     corner = np.array([-0.5 * (columns - 1), 0.5 * (rows - 1)]) * CELL_M
@@ -35,7 +34,7 @@ def synthetic_products() -> dict[str, Any]:
     spacing = 0.1
     true_x, true_y = np.meshgrid(100.0 + np.arange(-40, 41) * spacing, 50.0 + np.arange(-30, 31) * spacing)
     true_rock = 0.5 * np.exp(-((true_x - 102.0) ** 2 + (true_y - 51.0) ** 2) / 0.1)
-    near = np.hypot(true_x - 102.0, true_y - 51.0) < 1.2
+    is_near_rock = np.hypot(true_x - 102.0, true_y - 51.0) < 1.2
     return {
         "image_1": rng.integers(0, 255, (240, 320)).astype(np.uint16),
         "image_2": rng.integers(0, 255, (240, 320)).astype(np.uint16),
@@ -72,14 +71,14 @@ def synthetic_products() -> dict[str, Any]:
         "true_corner": np.array([true_x[0, 0], true_y[0, 0]]),
         "true_spacing": np.array([spacing]),
         "true_slope": np.full(true_x.shape, 0.05),
-        "true_roughness": np.where(near, 0.5, 0.02),
-        "true_safe": ~near,
+        "true_roughness": np.where(is_near_rock, 0.5, 0.02),
+        "true_safe": ~is_near_rock,
         "true_covered": np.hypot(true_x - 100.0, true_y - 50.0) < 3.0,
     }
 
 
 def landing_frame(cases: int, seed: int = 1) -> pd.DataFrame:
-    """Rows of flights over rocks: one in ten finds no site, one in twenty reports a wrong one."""
+    """Rows of flights over rocks: 10 % find no site, 5 % report an unsafe site."""
     rng = np.random.default_rng(seed)
     outcome = rng.choice(["SAFE_SITE", "NO_SAFE_SITE", "NO_MOTION"], cases, p=[0.85, 0.1, 0.05])
     reported = outcome == "SAFE_SITE"

@@ -1,0 +1,84 @@
+"""Tests of the comparison of two campaigns: paired and independent samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from marsyard.reports.comparison import (
+    Contrast,
+    Figure,
+    build_sample,
+    campaign_diff_grid,
+    compare_campaigns,
+    list_figures,
+)
+from marsyard.reports.statistics.changes import difference_p
+from marsyard.reports.stored import StoredRun, read_run
+
+Rows = Callable[..., pd.DataFrame]
+MakeRun = Callable[..., Path]
+
+
+def _compare(first: Path, second: Path) -> tuple[bool, dict[str, Contrast]]:
+    paired, contrasts = compare_campaigns(read_run(first), read_run(second))
+    return paired, {contrast.name: contrast for contrast in contrasts}
+
+
+def test_same_draws_are_compared_in_pairs(make_rows: Rows, make_run: MakeRun) -> None:
+    frame = make_rows(200, terrains=40)
+    worse = frame.assign(velocity_error_m_s=frame["velocity_error_m_s"] * 1.02)
+    paired, contrasts = _compare(make_run(frame), make_run(worse, name="other"))
+    assert paired
+    # errors larger by 2 %: the paired test detects them in spite of the large scatter
+    assert contrasts["velocity error (m/s)"].p_value < 1e-9
+    assert contrasts["answered"].p_value == 1.0
+    assert contrasts["came to an end"].second.level == 1.0
+    # with four terrains the sign test has p = 2 / 2^4, times 4 for the number of figures
+    few = make_rows(200)
+    worse = few.assign(velocity_error_m_s=few["velocity_error_m_s"] * 1.02)
+    _, contrasts = _compare(make_run(few, name="few"), make_run(worse, name="few-other"))
+    assert contrasts["velocity error (m/s)"].p_value == pytest.approx(4 * 2 / 2**4)
+
+
+def test_different_draws_are_compared_as_two_samples(make_rows: Rows, make_run: MakeRun) -> None:
+    first = make_run(make_rows(300))
+    paired, contrasts = _compare(first, make_run(make_rows(300, seed=2), name="same", seed=8))
+    assert not paired
+    assert min(contrast.p_value for contrast in contrasts.values()) > 0.01
+    _, changed = _compare(first, make_run(make_rows(300, seed=2, answered=0.6, spread=2.0), name="worse", seed=8))
+    assert changed["answered"].p_value < 1e-6
+    # no permutation of 10,000 has a larger difference
+    assert changed["velocity error (m/s)"].p_value < 1e-3
+    grid = campaign_diff_grid(["a", "b"], list(changed.values()))
+    assert ["answered", "< 0.001"] in [[row[0], row[-1]] for row in grid.rows]
+
+
+def test_terrains_of_different_sites_are_not_paired(make_rows: Rows, make_run: MakeRun) -> None:
+    # Errors depend on the terrain. Terrain numbers of two sites denote different terrains, so no pairs exist.
+    def write_site_run(name: str, seed: int) -> Path:
+        level = np.random.default_rng(seed).uniform(1.0, 3.0, 20)
+        frame = make_rows(400, terrains=20, answered=1.0, seed=seed)
+        frame["velocity_error_m_s"] = level[frame["terrain"]] + 0.1 * np.arange(400) / 400
+        configuration = {"parameters": {"site": name}}
+        return make_run(frame, name=name, seed=seed, configuration=configuration)
+
+    gusev, meridiani = read_run(write_site_run("gusev", 1)), read_run(write_site_run("meridiani", 6))
+    assert min(entry.p_value for entry in compare_campaigns(gusev, meridiani)[1]) > 0.05
+    first_sample, second_sample = (build_sample(*_select_errors(entry)) for entry in (gusev, meridiani))
+    assert difference_p(first_sample, second_sample) < 1e-3
+
+
+def _select_errors(run: StoredRun) -> tuple[pd.DataFrame, Figure]:
+    frame, figures = list_figures(run)
+    return frame, next(figure for figure in figures if figure.name == "velocity error (m/s)")
+
+
+def test_campaigns_without_common_metric_compare_completion(make_rows: Rows, make_run: MakeRun) -> None:
+    first = make_run(make_rows(20)[["case", "outcome"]], [])
+    _, contrasts = _compare(first, make_run(make_rows(20), name="other", seed=8))
+    assert set(contrasts) == {"came to an end"}
