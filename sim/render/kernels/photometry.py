@@ -149,20 +149,13 @@ def _add_octave(
         ratio = footprint[k] / cell
         fade = max(1.0 - FADING * ratio * ratio, 0.0)
         faded = strength[k] * amplitude * (fade * fade)
-        noise = gradient_noise(x[k] / cell, y[k] / cell, z[k] / cell, octave)
+        noise = gradient_noise(x[k] / cell, y[k] / cell, z[k] / cell, number)
         change[k] += faded * noise - 0.5 * NOISE_VARIANCE * faded**2
 
 
 @njit(cache=True)
 def add_texture(
-    x: Array,
-    y: Array,
-    z: Array,
-    footprint: Array,
-    coarsest: float,
-    amplitudes: Array,
-    strength: Array,
-    change: Array,
+    x: Array, y: Array, z: Array, footprint: Array, coarsest: float, amplitudes: Array, strength: Array, change: Array
 ) -> None:
     """Add the logarithm of the albedo's relative change at positions, averaged over pixels' footprints, to `change`.
 

@@ -232,7 +232,7 @@ def _sample_objects(
     work, other = strip.work, strip.other
     distance, triangles, weights = hits.distance, hits.triangle, hits.weights
     normals, body_of_triangle, albedo = materials.normals, materials.body_of_triangle, materials.albedo
-    samples = 0
+    count = 0
     for m in range(n_other):
         k = other[m]
         work[FOOTPRINT + k] = math.inf
@@ -244,17 +244,13 @@ def _sample_objects(
         _interpolate_normal(normals, triangle, weights[k, 0], weights[k, 1], k, work)
         body[k] = body_of_triangle[triangle]
         work[ALBEDO + k] = albedo[body[k]]
-        work[OBJECT_X + samples], work[OBJECT_Y + samples], work[OBJECT_Z + samples] = (
-            work[X + k],
-            work[Y + k],
-            work[Z + k],
-        )
+        work[OBJECT_X + count], work[OBJECT_Y + count], work[OBJECT_Z + count] = (work[X + k], work[Y + k], work[Z + k])
         facing = -(work[DX + k] * work[NX + k] + work[DY + k] * work[NY + k] + work[DZ + k] * work[NZ + k])
-        work[OBJECT_FOOTPRINT + samples] = distance[k] * pixel_angles[k] / math.sqrt(max(facing, 0.05))
-        work[OBJECT_CHANGE + samples] = 0.0
-        other[samples] = k
-        samples += 1
-    return samples
+        work[OBJECT_FOOTPRINT + count] = distance[k] * pixel_angles[k] / math.sqrt(max(facing, 0.05))
+        work[OBJECT_CHANGE + count] = 0.0
+        other[count] = k
+        count += 1
+    return count
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
@@ -468,13 +464,13 @@ def shade(
         _locate_pixels(rotation, centre, origins[here:there], directions[here:there], angles, met.distance, width, work)
         n_ground, n_blended, n_other = _select_levels(spacing, ground.top_level, met, strip)
         _sample_ground(levels, 1.0 / spacing, n_ground, n_blended, width, strip, fetched)
-        objects_sample = _sample_objects(materials, met, angles, n_other, strip, body)
+        n_objects = _sample_objects(materials, met, angles, n_other, strip, body)
         for k in range(width):
             n = here + 3 * k
             normals[n], normals[n + 1], normals[n + 2] = work[NX + k], work[NY + k], work[NZ + k]
         _roughen_ground(materials.relief, width, strip)
         photometric_angles(towards, width, work)
-        _apply_texture(materials, width, objects_sample, strip)
+        _apply_texture(materials, width, n_objects, strip)
         _cast_shadows(finest, terrain, met, angles, light, occluders, body, strip)
         if law[6] > 0.0 or light.drift[4] > 0.0:
             dim_sun(light, met.distance, work)

@@ -165,7 +165,7 @@ class MicroRelief(NamedTuple):
 
 
 class Materials(NamedTuple):
-    """Relief and textures (coarsest cell and amplitudes of octaves), normals at triangles' corners, albedo of bodies."""
+    """Relief and textures (coarsest cell, amplitudes of octaves), normals at triangles' corners, albedo of bodies."""
 
     relief: MicroRelief
     ground_texture: tuple[float, Array]
