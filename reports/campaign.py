@@ -38,7 +38,7 @@ COMMON_SECTIONS: tuple[SectionMaker, ...] = (
 _MAX_KINDS = 24
 
 #: Version of the layout of `report.json`, raised by removals and changes of meaning, and its JSON Schema.
-SCHEMA = 4
+SCHEMA = 5
 SCHEMA_FILE = Path(__file__).with_name("report.schema.json")
 #: Properties of a verdict in `report.json`.
 _DERIVED = ("note", "plain_status", "confident_status", "consumer_risk", "margin")

@@ -128,7 +128,7 @@ class TwinAlgorithm(_Part):
 class Twin(_Part):
     """A campaign's report in numbers."""
 
-    report_schema: Literal[4] = Field(alias="schema")
+    report_schema: Literal[5] = Field(alias="schema")
     campaign: str
     state: Any = Field(description="as the campaign's record has it, as are seed, git_commit and the times")
     seed: Any
