@@ -17,13 +17,13 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from marsyard.reports import common_sections, sections
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
-from marsyard.reports.evaluation import Judged, OverallVerdict, evaluate_run
+from marsyard.reports.evaluation import Evaluation, OverallVerdict, evaluate_run
 from marsyard.reports.presentation import presentations, shown_cases
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
-from marsyard.reports.traceability import judged_algorithms, junit_xml, requirement_evidence, verification_csv
+from marsyard.reports.traceability import junit_xml, requirement_evidence, tested_algorithms, verification_csv
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import count, label, number, numbers, primary_metric
 
@@ -38,7 +38,7 @@ COMMON_SECTIONS: tuple[SectionMaker, ...] = (
 _MAX_KINDS = 24
 
 #: Version of the layout of `report.json`, raised by removals and changes of meaning, and its JSON Schema.
-SCHEMA = 4
+SCHEMA = 5
 SCHEMA_FILE = Path(__file__).with_name("report.schema.json")
 #: Properties of a verdict in `report.json`.
 _DERIVED = ("note", "plain_status", "confident_status", "consumer_risk", "margin")
@@ -57,7 +57,7 @@ def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     return write_evaluation(evaluate_run(directory, requirements))
 
 
-def write_evaluation(evaluation: Judged) -> Path:
+def write_evaluation(evaluation: Evaluation) -> Path:
     """Write the report of an evaluated campaign into its folder."""
     run, how, verdicts, whole = evaluation.run, evaluation.how, evaluation.verdicts, evaluation.whole
     directory = run.directory
@@ -67,7 +67,7 @@ def write_evaluation(evaluation: Judged) -> Path:
     subject = Subject(drawn, metric, bound)
     further = [section for make in section_makers() if (section := make(subject)) is not None]
     twin = summary(evaluation, subject, further)
-    algorithms = judged_algorithms(run.record)
+    algorithms = tested_algorithms(run.record)
     write_whole(directory / TWIN_FILE, json.dumps(twin, indent=2, allow_nan=False) + "\n")
     write_whole(directory / VERIFICATION_FILE, verification_csv(requirement_evidence(run.name, verdicts, algorithms)))
     write_whole(directory / JUNIT_FILE, junit_xml(run.name, verdicts, whole, algorithms))
@@ -109,7 +109,7 @@ def page_context(
         "provenance": sections.provenance(run),
         "versions": sections.versions(run),
         "configuration": json.dumps(run.configuration or run.record, indent=2, ensure_ascii=False, default=str),
-        "algorithms": judged_algorithms(run.record),
+        "algorithms": tested_algorithms(run.record),
         "rerun": sections.rerun_commands(run),
         "rerun_is_stored": run.command is not None,
         "replay": sections.replay_command(run, "CASE"),
@@ -157,7 +157,7 @@ def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
     return texts
 
 
-def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict[str, Any]:
+def summary(found: Evaluation, subject: Subject, further: Sequence[Section]) -> dict[str, Any]:
     """The report as plain data; NaN and infinities are null."""
     run, how, whole, metric = found.run, found.how, found.whole, subject.metric
     summaries = error_summaries(subject.whole, metric) if metric is not None else []
@@ -169,7 +169,7 @@ def summary(found: Judged, subject: Subject, further: Sequence[Section]) -> dict
         "crashed": whole.crashed,
         "sites": _kinds(run.frame, "site"),
         "algorithms": _kinds(run.frame, "algorithm"),
-        "algorithm_details": [asdict(one) for one in judged_algorithms(run.record)],
+        "algorithm_details": [asdict(one) for one in tested_algorithms(run.record)],
         "sampling": {**asdict(how), "independent": how.independent, "text": how.text},
         "verdict": whole.word,
         "sentence": whole.sentence,

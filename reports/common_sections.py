@@ -36,7 +36,7 @@ from marsyard.reports.statistics.changes import holm
 from marsyard.reports.statistics.drivers import Driver, driver
 from marsyard.reports.statistics.proportions import proportion_interval
 from marsyard.reports.statistics.samples import circular_error, error_ellipse, mean_interval, quantile_bounds
-from marsyard.reports.verdicts import judge_campaign
+from marsyard.reports.verdicts import evaluate_requirements
 from marsyard.reports.wording import (
     NOTHING,
     axis_columns,
@@ -225,15 +225,15 @@ def sizes(cases: int) -> list[int]:
 
 
 def requirement_curves(subject: Subject) -> list[tuple[str, float, list[Point]]]:
-    """Name, rate asked and success rates of the first cases of each requirement that can be judged."""
+    """Name, rate asked and success rates of the first cases of each requirement that can be evaluated."""
     how = read_sampling_design(subject.run.configuration)
     frame, requirements = subject.whole, subject.run.requirements
-    judged = [(size, judge_campaign(frame.head(size), requirements, how)) for size in sizes(len(frame))]
+    evaluated = [(size, evaluate_requirements(frame.head(size), requirements, how)) for size in sizes(len(frame))]
     curves = []
-    for place, last in enumerate(judged[-1][1]):
+    for place, last in enumerate(evaluated[-1][1]):
         points = [
             Point(size, one[place].estimate, one[place].lower, one[place].upper)
-            for size, one in judged
+            for size, one in evaluated
             if not math.isnan(one[place].estimate)
         ]
         if len(points) > 1:
@@ -313,8 +313,8 @@ def consistency(nees: Float[np.ndarray, " n"], parts: int = PARTS) -> dict[str, 
 
 def consistencies(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Consistency of all algorithms in the rows with covariances, by name."""
-    judged = str(frame["algorithm"].iloc[0]) if "algorithm" in frame and len(frame) else "judged"
-    frames = {judged: frame, **{name: select_algorithm(frame, name) for name in compared_names(frame)}}
+    tested = str(frame["algorithm"].iloc[0]) if "algorithm" in frame and len(frame) else "tested"
+    frames = {tested: frame, **{name: select_algorithm(frame, name) for name in compared_names(frame)}}
     by_name = {name: numbers(own, NEES) for name, own in frames.items() if NEES in own}
     finite = {name: nees[np.isfinite(nees)] for name, nees in by_name.items()}
     return {name: consistency(nees) for name, nees in finite.items() if nees.size}

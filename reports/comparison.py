@@ -58,12 +58,12 @@ class Contender:
 
 @dataclass(frozen=True)
 class Difference:
-    """Another algorithm against the judged one on the same cases; both p are corrected for their number (Holm).
+    """Another algorithm against the one under test on the same cases; both p are corrected for their number (Holm).
 
-    only_first, only_other: cases in which only the judged one, or only the other, is within the bound; None without one
+    only_first, only_other: cases in which only the one under test, or only the other, is within the bound, if any
     success_p: two-sided probability of so uneven a split if both succeed equally often
     pairs: cases that both answered
-    mean, lower, upper: mean of the other's magnitude less the judged one's, with its interval
+    mean, lower, upper: mean of the other's magnitude less that of the algorithm under test, with its interval
     error_p: two-sided probability of such differences if they are symmetric about zero (Wilcoxon)
     """
 
@@ -85,7 +85,7 @@ def compared_names(frame: pd.DataFrame) -> list[str]:
 
 
 def select_algorithm(frame: pd.DataFrame, name: str) -> pd.DataFrame:
-    """The rows with a compared algorithm in place of the judged one."""
+    """The rows with a compared algorithm in place of the algorithm under test."""
     prefix = f"{name}."
     own = {str(column): str(column).removeprefix(prefix) for column in frame.columns if str(column).startswith(prefix)}
     renamed = frame.drop(columns=[column for column in own.values() if column in frame])
@@ -93,7 +93,7 @@ def select_algorithm(frame: pd.DataFrame, name: str) -> pd.DataFrame:
 
 
 def contender(frame: pd.DataFrame, name: str, metric: str | None, bound: float | None) -> Contender:
-    """Results of the judged algorithm in the rows."""
+    """Results of the algorithm under test in the rows."""
     magnitude = np.abs(numbers(frame, metric)) if metric is not None else np.full(len(frame), np.nan)
     finite = magnitude[np.isfinite(magnitude)]
     within = None
@@ -125,15 +125,15 @@ def difference(first: pd.DataFrame, other: pd.DataFrame, name: str, metric: str,
 def comparison(
     frame: pd.DataFrame, metric: str | None, bound: float | None
 ) -> tuple[list[Contender], list[Difference]]:
-    """Results of all algorithms, the judged one first, and differences of the others; empty for a single algorithm."""
+    """Results of all algorithms, the one under test first, and differences of the others; empty for a single one."""
     names = compared_names(frame)
     # cases that ended before any algorithm ran have no answers to compare
     frame = frame[np.logical_and.reduce([frame[f"{name}.answered"].notna() for name in names])] if names else frame
     if not names or frame.empty:
         return [], []
-    judged = str(frame["algorithm"].iloc[0]) if "algorithm" in frame else "judged"
+    tested = str(frame["algorithm"].iloc[0]) if "algorithm" in frame else "tested"
     others = {name: select_algorithm(frame, name) for name in names}
-    contenders = [contender(frame, judged, metric, bound)]
+    contenders = [contender(frame, tested, metric, bound)]
     contenders += [contender(own, name, metric, bound) for name, own in others.items()]
     if metric is None:
         return contenders, []
@@ -151,14 +151,14 @@ def comparison_section(subject: Subject) -> Section | None:
     if not contenders:
         return None
     grids = comparison_grids(contenders, differences, subject.metric)
-    judged = contenders[0].name
-    note = note_text("common.comparison", judged=judged, confidence=format_fraction(CONFIDENCE))
+    tested = contenders[0].name
+    note = note_text("common.comparison", tested=tested, confidence=format_fraction(CONFIDENCE))
     blocks = [Block(grid=grids[0])]
     if differences:
-        blocks.append(Block(heading=f"Against {judged}", grid=grids[1], note=note))
+        blocks.append(Block(heading=f"Against {tested}", grid=grids[1], note=note))
     data = {
         "algorithms": [asdict(one) for one in contenders],
-        "against": judged,
+        "against": tested,
         "differences": [asdict(one) for one in differences],
     }
     return Section("algorithms", "Algorithms", "Algorithms on the same cases", blocks, data)
@@ -180,7 +180,7 @@ def comparison_grids(
             f"95 %{unit}": lambda one: number(one.p95),
         },
     )
-    judged = contenders[0].name if contenders else ""
+    tested = contenders[0].name if contenders else ""
     rows = [
         [
             one.name,
@@ -192,7 +192,7 @@ def comparison_grids(
         ]
         for one in differences
     ]
-    return first, Grid(["Algorithm", f"Only {judged}", "Only it", "p", "Pairs", f"Difference{unit}", "p"], rows)
+    return first, Grid(["Algorithm", f"Only {tested}", "Only it", "p", "Pairs", f"Difference{unit}", "p"], rows)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from marsyard.reports.statistics.proportions import (
     proportion_upper,
 )
 from marsyard.reports.stored import StoredRun, read_run
-from marsyard.reports.verdicts import ESTIMATE, Status, Verdict, judge_campaign
+from marsyard.reports.verdicts import ESTIMATE, Status, Verdict, evaluate_requirements
 from marsyard.reports.wording import count
 
 
@@ -87,7 +87,7 @@ def _further_text(verdicts: Sequence[Verdict]) -> str:
 
 
 @dataclass(frozen=True)
-class Judged:
+class Evaluation:
     """A stored campaign with its sampling design and its verdicts."""
 
     run: StoredRun
@@ -101,12 +101,12 @@ class Judged:
         return exit_code(self.verdicts, bool(self.whole.crashed))
 
 
-def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Judged:
-    """Judge a campaign by its own or the given requirements; raises StoreError if the folder holds no rows."""
+def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Evaluation:
+    """Evaluate a campaign by its own or the given requirements; raises StoreError if the folder holds no rows."""
     run = read_run(directory, requirements)
     how = read_sampling_design(run.configuration)
-    verdicts = judge_campaign(run.whole, run.requirements, how)
-    return Judged(run, how, verdicts, overall(verdicts, run.whole, how))
+    verdicts = evaluate_requirements(run.whole, run.requirements, how)
+    return Evaluation(run, how, verdicts, overall(verdicts, run.whole, how))
 
 
 def next_look(verdicts: Sequence[Verdict], how: SamplingDesign, cases: int) -> int | None:

@@ -25,7 +25,7 @@ from marsyard.reports.section import Grid, SvgFigure, plate
 from marsyard.reports.statistics.drivers import Driver, driver
 from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.tables import outcome_counts
-from marsyard.reports.traceability import judged_algorithms
+from marsyard.reports.traceability import tested_algorithms
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import (
     NOTHING,
@@ -162,8 +162,8 @@ def provenance(run: StoredRun) -> list[tuple[str, str]]:
     environment, times = table(run.recorded("environment")), numbers(run.frame, "cpu_time_s")
     times = times[np.isfinite(times)]
     algorithms: list[tuple[str, Any]] = []
-    for one in judged_algorithms(run.record):
-        head = "Algorithm judged" if one.judged else "Algorithm compared"
+    for one in tested_algorithms(run.record):
+        head = "Algorithm under test" if one.tested else "Algorithm compared"
         algorithms += [(head, one.name), (f"{head}: class or file", one.path), (f"{head}: version", one.version)]
         algorithms += [(f"{head}: sources", one.source_hash), (f"{head}: options", one.options_text)]
     facts = [

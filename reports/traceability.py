@@ -23,13 +23,13 @@ class Algorithm:
     """An algorithm under test; text that the record lacks is empty.
 
     name: as in the campaign: a shipped name, `module:Class`, or a program
-    judged: whether requirements judge it, or it is only compared
+    tested: whether it is under test, or only compared
     path: its class as `module:name`, or its file
     version: of its installed distribution, or its `version` attribute
     """
 
     name: str
-    judged: bool = True
+    tested: bool = True
     path: str = ""
     version: str = ""
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -46,14 +46,14 @@ class Algorithm:
         return json.dumps(self.options, ensure_ascii=False) if self.options else ""
 
 
-def judged_algorithms(record: Mapping[str, Any]) -> list[Algorithm]:
-    """Read the algorithms from a campaign's record, the judged one first; old records give names alone."""
+def tested_algorithms(record: Mapping[str, Any]) -> list[Algorithm]:
+    """Read the algorithms from a campaign's record, the algorithm under test first; old records give names alone."""
     stored = record.get("algorithms")
     entries = [table(one) for one in stored] if isinstance(stored, list) else []
     items = [
         Algorithm(
             name=str(entry["spec"]),
-            judged=entry.get("role") != "compared",
+            tested=entry.get("role") != "compared",
             path=str(entry.get("path") or ""),
             version=str(entry.get("version") or ""),
             options=table(entry.get("options")),
@@ -64,12 +64,12 @@ def judged_algorithms(record: Mapping[str, Any]) -> list[Algorithm]:
     ]
     if not items:
         items = _named_algorithms(table(table(record.get("configuration")).get("parameters")))
-    return sorted(items, key=lambda one: not one.judged)
+    return sorted(items, key=lambda one: not one.tested)
 
 
-def format_judged_algorithms(algorithms: Sequence[Algorithm]) -> str:
-    """Names and versions of the judged algorithms."""
-    return ", ".join(one.title for one in algorithms if one.judged)
+def format_tested_algorithms(algorithms: Sequence[Algorithm]) -> str:
+    """Names and versions of the algorithm under test."""
+    return ", ".join(one.title for one in algorithms if one.tested)
 
 
 def _named_algorithms(parameters: Mapping[str, Any]) -> list[Algorithm]:
@@ -78,7 +78,7 @@ def _named_algorithms(parameters: Mapping[str, Any]) -> list[Algorithm]:
     if isinstance(chosen, str) and chosen:
         compared = parameters.get("compared")
         names = compared if isinstance(compared, list) else []
-        return [Algorithm(chosen), *(Algorithm(str(name), judged=False) for name in names)]
+        return [Algorithm(chosen), *(Algorithm(str(name), tested=False) for name in names)]
     inner = (_named_algorithms(value) for value in parameters.values() if isinstance(value, Mapping))
     return next((found for found in inner if found), [])
 
@@ -90,13 +90,13 @@ _UNPRINTABLE = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff
 
 
 def algorithm_cells(algorithms: Iterable[Algorithm]) -> dict[str, str]:
-    """Columns of the matrix that identify the judged algorithms, joined by "; "."""
-    judged = [one for one in algorithms if one.judged]
+    """Columns of the matrix that identify the algorithm under test, joined by "; "."""
+    tested = [one for one in algorithms if one.tested]
     cells = {
-        "algorithm": [one.name for one in judged],
-        "algorithm_version": [one.version for one in judged],
-        "algorithm_options": [one.options_text for one in judged],
-        "algorithm_source": [one.source_hash for one in judged],
+        "algorithm": [one.name for one in tested],
+        "algorithm_version": [one.version for one in tested],
+        "algorithm_options": [one.options_text for one in tested],
+        "algorithm_source": [one.source_hash for one in tested],
     }
     return {column: "; ".join(value for value in values if value) for column, values in cells.items()}
 
@@ -148,7 +148,7 @@ def junit_xml(
 ) -> str:
     """JUnit's XML: a test for each requirement, and one for the completion of all cases.
 
-    FAIL is a failure; INSUFFICIENT and MET BY RATE are skipped. Properties of the suite name the judged algorithms.
+    FAIL is a failure; INSUFFICIENT and MET BY RATE are skipped. Properties of the suite name the algorithm under test.
     """
     statuses = [one.status for one in verdicts]
     suite = Xml.Element(
@@ -163,8 +163,8 @@ def junit_xml(
         properties = Xml.SubElement(suite, "properties")
         for name, value in cells.items():
             Xml.SubElement(properties, "property", name=name, value=_text(value))
-    judged = format_judged_algorithms(algorithms)
-    subject = f"Judged: {judged}. " if judged else ""
+    tested = format_tested_algorithms(algorithms)
+    subject = f"Under test: {tested}. " if tested else ""
     for one in verdicts:
         case = Xml.SubElement(suite, "testcase", classname=_text(campaign), name=_text(one.requirement_id))
         evidence = _text(

@@ -55,13 +55,13 @@ class Verdict:
     failures: cases whose metric is missing, NaN or out of bound, unfinished cases, and those of unknown membership
     estimate, lower, upper: success rate and its one-sided bounds; NaN for an empty population, bounds also for designs
     further_cases: cases that pass the requirement if none fails, on new terrains where terrains are counted; or None
-    reason: why the requirement is not judged, or the verdict is withheld
+    reason: why the requirement is not evaluated, or the verdict is withheld
     advice: why more cases cannot help, and the change that does
     accept_rate: whether MET BY RATE gives the exit status 0
     terrains: distinct terrains of the population; None if unknown
     clustered: evidence of shared terrains; None where no terrain is shared
     plain_lower, plain_upper: bounds for independent cases
-    bounds_confidence, upper_confidence: of the two bounds; above the requirement's where the campaign is judged again
+    bounds_confidence, upper_confidence: of the two bounds; above the requirement's for repeated evaluations
     """
 
     requirement_id: str
@@ -166,9 +166,9 @@ class Verdict:
         lower, upper = (f"{100.0 * level:.4g} %" for level in (self.bounds_confidence, self.upper_confidence))
         joint_note = f"so that all looks together keep {format_fraction(self.confidence)}"
         if lower == upper:
-            return f"The campaign is judged more than once: its bounds are at {lower} confidence, {joint_note}."
+            return f"The campaign is evaluated more than once: its bounds are at {lower} confidence, {joint_note}."
         return (
-            f"The campaign is judged more than once: its lower bound is at {lower} confidence and its upper bound at "
+            f"The campaign is evaluated more than once: its lower bound is at {lower} confidence, its upper bound at "
             f"{upper}, {joint_note}."
         )
 
@@ -240,17 +240,17 @@ def _cases_needed(first: int, n: int, failures: int, probability: float, confide
     return LaterLook(1.0 - probability, 1.0 - confidence, first).cases_needed(n, failures)
 
 
-def judge_campaign(
+def evaluate_requirements(
     frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], how: SamplingDesign = INDEPENDENT
 ) -> list[Verdict]:
-    """Judge every requirement on all rows of a campaign; missing columns or numbers give INSUFFICIENT, no exception.
+    """Evaluate every requirement on all rows of a campaign; missing columns or numbers give INSUFFICIENT, no exception.
 
     how: the sampling design; without independent random draws, verdicts have no bounds
     """
-    return [_judge(how.draw(frame), requirement, how) for requirement in requirements]
+    return [_evaluate(how.draw(frame), requirement, how) for requirement in requirements]
 
 
-def _judge(frame: pd.DataFrame, requirement: Mapping[str, Any], how: SamplingDesign) -> Verdict:
+def _evaluate(frame: pd.DataFrame, requirement: Mapping[str, Any], how: SamplingDesign) -> Verdict:
     verdict = _empty_verdict(requirement)
     fault = _requirement_fault(frame, verdict)
     if fault:
@@ -296,23 +296,23 @@ def _decide(verdict: Verdict, chosen: pd.DataFrame, how: SamplingDesign, frame: 
         status = _status_by_rate(rate, n, verdict.probability) if by_rate else verdict.status
         return replace(counted, status=status, reason=reason)
     looks = Looks(how.mask_first_look(frame, chosen), how.risk_share(len(frame)))
-    judged, further = add_bounds(counted, success, groups, looks)
-    status = judged.confident_status
+    evaluated, further = add_bounds(counted, success, groups, looks)
+    status = evaluated.confident_status
     by_rate = by_rate and status is not Status.PASS
     if by_rate:
         status = _status_by_rate(rate, n, verdict.probability)
-    judged = replace(judged, status=status)
+    evaluated = replace(evaluated, status=status)
     if status is not Status.INSUFFICIENT:
-        return judged
+        return evaluated
     if by_rate:
-        return replace(judged, further_cases=min_cases_for_rate(verdict.probability) - n)
+        return replace(evaluated, further_cases=min_cases_for_rate(verdict.probability) - n)
     # further cases, or the advice why these cannot help
-    shared, supply = judged.clustered, how.terrains
+    shared, supply = evaluated.clustered, how.terrains
     are_counted = shared is not None and shared.method is ClusterMethod.TERRAIN_COUNT
     if not are_counted or supply is None or (terrains or 0) + further <= supply.terrains:
-        return replace(judged, further_cases=further)
+        return replace(evaluated, further_cases=further)
     fewest = proportions.minimum_sample_size(verdict.probability, verdict.confidence)
-    return replace(judged, advice=supply.advice(fewest, verdict.probability, verdict.confidence))
+    return replace(evaluated, advice=supply.advice(fewest, verdict.probability, verdict.confidence))
 
 
 def _status_by_rate(rate: float, n: int, probability: float) -> Status:
@@ -335,7 +335,7 @@ def compare_bounds(lower: float, upper: float, probability: float) -> Status:
 
 
 def _requirement_fault(frame: pd.DataFrame, verdict: Verdict) -> str:
-    """Why a requirement cannot be judged; empty if it can."""
+    """Why a requirement cannot be evaluated; empty if it can."""
     for name in ("probability", "confidence"):
         value = getattr(verdict, name)
         if not 0.0 < value < 1.0:

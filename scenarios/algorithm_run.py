@@ -150,12 +150,12 @@ def answer_time_s(answer: object, taken_s: float) -> float:
 
 
 def case_result(
-    algorithms: Sequence[str], judge: Callable[[str], CaseResult], conditions: Mapping[str, Scalar]
+    algorithms: Sequence[str], evaluate: Callable[[str], CaseResult], conditions: Mapping[str, Scalar]
 ) -> CaseResult:
-    """Record the conditions, run and score each algorithm by `judge`, the first under test, and combine the results."""
+    """Record the conditions, score each algorithm by `evaluate` (the first is under test), and combine the results."""
     record_conditions(conditions)
     names = labels(algorithms)
-    first, *others = [judge(spec) for spec in algorithms]
+    first, *others = [evaluate(spec) for spec in algorithms]
     row: dict[str, Scalar] = {ALGORITHM: names[0], **first.row, **conditions}
     for name, other in zip(names[1:], others, strict=True):
         own: dict[str, Scalar] = {"outcome": other.outcome, "answered": other.answered, **other.row}

@@ -368,7 +368,7 @@ def check_losses(
     details, sighting = located.details, located.sighting
     match, stereo, position = details.match, details.stereo, details.position_world
     if sighting is None or match is None or stereo is None or position is None or track.seed_world is None:
-        raise ValueError("only a target that was matched, ranged and seeded can be judged")
+        raise ValueError("only a target that was matched, ranged and seeded can be evaluated")
     moved = sighting.world_from_rover.translation - last.world_from_rover.translation
     since_update = sighting.world_from_rover.translation - track.world_from_rover.translation
     journey = Journey(

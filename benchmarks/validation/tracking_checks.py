@@ -63,25 +63,25 @@ def drift(quick: bool) -> Iterator[Measure]:
     for camera in CAMERAS:
         rows = (driven(number, camera) for number in count(1000))
         chosen = list(islice((row for row in rows if row["selectable"]), wanted))
-        yield from _drifts(chosen, camera, judged=False)
+        yield from _drifts(chosen, camera, tested=False)
         all_rows += chosen
-    yield from _drifts(all_rows, "both cameras", judged=True)
+    yield from _drifts(all_rows, "both cameras", tested=True)
 
 
-def _drifts(rows: list[dict[str, Scalar]], name: str, *, judged: bool) -> Iterator[Measure]:
+def _drifts(rows: list[dict[str, Scalar]], name: str, *, tested: bool) -> Iterator[Measure]:
     px = np.array([float(row["drift_px"]) for row in rows])
     how = (
         f"{len(rows)} targets on rendered rocks, 10 m to 2 m in steps of 10 %, no noise, exact pose and cameras, "
         f"the sun moving by {_sun_moved_deg(rows):.0f} deg; "
         f"{np.count_nonzero(np.isnan(px))} not tracked to the end"
     )
-    if judged:
+    if tested:
         yield _measure_losses(f"targets lost before 2 m: {name}", int(np.isnan(px).sum()), len(px), how)
     tracked = px[~np.isnan(px)]
     rms, worst = float(np.sqrt(np.mean(tracked**2))), float(tracked.max())
-    yield Measure(f"drift of the tracked point, rms: {name}", rms, "px", DRIFT_RMS_BAR_PX if judged else None, how)
+    yield Measure(f"drift of the tracked point, rms: {name}", rms, "px", DRIFT_RMS_BAR_PX if tested else None, how)
     yield Measure(
-        f"drift of the tracked point, worst: {name}", worst, "px", DRIFT_WORST_BAR_PX if judged else None, how
+        f"drift of the tracked point, worst: {name}", worst, "px", DRIFT_WORST_BAR_PX if tested else None, how
     )
 
 

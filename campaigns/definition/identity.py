@@ -111,10 +111,10 @@ def list_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
     used = find_scenario(configuration.scenario)
     if not isinstance(used, HasAlgorithms):
         return ()
-    judged, compared = (".".join((*used.algorithm_table, name)) for name in ("algorithm", "compared"))
-    stated = [find_value(configuration.parameters, judged), *find_value(configuration.parameters, compared)]
-    if judged in configuration.dispersions:
-        stated += configuration.dispersions[judged].extremes()
+    tested, compared = (".".join((*used.algorithm_table, name)) for name in ("algorithm", "compared"))
+    stated = [find_value(configuration.parameters, tested), *find_value(configuration.parameters, compared)]
+    if tested in configuration.dispersions:
+        stated += configuration.dispersions[tested].extremes()
     return tuple(dict.fromkeys(str(spec) for spec in stated if spec))
 
 
@@ -208,9 +208,9 @@ def _distribution_version(name: str) -> str | None:
 
 
 def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
-    """Describe the algorithms that a campaign runs, the judged one first; empty where the scenario takes none.
+    """Describe the algorithms that a campaign runs, the one under test first; empty where the scenario takes none.
 
-    Keys of each entry: `spec` (the campaign's name for it), `role` (`judged` or `compared`), `path` (class as
+    Keys of each entry: `spec` (the campaign's name for it), `role` (`tested` or `compared`), `path` (class as
     ``module:name``, or the file of the program or table), `version` (of the installed distribution, or the class's
     `version` attribute; None where there is neither), `options` and `source_hash` (SHA-256, 16 digits; None where no
     source can be read).
@@ -237,7 +237,7 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
         described.append(
             {
                 "spec": spec,
-                "role": "compared" if spec in compared else "judged",
+                "role": "compared" if spec in compared else "tested",
                 "path": path,
                 "version": version,
                 "options": options,

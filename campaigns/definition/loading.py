@@ -90,7 +90,7 @@ def load_campaign(
     overrides: ``KEY=VALUE`` each. KEY is a dotted path into the parameters or one of the file's own keys (`cases`,
     `seed`), VALUE is in TOML's notation or plain text. An overridden parameter is no longer dispersed.
     cases, seed: replace those of the file.
-    algorithms: replace those of the file: the judged one, then those compared with it.
+    algorithms: replace those of the file: the algorithm under test, then those compared with it.
     Raises ConfigurationError that lists every problem by file (or option), key and allowed values.
     """
     path = find_campaign(name_or_path)

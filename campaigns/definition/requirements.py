@@ -1,4 +1,4 @@
-"""Files of requirements: campaigns name requirements by id, and stored rows can be judged by them again."""
+"""Files of requirements: campaigns name requirements by id, and stored rows can be evaluated by them again."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class RunOptions:
 @options.handle_user_errors
 @options.with_options(RunOptions)
 def run(given: RunOptions) -> None:
-    """Run a campaign, judge its requirements, and write its report."""
+    """Run a campaign, evaluate its requirements, and write its report."""
     from marsyard.campaigns.definition.loading import load_campaign
 
     changes = list(given.override or [])
@@ -84,7 +84,7 @@ def resume(
     case_time: options.CaseTimeOption = None,
     allow_changed: options.ChangedOption = False,
 ) -> None:
-    """Run the remaining cases of an interrupted or killed campaign, and judge it."""
+    """Run the remaining cases of an interrupted or killed campaign, and evaluate it."""
     from marsyard.campaigns.errors import RETRYABLE, CampaignError, unknown_name_message
     from marsyard.campaigns.running.engine import resume_campaign
     from marsyard.cli.outcome import continue_until_decided
@@ -110,7 +110,7 @@ def append(
     cluster: options.ClusterOption = None,
     allow_changed: options.ChangedOption = False,
 ) -> None:
-    """Add cases to a finished campaign, run them, and judge all."""
+    """Add cases to a finished campaign, run them, and evaluate all."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.running.engine import append_cases, campaign_with_block
     from marsyard.campaigns.store.record import stored_configuration
@@ -188,7 +188,7 @@ def make_executor(jobs: int | None, cluster: str | None) -> ExecutorConfig:
 
 
 def run_and_judge(directory: Path, work: Callable[[Watch], None]) -> None:
-    """Do a campaign's work and judge it."""
+    """Do a campaign's work and evaluate it."""
     from marsyard.cli.outcome import conclude
     from marsyard.cli.progress import RunLog
 

@@ -99,7 +99,7 @@ class Night:
 
 
 def run_planned(now: Night, planned: PlannedCampaign, folder: Path, watch: Watch) -> None:
-    """Run a campaign, judge it, and store its figures; its errors do not affect the others."""
+    """Run a campaign, evaluate it, and store its figures; its errors do not affect the others."""
     figures = []
     try:
         campaign = planned.load(now.plan.seed, now.number, folder)

@@ -53,7 +53,7 @@ AlgorithmOption = Annotated[
     Option(
         metavar="NAME",
         help="The algorithm under test: a name, module:Class, exec:PROGRAM or serve:PROGRAM. Given several times, all "
-        "run on the same cases and are compared; the first is judged.",
+        "run on the same cases and are compared; the first is under test.",
     ),
 ]
 JobsOption = Annotated[int | None, Option(metavar="J", help="Worker processes; by default one per core.")]

@@ -37,13 +37,13 @@ from marsyard.cli.options import Exit, size_text
 from marsyard.cli.showing import grid_table
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.comparison import comparison, comparison_grids
-from marsyard.reports.evaluation import Judged, evaluate_run, next_look
+from marsyard.reports.evaluation import Evaluation, evaluate_run, next_look
 from marsyard.reports.presentation import notable_cases
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.statistics.proportions import minimum_sample_size, planned_looks
 from marsyard.reports.stored import read_run
 from marsyard.reports.tables import verdict_table
-from marsyard.reports.verdicts import ESTIMATE, Verdict, judge_campaign
+from marsyard.reports.verdicts import ESTIMATE, Verdict, evaluate_requirements
 from marsyard.reports.wording import count, format_fraction, primary_metric
 
 #: Browsers that can print pages, in order of preference.
@@ -52,9 +52,9 @@ _PRINTING_S = 600.0
 
 
 def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[str, Any]] | None = None) -> int:
-    """Judge a campaign, write its report, print both, and return the exit status.
+    """Evaluate a campaign, write its report, print both, and return the exit status.
 
-    An unfinished campaign is judged by its rows so far, with a status that is never 0; its record is not changed.
+    An unfinished campaign is evaluated by its rows so far, with a status that is never 0; its record is not changed.
     `requirements` replace the campaign's own; the record then keeps its status too.
 
     Raises StoreError where the folder holds no campaign with rows, or the report cannot be written.
@@ -79,10 +79,10 @@ def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[s
     return found.exit_code if finished else found.exit_code or Exit.INSUFFICIENT
 
 
-def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> tuple[Judged, Path]:
-    """Judge a campaign's rows and write its report; return the verdicts and the page.
+def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> tuple[Evaluation, Path]:
+    """Evaluate a campaign's rows and write its report; return the verdicts and the page.
 
-    The record stores the exit status of a finished campaign that is judged by its own requirements.
+    The record stores the exit status of a finished campaign that is evaluated by its own requirements.
 
     Raises StoreError where the folder holds no campaign with rows, or the report cannot be written.
     """
@@ -266,7 +266,7 @@ def continue_until_decided(directory: Path, executor: ExecutorConfig, watch: Wat
             return
         plain = configuration.model_dump(mode="json")
         how, cases = read_sampling_design(plain), configuration.total_cases
-        look = next_look(judge_campaign(read_frame(directory), plain["requirements"], how), how, cases)
+        look = next_look(evaluate_requirements(read_frame(directory), plain["requirements"], how), how, cases)
         if look is None:
             watch.note(f"stopped after {cases} of at most {count(configuration.max_cases, 'case')}")
             return

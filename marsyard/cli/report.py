@@ -19,7 +19,7 @@ LOOPBACK = "127.0.0.1"
 def report(
     directory: DirectoryArgument,
     requirements: Annotated[
-        Path | None, Option(metavar="FILE", help="Judge by this file's requirements for the campaign, not by its own.")
+        Path | None, Option(metavar="FILE", help="Use this file's requirements for the campaign, not its own.")
     ] = None,
     pdf: Annotated[bool, Option("--pdf", help="Also print the page to report.pdf (needs Chromium).")] = False,
     csv: Annotated[bool, Option("--csv", help="Also write all rows to cases.csv.")] = False,
@@ -28,7 +28,7 @@ def report(
         Option("--gallery", help="First rerun the worst, some unanswered and some random cases for their pictures."),
     ] = False,
 ) -> None:
-    """Judge a campaign from its stored rows, complete or not, and write its report.
+    """Evaluate a campaign from its stored rows, complete or not, and write its report.
 
     Cases are rerun for --gallery only.
     """

@@ -16,7 +16,7 @@ from marsyard.campaigns.definition.requirements import StatedRequirement
 from marsyard.campaigns.errors import CampaignError
 from marsyard.reports.campaign import SCHEMA, TWIN_FILE, write_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
-from marsyard.reports.traceability import Algorithm, format_judged_algorithms, judged_algorithms
+from marsyard.reports.traceability import Algorithm, format_tested_algorithms, tested_algorithms
 from marsyard.reports.verdicts import ESTIMATE
 from marsyard.reports.wording import NOTHING, percent
 from marsyard.scenarios.systems import find_system
@@ -48,7 +48,7 @@ class Entry:
     """A stored campaign, from its record and its report; empty fields where these state nothing.
 
     slug: its folder's name in the site: letters, digits, dots and hyphens, with a hash of its path.
-    tested: algorithms under test with versions, options and sources, the judged one first.
+    tested: algorithms under test with versions, options and sources; those that are only compared follow.
     kept, worst: cases with kept products, and those with the largest errors.
     """
 
@@ -72,9 +72,9 @@ class Entry:
     outcomes: Mapping[str, int]
 
     @property
-    def judged(self) -> str:
-        """Names and versions of the judged algorithms; names from the rows where the record states none."""
-        return format_judged_algorithms(self.tested) or ", ".join(self.algorithms)
+    def tested_names(self) -> str:
+        """Names and versions of the algorithm under test; names from the rows where the record states none."""
+        return format_tested_algorithms(self.tested) or ", ".join(self.algorithms)
 
     @property
     def finished(self) -> bool:
@@ -131,7 +131,7 @@ def _read_entry(path: Path) -> Entry:
         system="other" if system is None else system.name,
         sites=_named(twin, "sites", parameters, "site"),
         algorithms=_named(twin, "algorithms", parameters, "algorithm"),
-        tested=tuple(judged_algorithms(record)),
+        tested=tuple(tested_algorithms(record)),
         commit=str(twin.get("git_commit") or "")[:10],
         started=str(twin.get("started_utc") or ""),
         state=str(twin.get("state") or ""),
@@ -211,7 +211,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class RequirementRow:
-    """A requirement, the latest verdict of each campaign, and the trend of the campaign that was judged last.
+    """A requirement, the latest verdict of each campaign, and the trend of the campaign that was evaluated last.
 
     `all_cells` are the verdicts of all campaigns, the latest first, unfinished campaigns last; `cells` the latest
     verdict of each campaign name.

@@ -127,7 +127,7 @@ def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
             {
                 "slug": cell.entry.slug,
                 "name": cell.entry.name,
-                "algorithm": cell.entry.judged,
+                "algorithm": cell.entry.tested_names,
                 "status": cell.shown.status,
                 "margin": margin_text(cell.shown),
                 "date": cell.entry.started[:10],

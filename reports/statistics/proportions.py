@@ -223,7 +223,7 @@ def confidence_at(confidence: float, share: float) -> float:
 
 @dataclass(frozen=True)
 class LaterLook:
-    """Test at a look at a campaign that was judged before: one verdict, PASS or FAIL, of a requirement.
+    """Test at a look at a campaign that was evaluated before: one verdict, PASS or FAIL, of a requirement.
 
     Events are failures for PASS, successes for FAIL: few of them show it. Under `rate`, the rate at the requirement's
     limit, the likelihood ratio (`_log_likelihood_ratio`) is a martingale, and under any higher rate a supermartingale.

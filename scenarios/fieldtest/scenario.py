@@ -102,7 +102,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
             **picture_columns(p.backend, hash_images(pictures)),
         }
 
-        def judge(algorithm: str) -> CaseResult:
+        def evaluate(algorithm: str) -> CaseResult:
             attempt = run_algorithm_on_copy(
                 lambda given: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case).estimate(given),
                 lambda answer: check_last_interval(answer, measurements),
@@ -117,7 +117,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
                 row |= compute_scores(p.scores, flight, {*row, *conditions})
             return algorithm_result(attempt, velocity is not None, row, velocity_products(pictures, estimate, truth))
 
-        return case_result(p.algorithms, judge, conditions)
+        return case_result(p.algorithms, evaluate, conditions)
 
 
 def calibrated_camera(p: FieldTestParameters, streams: Streams) -> CameraModel:

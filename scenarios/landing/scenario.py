@@ -80,7 +80,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
         provenance = picture_columns(p.render.backend, hash_images(case.pair.counts))
         known = {**conditions(case, measurements), **provenance}
 
-        def judge(algorithm: str) -> CaseResult:
+        def evaluate(algorithm: str) -> CaseResult:
             attempt = run_algorithm_on_copy(
                 lambda given: LANDING.make(algorithm, p.hda, p.executable, streams.case).estimate(given),
                 check_site,
@@ -109,4 +109,4 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
             converged = attempt.answer is not None and estimate.outcome.converged
             return algorithm_result(attempt, converged, row, products(case, estimate))
 
-        return case_result(p.algorithms, judge, known)
+        return case_result(p.algorithms, evaluate, known)

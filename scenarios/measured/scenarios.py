@@ -81,7 +81,7 @@ class MeasuredVelocityParameters(AlgorithmSelection, CustomScores, MeasuredParam
     task = VELOCITY
     scored = ScoredVelocity
 
-    algorithm: str = Field(default="dimes", description="the velocity estimator under test, whose answers are judged")
+    algorithm: str = Field(default="dimes", description="the velocity estimator under test")
     dimes: Annotated[DimesOptions, Field(description="options of DIMES")] = DimesOptions()
 
     @model_validator(mode="after")
@@ -99,9 +99,7 @@ class MeasuredLandingParameters(AlgorithmSelection, CustomScores, MeasuredParame
     task = LANDING
     scored = ScoredSite
 
-    algorithm: Annotated[
-        str, Field(description="the estimator of landing sites under test, whose answers are judged")
-    ] = "hda"
+    algorithm: Annotated[str, Field(description="the estimator of landing sites under test")] = "hda"
     hda: Annotated[HdaOptions, Field(description="options of the hazard detection and avoidance")] = HdaOptions()
 
 
@@ -169,7 +167,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
         true_velocity = p.case.truth.velocity_m_s
         truth = np.array(true_velocity or (np.nan, np.nan), dtype=np.float64)
 
-        def judge(algorithm: str) -> CaseResult:
+        def evaluate(algorithm: str) -> CaseResult:
             attempt = attempts[algorithm]
             velocity = _velocity(attempt.answer)
             pairs = compare_with_poses(images, matches, _descent_poses(p.case, measurements, velocity))
@@ -201,7 +199,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
                 attempt, velocity is not None, row, {**products, **agreement_products(images, pairs)}
             )
 
-        return case_result(p.algorithms, judge, conditions)
+        return case_result(p.algorithms, evaluate, conditions)
 
 
 class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
@@ -232,7 +230,7 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
         record_conditions(conditions)
         attempts = _run_algorithms(p, p.hda, measurements, check_site, streams.case)
 
-        def judge(algorithm: str) -> CaseResult:
+        def evaluate(algorithm: str) -> CaseResult:
             attempt = attempts[algorithm]
             details = None if attempt.answer is None else attempt.answer.details
             row = _site_answer_row(attempt.answer, measurements, true_poses)
@@ -246,7 +244,7 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
             converged = attempt.answer is not None and attempt.answer.outcome.converged
             return algorithm_result(attempt, converged, row, {**products, **agreement_products(images, pairs)})
 
-        return case_result(p.algorithms, judge, conditions)
+        return case_result(p.algorithms, evaluate, conditions)
 
 
 def _run_algorithms(

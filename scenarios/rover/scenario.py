@@ -229,14 +229,14 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
         first = prepare_run(p, streams, self.load_ground)
         known = score.fixed_conditions(p, first)
 
-        def judge(algorithm: str) -> CaseResult:
-            judged = algorithm == p.algorithm
+        def evaluate(algorithm: str) -> CaseResult:
+            tested = algorithm == p.algorithm
             candidate = p.model_copy(update={"algorithm": algorithm})
-            run_started = started if judged else time.process_time()
-            run = first if judged else prepare_run(candidate, streams, self.load_ground)
-            return _judge(p, lambda: track_target(candidate, run), known, judged, run_started)
+            run_started = started if tested else time.process_time()
+            run = first if tested else prepare_run(candidate, streams, self.load_ground)
+            return _evaluate(p, lambda: track_target(candidate, run), known, tested, run_started)
 
-        return case_result(p.algorithms, judge, known)
+        return case_result(p.algorithms, evaluate, known)
 
 
 class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
@@ -291,20 +291,20 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
             "on_face": visibility.in_view and (p.face_deg is None or visibility.obliquity_max_deg <= p.face_deg),
         }
 
-        def judge(name: str) -> CaseResult:
-            return _judge(case, lambda: track_views(p, drive, name), known, name == algorithm)
+        def evaluate(name: str) -> CaseResult:
+            return _evaluate(case, lambda: track_views(p, drive, name), known, name == algorithm)
 
-        return case_result(p.drive.algorithms, judge, known)
+        return case_result(p.drive.algorithms, evaluate, known)
 
 
-def _judge(
+def _evaluate(
     p: RoverScenarioParameters,
     track: Callable[[], Run],
     known: Mapping[str, Scalar],
-    judged: bool,
+    tested: bool,
     started: float | None = None,
 ) -> CaseResult:
-    """Score a run; `judged` is the run of the algorithm under test, whose conditions and products are stored.
+    """Score a run; `tested` is the run of the algorithm under test, whose conditions and products are stored.
 
     `started` is the processor time at the start of a run that takes its own pictures.
     """
@@ -319,12 +319,12 @@ def _judge(
     run, row = attempt.answer
     if started is not None:
         row["run_time_s"] = time.process_time() - started
-        row |= score.visibility_columns(p, run) if judged else {}
-    if judged:
+        row |= score.visibility_columns(p, run) if tested else {}
+    if tested:
         digest = hashlib.sha256(b"".join(stop.pictures.digest for stop in run.stops)).hexdigest()
         row |= {**score.stored_updates(run, p.score.stored_updates), **score.run_conditions(p, run)}
         row |= picture_columns(p.backend, digest)
     row |= compute_scores(p.scores, score.scored_run(run), {*row, *known})
     return CaseResult(
-        run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, score.products(p, run) if judged else {}
+        run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, score.products(p, run) if tested else {}
     )

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("sim", "algorithms", "scenarios", "campaigns", "reports", "marsyard", "benchmarks")
+PACKAGES = ("sim", "algorithms", "scenarios", "campaigns", "reports", "marsyard", "benchmarks", "tests")
 #: Words of a name, split at underscores and capitals, that have a standard term.
 NAME_WORDS = {
     "most": "max",

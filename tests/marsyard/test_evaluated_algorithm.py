@@ -72,10 +72,10 @@ def _read_record(folder: Path) -> Mapping[str, Any]:
 
 
 def test_record_describes_the_algorithms(folder: Path) -> None:
-    judged, compared = _read_record(folder)["algorithms"]
-    assert (judged["spec"], judged["role"], judged["path"]) == ("mine:Mine", "judged", "mine:Mine")
-    assert (judged["version"], judged["options"]) == ("3.1", {"gain": 0.5})
-    assert re.fullmatch("[0-9a-f]{16}", judged["source_hash"])
+    tested, compared = _read_record(folder)["algorithms"]
+    assert (tested["spec"], tested["role"], tested["path"]) == ("mine:Mine", "tested", "mine:Mine")
+    assert (tested["version"], tested["options"]) == ("3.1", {"gain": 0.5})
+    assert re.fullmatch("[0-9a-f]{16}", tested["source_hash"])
     assert (compared["spec"], compared["role"]) == ("homography", "compared")
     assert compared["path"] == "marsyard.algorithms.baselines.homography:HomographyEstimator"
     assert compared["version"]
@@ -99,7 +99,7 @@ def test_reports_name_the_evaluated_algorithm(folder: Path) -> None:
     properties = {entry.get("name"): entry.get("value") for entry in suite.iter("property")}
     assert (properties["algorithm"], properties["algorithm_source"]) == ("mine:Mine", source)
     twin = json.loads((folder / "run" / "report.json").read_text())
-    assert [entry["name"] for entry in twin["algorithm_details"] if entry["judged"]] == ["mine:Mine"]
+    assert [entry["name"] for entry in twin["algorithm_details"] if entry["tested"]] == ["mine:Mine"]
 
 
 def test_dashboard_names_the_evaluated_algorithm(folder: Path, tmp_path: Path) -> None:

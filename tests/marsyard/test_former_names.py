@@ -20,7 +20,7 @@ from marsyard.scenarios.systems import row_columns, scenario, scenario_names
 from marsyard.sim import parameters
 from marsyard.sim.parameters import RenamedWarning
 
-TABLE = tomllib.loads(Path(parameters.__file__).with_suffix(".toml").read_text())
+TABLE = tomllib.loads(Path(parameters.__file__).with_name("renamed.toml").read_text())
 CAMPAIGN = """
 name = "former"
 scenario = "descent"

@@ -14,7 +14,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.cli.app import app
 from marsyard.cli.outcome import evidence_limits
 from marsyard.reports.sampling_design import read_sampling_design
-from marsyard.reports.verdicts import Status, judge_campaign
+from marsyard.reports.verdicts import Status, evaluate_requirements
 
 #: Fields of EuRoC's sensor.yaml for the first camera.
 EUROC = """resolution: [752, 480]
@@ -71,7 +71,9 @@ def test_new_campaign_without_failures_passes(working_folder: Path) -> None:
     terrains = [campaign.draws(case)["location.terrain"] for case in range(230)]
     frame = pd.DataFrame({"case": range(230), "terrain": terrains, "answered": True, "velocity_error_m_s": 1.0})
     settings = campaign.configuration.model_dump(mode="json")
-    (verdict,) = judge_campaign(frame.assign(outcome="VALID"), settings["requirements"], read_sampling_design(settings))
+    (verdict,) = evaluate_requirements(
+        frame.assign(outcome="VALID"), settings["requirements"], read_sampling_design(settings)
+    )
     assert (verdict.status, verdict.n, verdict.terrains) == (Status.PASS, 230, 230)
 
 

@@ -27,7 +27,7 @@ from marsyard.reports.evaluation import next_look
 from marsyard.reports.presentation import notable_cases
 from marsyard.reports.sampling_design import SamplingDesign
 from marsyard.reports.stored import read_run
-from marsyard.reports.verdicts import judge_campaign
+from marsyard.reports.verdicts import evaluate_requirements
 from tests.campaigns.fake_campaign import REQUIREMENT, RecordingWatch, write_campaign
 
 pytestmark = [
@@ -154,7 +154,7 @@ def _find_next_look(n: int, failures: int, max_cases: int, **changes: Any) -> in
         **changes,
     }
     design = SamplingDesign(max_cases=max_cases)
-    return next_look(judge_campaign(_make_rows(n, failures), [requirement], design), design, n)
+    return next_look(evaluate_requirements(_make_rows(n, failures), [requirement], design), design, n)
 
 
 def test_undecided_campaign_continues() -> None:

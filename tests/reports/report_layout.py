@@ -29,7 +29,7 @@ class TwinClusters(_Part):
 
 
 class TwinVerdict(_Part):
-    """One requirement judged."""
+    """One requirement evaluated."""
 
     requirement_id: str
     statement: str
@@ -118,7 +118,7 @@ class TwinAlgorithm(_Part):
     """An algorithm under test; unknown texts are empty."""
 
     name: str = Field(description="as the campaign names it")
-    judged: bool = Field(description="false where it is only compared")
+    tested: bool = Field(description="false where it is only compared")
     path: str = Field(description="class as module:name, or file")
     version: str
     options: dict[str, Any]
@@ -128,7 +128,7 @@ class TwinAlgorithm(_Part):
 class Twin(_Part):
     """A campaign's report in numbers."""
 
-    report_schema: Literal[4] = Field(alias="schema")
+    report_schema: Literal[5] = Field(alias="schema")
     campaign: str
     state: Any = Field(description="as the campaign's record has it, as are seed, git_commit and the times")
     seed: Any
@@ -140,7 +140,7 @@ class Twin(_Part):
     sites: list[str] = Field(description="as the rows name them, at most 24, as are the algorithms")
     algorithms: list[str]
     algorithm_details: list[TwinAlgorithm] = Field(
-        default=[], description="as the campaign's record names them, the judged one first"
+        default=[], description="as the campaign's record names them, the algorithm under test first"
     )
     sampling: TwinSampling
     verdict: Word | Literal["NO REQUIREMENT"]

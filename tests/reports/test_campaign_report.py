@@ -121,7 +121,7 @@ RUNS: dict[str, Callable[[Rows], pd.DataFrame]] = {
 def test_report_is_valid_for_any_run(make_rows: Rows, make_run: MakeRun, kind: str) -> None:
     text, page, twin = _write_and_read(make_run(RUNS[kind](make_rows)))
     _check_page(text, page)
-    assert twin["schema"] == 4
+    assert twin["schema"] == 5
     assert twin["verdict"] in text
     assert len(text) < 1_000_000
 

@@ -18,7 +18,7 @@ from marsyard.reports.campaign import write_report
 from marsyard.reports.evaluation import exit_code, overall
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design
 from marsyard.reports.tables import verdict_table
-from marsyard.reports.verdicts import Status, judge_campaign
+from marsyard.reports.verdicts import Status, evaluate_requirements
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
@@ -46,7 +46,7 @@ def test_designs_report_rates_without_confidence(
     frame, design = make_rows(2000), read_sampling_design(configuration)
     requirements = [{**velocity, "probability": probability} for probability in (0.5, velocity["probability"])]
     for verdict, reference in zip(
-        judge_campaign(frame, requirements, design), judge_campaign(frame, requirements), strict=True
+        evaluate_requirements(frame, requirements, design), evaluate_requirements(frame, requirements), strict=True
     ):
         assert verdict.status is Status.INSUFFICIENT
         assert (verdict.n, verdict.failures, verdict.estimate) == (reference.n, reference.failures, reference.estimate)
@@ -54,7 +54,7 @@ def test_designs_report_rates_without_confidence(
         assert math.isnan(verdict.upper)
         assert verdict.further_cases is None
         assert message in verdict.note
-    verdicts = judge_campaign(frame, requirements, design)
+    verdicts = evaluate_requirements(frame, requirements, design)
     summary = overall(verdicts, frame, design)
     assert (summary.word, message in summary.sentence) == ("INSUFFICIENT", True)
     assert exit_code(verdicts, crashed=False) == 3
@@ -73,7 +73,7 @@ def test_rate_of_a_design_decides_by_estimate(
     frame, design = make_rows(1000), read_sampling_design(configuration)
     frame["answered"], frame["velocity_error_m_s"] = True, np.where(np.arange(1000) % 50, 0.1, 99.0)
     requirements = [{**velocity, "probability": min_rate, "decide_by": "estimate"} for min_rate in (0.98, 0.99)]
-    met, missed = judge_campaign(frame, requirements, design)
+    met, missed = evaluate_requirements(frame, requirements, design)
     assert (met.status, missed.status) == (Status.MET_BY_RATE, Status.FAIL)
     assert (met.n, met.failures, met.estimate) == (1000, 20, 0.98)
     assert math.isnan(met.lower)
@@ -84,7 +84,7 @@ def test_rate_of_a_design_decides_by_estimate(
     summary = overall([met, missed], frame, design)
     assert summary.word == "FAIL"
     assert summary.sentence.startswith("1 of 2 requirements met by the rate of these cases. No probability statement: ")
-    empty = judge_campaign(frame.assign(answered=False), [{**requirements[0], "population": "valid"}], design)
+    empty = evaluate_requirements(frame.assign(answered=False), [{**requirements[0], "population": "valid"}], design)
     assert empty[0].status is Status.INSUFFICIENT
     assert not overall(empty, frame, design).sentence.startswith("0 of")
 
@@ -101,9 +101,9 @@ def test_nominal_case_is_excluded_from_verdicts(make_rows: Rows, velocity: dict[
     frame["answered"] = True
     frame["terrain"] = range(231)
     frame.loc[0, "velocity_error_m_s"] = 9.0
-    (without_nominal,) = judge_campaign(frame, [velocity], SamplingDesign(nominal=True))
+    (without_nominal,) = evaluate_requirements(frame, [velocity], SamplingDesign(nominal=True))
     assert (without_nominal.status, without_nominal.n, without_nominal.failures) == (Status.PASS, 230, 0)
-    (with_nominal,) = judge_campaign(frame, [velocity])
+    (with_nominal,) = evaluate_requirements(frame, [velocity])
     assert (with_nominal.n, with_nominal.failures) == (231, 1)
 
 

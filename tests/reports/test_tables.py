@@ -15,7 +15,7 @@ from rich.table import Table
 
 from marsyard.reports.rates import fraction_of
 from marsyard.reports.tables import outcome_counts, statistics_grid, verdict_table
-from marsyard.reports.verdicts import judge_campaign
+from marsyard.reports.verdicts import evaluate_requirements
 from marsyard.reports.wording import (
     axis_columns,
     category_column,
@@ -41,7 +41,7 @@ def _print_table(table: Table, width: int) -> str:
 
 @pytest.mark.parametrize("width", [80, 140])
 def test_verdict_table_is_complete_at_any_width(make_rows: Rows, velocity: dict[str, Any], width: int) -> None:
-    verdicts = judge_campaign(make_rows(24), [velocity, {**velocity, "id": "DIMES-AVAIL", "population": "all"}])
+    verdicts = evaluate_requirements(make_rows(24), [velocity, {**velocity, "id": "DIMES-AVAIL", "population": "all"}])
     text = _print_table(verdict_table(verdicts), width)
     assert max(len(line) for line in text.splitlines()) <= width
     for message in ("DIMES-VEL", "DIMES-AVAIL", "INSUFFICIENT", "4 terrains", "Clopper-Pearson"):
@@ -55,7 +55,7 @@ def test_verdict_table_without_requirements_is_marked() -> None:
 
 
 def test_texts_are_not_interpreted_as_markup(make_rows: Rows, velocity: dict[str, Any]) -> None:
-    verdicts = judge_campaign(make_rows(5), [{**velocity, "id": "[red]R[/red]", "metric": "[/]"}])
+    verdicts = evaluate_requirements(make_rows(5), [{**velocity, "id": "[red]R[/red]", "metric": "[/]"}])
     text = _print_table(verdict_table(verdicts), 140)
     assert "[red]R[/red]" in text
 

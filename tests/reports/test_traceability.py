@@ -14,7 +14,7 @@ import pandas as pd
 from marsyard.reports.campaign import write_report
 from marsyard.reports.evaluation import overall
 from marsyard.reports.traceability import COLUMNS, junit_xml, requirement_evidence, verification_csv
-from marsyard.reports.verdicts import judge_campaign
+from marsyard.reports.verdicts import evaluate_requirements
 
 Rows = Callable[..., pd.DataFrame]
 HOSTILE = '=HYPERLINK("x")\x00<&>'
@@ -27,7 +27,7 @@ def _make_undecided(velocity: dict[str, Any]) -> dict[str, Any]:
 def test_matrix_has_one_row_per_requirement(make_rows: Rows, velocity: dict[str, Any]) -> None:
     frame = make_rows(40)
     requirement = {**velocity, "source": "the paper", "kind": "requirement"}
-    verdicts = judge_campaign(
+    verdicts = evaluate_requirements(
         frame, [requirement, {**velocity, "id": HOSTILE, "statement": HOSTILE, "metric": "nonesuch"}]
     )
     first, second = csv.DictReader(io.StringIO(verification_csv(requirement_evidence("dimes", verdicts))))
@@ -57,7 +57,7 @@ def test_junit_lists_failures_and_undecided_requirements(make_rows: Rows, veloci
         {**velocity, "probability": 0.5},
         by_rate,
     ]
-    verdicts = judge_campaign(frame, requirements)
+    verdicts = evaluate_requirements(frame, requirements)
     suite = Xml.fromstring(junit_xml(HOSTILE, verdicts, overall(verdicts, frame)))  # noqa: S314
     assert (suite.get("tests"), suite.get("failures"), suite.get("skipped")) == ("5", "2", "2")
     fails, undecided, passes, met, completed = suite

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from marsyard.reports.evaluation import exit_code, overall
 from marsyard.reports.sampling_design import SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
-from marsyard.reports.verdicts import Status, Verdict, judge_campaign
+from marsyard.reports.verdicts import Status, Verdict, evaluate_requirements
 
 Rows = Callable[..., pd.DataFrame]
 
@@ -34,22 +34,22 @@ def _make_rows(n: int, failures: int, *, error: float = 6.0) -> pd.DataFrame:
     )
 
 
-def _judge(frame: pd.DataFrame, requirement: dict[str, Any], **changes: Any) -> Verdict:
-    (verdict,) = judge_campaign(frame, [{**requirement, **changes}])
+def _evaluate(frame: pd.DataFrame, requirement: dict[str, Any], **changes: Any) -> Verdict:
+    (verdict,) = evaluate_requirements(frame, [{**requirement, **changes}])
     return verdict
 
 
 def test_minimum_number_of_cases_passes(velocity: dict[str, Any]) -> None:
     # 99 % at 90 % confidence needs 230 cases without failure, 388 with one (docs/design.md)
-    assert _judge(_make_rows(230, 0), velocity).status is Status.PASS
-    assert _judge(_make_rows(388, 1), velocity).status is Status.PASS
-    short = _judge(_make_rows(229, 0), velocity)
+    assert _evaluate(_make_rows(230, 0), velocity).status is Status.PASS
+    assert _evaluate(_make_rows(388, 1), velocity).status is Status.PASS
+    short = _evaluate(_make_rows(229, 0), velocity)
     # appended cases are a second look, so more than one additional case is needed
     assert (short.status, short.further_cases) == (Status.INSUFFICIENT, 297 - 229)
 
 
 def test_24_cases_without_failure_are_insufficient(velocity: dict[str, Any]) -> None:
-    verdict = _judge(_make_rows(24, 0), velocity)
+    verdict = _evaluate(_make_rows(24, 0), velocity)
     assert (verdict.status, verdict.n, verdict.failures) == (Status.INSUFFICIENT, 24, 0)
     assert verdict.further_cases == 297 - 24
     # Clopper-Pearson bound without failure in 24 cases at 90 % confidence
@@ -58,7 +58,7 @@ def test_24_cases_without_failure_are_insufficient(velocity: dict[str, Any]) -> 
 
 
 def test_failure_of_all_cases_fails(velocity: dict[str, Any]) -> None:
-    verdict = _judge(_make_rows(24, 24), velocity)
+    verdict = _evaluate(_make_rows(24, 24), velocity)
     assert (verdict.status, verdict.estimate, verdict.lower) == (Status.FAIL, 0.0, 0.0)
     assert verdict.further_cases is None
 
@@ -72,7 +72,7 @@ def test_status_follows_from_the_bounds(counts: tuple[int, int], probability: fl
     n, failures = counts
     requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "population": "all"}
     requirement |= {"probability": probability, "confidence": confidence}
-    verdict = _judge(_make_rows(n, failures), requirement)
+    verdict = _evaluate(_make_rows(n, failures), requirement)
     lower, upper = proportion_lower(n - failures, n, confidence), proportion_upper(n - failures, n, confidence)
     assert (verdict.lower, verdict.upper) == (lower, upper)
     assert (verdict.status is Status.PASS) == (lower >= probability)
@@ -81,30 +81,30 @@ def test_status_follows_from_the_bounds(counts: tuple[int, int], probability: fl
         assert verdict.further_cases
         more = pd.concat([_make_rows(n, failures), _make_rows(verdict.further_cases, 0)], ignore_index=True)
         more = more.drop(columns="terrain").assign(case=np.arange(len(more)))
-        (later,) = judge_campaign(more, [requirement], SamplingDesign(first_look=n))
+        (later,) = evaluate_requirements(more, [requirement], SamplingDesign(first_look=n))
         assert later.status is Status.PASS
-        (too_few,) = judge_campaign(more[:-1], [requirement], SamplingDesign(first_look=n))
+        (too_few,) = evaluate_requirements(more[:-1], [requirement], SamplingDesign(first_look=n))
         assert too_few.status is Status.INSUFFICIENT
 
 
 def test_metric_equal_to_the_bound_succeeds(velocity: dict[str, Any]) -> None:
-    assert _judge(_make_rows(5, 5, error=5.0), velocity).failures == 0
-    assert _judge(_make_rows(5, 5, error=math.nextafter(5.0, 6.0)), velocity).failures == 5
+    assert _evaluate(_make_rows(5, 5, error=5.0), velocity).failures == 0
+    assert _evaluate(_make_rows(5, 5, error=math.nextafter(5.0, 6.0)), velocity).failures == 5
 
 
 def test_signed_metrics_count_by_magnitude(velocity: dict[str, Any]) -> None:
-    assert _judge(_make_rows(5, 2, error=-6.0), velocity).failures == 2
+    assert _evaluate(_make_rows(5, 2, error=-6.0), velocity).failures == 2
 
 
 @pytest.mark.parametrize("error", [math.nan, math.inf, -math.inf])
 def test_non_finite_metric_fails(velocity: dict[str, Any], error: float) -> None:
-    assert _judge(_make_rows(5, 2, error=error), velocity).failures == 2
+    assert _evaluate(_make_rows(5, 2, error=error), velocity).failures == 2
 
 
 def test_populations_select_cases(make_rows: Rows, velocity: dict[str, Any]) -> None:
     frame = make_rows(100, answered=0.8, crashed=3)
     answered, crashed = int(frame["answered"].sum()), 3
-    verdicts = {name: _judge(frame, velocity, population=name) for name in ("all", "completed", "valid")}
+    verdicts = {name: _evaluate(frame, velocity, population=name) for name in ("all", "completed", "valid")}
     assert [verdict.n for verdict in verdicts.values()] == [100, 100 - crashed, answered]
     n_beyond = int((frame["velocity_error_m_s"] > 5.0).sum())
     # a case without an answer fails if it belongs to the population
@@ -113,15 +113,15 @@ def test_populations_select_cases(make_rows: Rows, velocity: dict[str, Any]) -> 
 
 
 def test_empty_population_is_insufficient(make_rows: Rows, velocity: dict[str, Any]) -> None:
-    verdict = _judge(make_rows(24, answered=0.0), velocity)
+    verdict = _evaluate(make_rows(24, answered=0.0), velocity)
     assert (verdict.status, verdict.n, verdict.further_cases) == (Status.INSUFFICIENT, 0, 297)
     assert math.isnan(verdict.estimate)
     assert "No case" in verdict.note
 
 
 def test_empty_table_is_insufficient(velocity: dict[str, Any]) -> None:
-    assert _judge(pd.DataFrame(), velocity, population="all").status is Status.INSUFFICIENT
-    assert _judge(_make_rows(0, 0), velocity).n == 0
+    assert _evaluate(pd.DataFrame(), velocity, population="all").status is Status.INSUFFICIENT
+    assert _evaluate(_make_rows(0, 0), velocity).n == 0
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_empty_table_is_insufficient(velocity: dict[str, Any]) -> None:
 def test_invalid_requirements_are_insufficient_with_a_note(
     velocity: dict[str, Any], changes: dict[str, Any], message: str
 ) -> None:
-    verdict = _judge(_make_rows(500, 0), velocity, **changes)
+    verdict = _evaluate(_make_rows(500, 0), velocity, **changes)
     assert verdict.status is Status.INSUFFICIENT
     assert message in verdict.note
 
@@ -146,23 +146,25 @@ def test_invalid_requirements_are_insufficient_with_a_note(
 def test_boolean_metric_counts_true_as_success() -> None:
     frame = _make_rows(100, 0).assign(answered=np.arange(100) >= 10, feasible_overlap=np.arange(100) >= 5)
     availability = {"id": "AVAIL", "metric": "answered", "probability": 0.9, "confidence": 0.9}
-    all_cases, feasible_cases = (_judge(frame, availability, population=name) for name in ("all", "feasible_overlap"))
+    all_cases, feasible_cases = (
+        _evaluate(frame, availability, population=name) for name in ("all", "feasible_overlap")
+    )
     assert (all_cases.n, all_cases.failures, feasible_cases.n, feasible_cases.failures) == (100, 10, 95, 5)
     assert (all_cases.status, feasible_cases.status) == (Status.INSUFFICIENT, Status.PASS)
     # decided by the estimate: 90 of 100 is 90 %; the bounds do not change
-    by_estimate = _judge(frame, availability, decide_by="estimate")
+    by_estimate = _evaluate(frame, availability, decide_by="estimate")
     assert (by_estimate.status, by_estimate.lower) == (Status.MET_BY_RATE, all_cases.lower)
-    assert _judge(frame, availability, decide_by="estimate", probability=0.91).status is Status.FAIL
+    assert _evaluate(frame, availability, decide_by="estimate", probability=0.91).status is Status.FAIL
 
 
 def test_populations_combine_columns() -> None:
     frame = _make_rows(100, 20).assign(answered=np.arange(100) >= 10, feasible_overlap=np.arange(100) < 50)
     criterion = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
-    both = _judge(frame, criterion, population="valid and feasible_overlap")
+    both = _evaluate(frame, criterion, population="valid and feasible_overlap")
     assert (both.n, both.failures) == (40, 10)
     assert (
         "feasible_overlap"
-        in _judge(frame.assign(feasible_overlap=np.arange(100.0)), criterion, population="feasible_overlap").note
+        in _evaluate(frame.assign(feasible_overlap=np.arange(100.0)), criterion, population="feasible_overlap").note
     )
 
 
@@ -172,11 +174,11 @@ def test_unknown_membership_counts_as_failure(outcome: str) -> None:
     frame.loc[90:93, "outcome"] = outcome
     frame.loc[90:93, "feasible_overlap"] = None
     criterion = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
-    verdict = _judge(frame, criterion, population="feasible_overlap")
+    verdict = _evaluate(frame, criterion, population="feasible_overlap")
     assert (verdict.n, verdict.failures) == (54, 4)
     # cases 92 and 93 are excluded by the second condition
     frame["near"] = np.arange(100) < 92
-    verdict = _judge(frame, criterion, population="feasible_overlap and near")
+    verdict = _evaluate(frame, criterion, population="feasible_overlap and near")
     assert (verdict.n, verdict.failures) == (52, 2)
 
 
@@ -191,14 +193,14 @@ def test_crashed_cases_fail_an_availability() -> None:
         "confidence": 0.9,
         "population": "feasible_overlap",
     }
-    verdict = _judge(frame, criterion, decide_by="estimate")
+    verdict = _evaluate(frame, criterion, decide_by="estimate")
     assert (verdict.status, verdict.n, verdict.failures) == (Status.FAIL, 20, 4)
 
 
 def test_crashed_case_with_a_small_error_fails() -> None:
     frame = _make_rows(20, 0).assign(outcome=["CRASHED"] * 2 + ["VALID"] * 18)
     criterion = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.95, "confidence": 0.9}
-    assert _judge(frame, criterion, population="all", decide_by="estimate").failures == 2
+    assert _evaluate(frame, criterion, population="all", decide_by="estimate").failures == 2
 
 
 @pytest.mark.parametrize("population", ["valid", "completed", "valid and near"])
@@ -209,26 +211,26 @@ def test_crashed_cases_outside_the_population_prevent_a_pass(population: str) ->
     frame.loc[:9, "outcome"] = "CRASHED"
     frame.loc[:9, "answered"] = False
     for rule in ("confidence", "estimate"):
-        verdict = _judge(frame, criterion, population=population, decide_by=rule)
+        verdict = _evaluate(frame, criterion, population=population, decide_by=rule)
         assert (verdict.status, verdict.n, verdict.failures) == (Status.INSUFFICIENT, 40, 0)
         assert "10 cases did not come to an end" in verdict.note
     # too few crashes, or crashes outside the population, do not change the verdict
     few_crashes = _make_rows(200, 0).assign(near=True)
     few_crashes.loc[:1, "outcome"] = "CRASHED"
     few_crashes.loc[:1, "answered"] = False
-    assert _judge(few_crashes, criterion, population=population).status is Status.PASS
+    assert _evaluate(few_crashes, criterion, population=population).status is Status.PASS
     outside = frame.assign(near=frame["answered"])
-    assert _judge(outside, criterion, population="valid and near").status is Status.PASS
+    assert _evaluate(outside, criterion, population="valid and near").status is Status.PASS
 
 
 def test_estimate_decides_with_shared_terrains(velocity: dict[str, Any]) -> None:
-    verdict = _judge(_make_rows(400, 0).assign(terrain=np.arange(400) % 8), velocity, decide_by="estimate")
+    verdict = _evaluate(_make_rows(400, 0).assign(terrain=np.arange(400) % 8), velocity, decide_by="estimate")
     assert (verdict.status, verdict.plain_status) == (Status.MET_BY_RATE, None)
     assert "8 terrains" in verdict.note
 
 
 def test_estimate_verdict_reports_the_confidence_verdict(velocity: dict[str, Any]) -> None:
-    verdict = _judge(_make_rows(120, 1), velocity, decide_by="estimate")
+    verdict = _evaluate(_make_rows(120, 1), velocity, decide_by="estimate")
     assert (verdict.status, verdict.confident_status) == (Status.MET_BY_RATE, Status.INSUFFICIENT)
     assert "at 90 % confidence it would be INSUFFICIENT" in verdict.note
     summary = overall([verdict], _make_rows(120, 1))
@@ -240,19 +242,19 @@ def test_estimate_verdict_reports_the_confidence_verdict(velocity: dict[str, Any
 def test_rate_without_confidence_never_passes(velocity: dict[str, Any]) -> None:
     """8 cases without failure have a rate of 100 %, but a consumer's risk of 97.6 % for 99.7 %."""
     harm = {**velocity, "probability": 0.997, "decide_by": "estimate"}
-    few = _judge(_make_rows(8, 0), harm)
+    few = _evaluate(_make_rows(8, 0), harm)
     # 334 = 1 / 0.003 cases, of which one may fail
     assert (few.status, few.further_cases) == (Status.INSUFFICIENT, 334 - 8)
     assert "takes 334 cases or more" in few.note
-    assert _judge(_make_rows(333, 0), harm).status is Status.INSUFFICIENT
-    assert _judge(_make_rows(334, 1), harm).status is Status.MET_BY_RATE
-    assert _judge(_make_rows(334, 2), harm).status is Status.FAIL
+    assert _evaluate(_make_rows(333, 0), harm).status is Status.INSUFFICIENT
+    assert _evaluate(_make_rows(334, 1), harm).status is Status.MET_BY_RATE
+    assert _evaluate(_make_rows(334, 2), harm).status is Status.FAIL
     # 99.7 % at 90 % confidence needs 767 cases without failure
-    assert _judge(_make_rows(767, 0), harm).status is Status.PASS
-    by_rate = _judge(_make_rows(334, 1), harm)
+    assert _evaluate(_make_rows(767, 0), harm).status is Status.PASS
+    by_rate = _evaluate(_make_rows(334, 1), harm)
     assert exit_code([by_rate], crashed=False) == 3
-    assert exit_code([_judge(_make_rows(334, 1), harm, accept_rate=True)], crashed=False) == 0
-    passing = _judge(_make_rows(230, 0), velocity)
+    assert exit_code([_evaluate(_make_rows(334, 1), harm, accept_rate=True)], crashed=False) == 0
+    passing = _evaluate(_make_rows(230, 0), velocity)
     assert overall([passing, by_rate], _make_rows(334, 1)).word == "MET BY RATE"
     assert overall([passing, by_rate, few], _make_rows(334, 1)).word == "INSUFFICIENT"
 
@@ -262,58 +264,58 @@ def test_minimum_cases_of_a_rate_allow_one_failure(
     velocity: dict[str, Any], probability: float, min_cases: int
 ) -> None:
     criterion = {**velocity, "probability": probability, "decide_by": "estimate"}
-    assert _judge(_make_rows(min_cases, 1), criterion).status is Status.MET_BY_RATE
-    assert _judge(_make_rows(min_cases - 1, 1), criterion).status is Status.FAIL
-    assert _judge(_make_rows(min_cases - 1, 0), criterion).status is Status.INSUFFICIENT
+    assert _evaluate(_make_rows(min_cases, 1), criterion).status is Status.MET_BY_RATE
+    assert _evaluate(_make_rows(min_cases - 1, 1), criterion).status is Status.FAIL
+    assert _evaluate(_make_rows(min_cases - 1, 0), criterion).status is Status.INSUFFICIENT
 
 
 def test_appended_cases_share_the_risk_of_two_looks(velocity: dict[str, Any]) -> None:
     """388 cases with one failure pass at one look, but not at a second look after 230 cases."""
     design = read_sampling_design({"cases": 230, "appended": [158]})
     frame = _make_rows(388, 1)
-    (first,) = judge_campaign(frame[:230], [velocity], design)
-    (later,) = judge_campaign(frame, [velocity], design)
-    assert _judge(frame, velocity).status is Status.PASS
+    (first,) = evaluate_requirements(frame[:230], [velocity], design)
+    (later,) = evaluate_requirements(frame, [velocity], design)
+    assert _evaluate(frame, velocity).status is Status.PASS
     assert (first.status, first.bounds_confidence) == (Status.INSUFFICIENT, 0.9)
     assert (later.status, later.bounds_confidence > 0.99) == (Status.INSUFFICIENT, True)
-    assert "judged more than once" in later.note
+    assert "evaluated more than once" in later.note
     assert first.further_cases == 1049 - 230
-    (enough,) = judge_campaign(_make_rows(1049, 1), [velocity], design)
+    (enough,) = evaluate_requirements(_make_rows(1049, 1), [velocity], design)
     assert (enough.status, enough.n) == (Status.PASS, 1049)
     # 60 failures also fail at the second look
-    assert judge_campaign(_make_rows(388, 60), [velocity], design)[0].status is Status.FAIL
+    assert evaluate_requirements(_make_rows(388, 60), [velocity], design)[0].status is Status.FAIL
 
 
 def test_appended_terrains_share_the_risk_of_two_looks(velocity: dict[str, Any]) -> None:
     design = SamplingDesign(first_look=460)
     frame = _make_rows(776, 0).assign(terrain=np.arange(776) // 2)
     frame.loc[0, "velocity_error_m_s"] = 6.0
-    (first,) = judge_campaign(frame[:460], [velocity], design)
-    (later,) = judge_campaign(frame, [velocity], design)
+    (first,) = evaluate_requirements(frame[:460], [velocity], design)
+    (later,) = evaluate_requirements(frame, [velocity], design)
     assert (first.status, first.further_cases) == (Status.INSUFFICIENT, 1049 - 230)
-    assert _judge(frame, velocity).status is Status.PASS
+    assert _evaluate(frame, velocity).status is Status.PASS
     assert later.status is Status.INSUFFICIENT
 
 
 def test_consumer_risk_at_the_minimum_number_of_cases(velocity: dict[str, Any]) -> None:
     # 0.99^230 = 0.0991 is below 10 %
-    assert _judge(_make_rows(230, 0), velocity).consumer_risk == pytest.approx(0.99**230)
+    assert _evaluate(_make_rows(230, 0), velocity).consumer_risk == pytest.approx(0.99**230)
     # ten cases on each of 230 terrains count as 230 cases
-    verdict = _judge(_make_rows(2300, 0).assign(terrain=np.arange(2300) // 10), velocity)
+    verdict = _evaluate(_make_rows(2300, 0).assign(terrain=np.arange(2300) // 10), velocity)
     assert verdict.consumer_risk == pytest.approx(0.99**230)
     assert "the design effect taken for 10" in verdict.note
 
 
 def test_missing_answered_column_is_noted(velocity: dict[str, Any]) -> None:
-    assert "answered" in _judge(_make_rows(5, 0).drop(columns="answered"), velocity).note
+    assert "answered" in _evaluate(_make_rows(5, 0).drop(columns="answered"), velocity).note
 
 
 def test_text_metric_fails_all_cases(velocity: dict[str, Any]) -> None:
-    assert _judge(_make_rows(5, 0).assign(velocity_error_m_s="good"), velocity).failures == 5
+    assert _evaluate(_make_rows(5, 0).assign(velocity_error_m_s="good"), velocity).failures == 5
 
 
 def test_shared_terrains_count_as_single_cases(velocity: dict[str, Any]) -> None:
-    verdict = _judge(_make_rows(400, 0).assign(terrain=np.arange(400) % 8), velocity)
+    verdict = _evaluate(_make_rows(400, 0).assign(terrain=np.arange(400) % 8), velocity)
     # too few failures to estimate the correlation: terrains are counted; 99 % at 90 % needs 230 terrains
     assert (verdict.status, verdict.terrains, verdict.plain_status) == (Status.INSUFFICIENT, 8, Status.PASS)
     assert verdict.lower == proportion_lower(8, 8, 0.9)
@@ -321,7 +323,7 @@ def test_shared_terrains_count_as_single_cases(velocity: dict[str, Any]) -> None
     assert verdict.further_cases == 297 - 8
     for message in ("8 terrains", "not independent", "289 additional terrains", "PASS"):
         assert message in verdict.note
-    enough = _judge(_make_rows(460, 0).assign(terrain=np.arange(460) % 230), velocity)
+    enough = _evaluate(_make_rows(460, 0).assign(terrain=np.arange(460) % 230), velocity)
     assert enough.status is Status.PASS
 
 
@@ -329,7 +331,7 @@ def test_additional_cases_account_for_the_design_effect(velocity: dict[str, Any]
     # 40 of 200 terrains fail with all their 5 cases: the design effect is 5
     frame = _make_rows(1000, 0).assign(terrain=np.arange(1000) // 5)
     frame.loc[frame["terrain"] < 40, "velocity_error_m_s"] = 6.0
-    verdict = _judge(frame, velocity, probability=0.82)
+    verdict = _evaluate(frame, velocity, probability=0.82)
     assert verdict.status is Status.INSUFFICIENT
     assert verdict.clustered is not None
     assert verdict.clustered.design_effect == pytest.approx(5.0, rel=0.02)
@@ -338,7 +340,7 @@ def test_additional_cases_account_for_the_design_effect(velocity: dict[str, Any]
         [frame, _make_rows(verdict.further_cases, 0).assign(terrain=1000 + np.arange(verdict.further_cases) // 5)]
     )
     more["case"] = np.arange(len(more))
-    (later,) = judge_campaign(more, [{**velocity, "probability": 0.82}], SamplingDesign(first_look=1000))
+    (later,) = evaluate_requirements(more, [{**velocity, "probability": 0.82}], SamplingDesign(first_look=1000))
     assert later.status is Status.PASS
 
 
@@ -355,7 +357,7 @@ def test_advice_names_the_limiting_number_of_terrains(velocity: dict[str, Any]) 
     """8 terrains cannot show 99 % at 90 % confidence, so no number of additional cases is given."""
     frame = _make_rows(400, 0).assign(terrain=np.arange(400) % 8)
     design = _make_terrain_design(8, distribution="integer", low=0, high="location.bank - 1")
-    (verdict,) = judge_campaign(frame, [velocity], design)
+    (verdict,) = evaluate_requirements(frame, [velocity], design)
     assert (verdict.status, verdict.further_cases) == (Status.INSUFFICIENT, None)
     message = (
         "The campaign draws from 8 terrains (location.bank = 8); 99 % at 90 % confidence takes at least 230 terrains: "
@@ -368,50 +370,50 @@ def test_advice_names_the_limiting_number_of_terrains(velocity: dict[str, Any]) 
     rng = np.random.default_rng(3)
     assert np.mean([np.unique(rng.integers(0, 2300, 254)).size >= 230 for _ in range(1000)]) > 0.99
     in_turn = _make_terrain_design(8, distribution="in-turn", low=0, high="location.bank - 1")
-    assert "--set location.bank=230 -n 230" in judge_campaign(frame, [velocity], in_turn)[0].note
-    fixed = judge_campaign(frame.assign(terrain=0), [velocity], _make_terrain_design(8))[0]
+    assert "--set location.bank=230 -n 230" in evaluate_requirements(frame, [velocity], in_turn)[0].note
+    fixed = evaluate_requirements(frame.assign(terrain=0), [velocity], _make_terrain_design(8))[0]
     assert "draws from 1 terrain (location.terrain = 1)" in fixed.note
     narrow = _make_terrain_design(100, distribution="integer", low=0, high=7)
-    assert 'dispersions."location.terrain"' in judge_campaign(frame, [velocity], narrow)[0].note
+    assert 'dispersions."location.terrain"' in evaluate_requirements(frame, [velocity], narrow)[0].note
     large = _make_terrain_design(1000, distribution="integer", low=0, high="location.bank - 1")
-    assert judge_campaign(frame, [velocity], large)[0].further_cases == 289
+    assert evaluate_requirements(frame, [velocity], large)[0].further_cases == 289
 
 
 def test_looks_of_an_adaptive_campaign_share_the_risk(velocity: dict[str, Any]) -> None:
     # looks at 20, 40, 80, 160, 320 and 640 cases; the last look adds half of the cases and spends half of the risk
     design = SamplingDesign(max_cases=640)
-    (early,) = judge_campaign(_make_rows(320, 0), [velocity], design)
+    (early,) = evaluate_requirements(_make_rows(320, 0), [velocity], design)
     assert early.bounds_confidence == pytest.approx(1.0 - 0.1 * 160 / 640)
     assert early.lower == proportion_lower(320, 320, early.bounds_confidence)
-    (last,) = judge_campaign(_make_rows(640, 0), [velocity], design)
+    (last,) = evaluate_requirements(_make_rows(640, 0), [velocity], design)
     assert last.status is Status.PASS
     assert last.bounds_confidence == pytest.approx(0.95)
-    assert "judged more than once" in last.note
+    assert "evaluated more than once" in last.note
 
 
 def test_one_terrain_per_case_gives_no_note(velocity: dict[str, Any]) -> None:
-    verdict = _judge(_make_rows(20, 0), velocity)
+    verdict = _evaluate(_make_rows(20, 0), velocity)
     assert (verdict.terrains, verdict.clustered, verdict.note) == (20, None, "")
 
 
 def test_cases_of_unknown_terrain_are_independent(velocity: dict[str, Any]) -> None:
     frame = _make_rows(20, 3).assign(terrain=[np.nan, np.nan, *range(18)])
-    assert _judge(frame, velocity).clustered is None
-    assert _judge(frame.assign(terrain=np.nan), velocity).terrains is None
+    assert _evaluate(frame, velocity).clustered is None
+    assert _evaluate(frame.assign(terrain=np.nan), velocity).terrains is None
 
 
 def test_evaluation_does_not_change_its_inputs(make_rows: Rows, velocity: dict[str, Any]) -> None:
     frame, requirement = make_rows(50), dict(velocity)
     before = frame.copy()
-    judge_campaign(frame, [requirement])
+    evaluate_requirements(frame, [requirement])
     pd.testing.assert_frame_equal(frame, before)
     assert requirement == velocity
 
 
 def test_overall_verdict_is_the_worst(velocity: dict[str, Any]) -> None:
     frame = _make_rows(230, 0)
-    passing, failing = _judge(frame, velocity), _judge(frame, velocity, bound=0.5)
-    undecided = _judge(frame, velocity, probability=0.999)
+    passing, failing = _evaluate(frame, velocity), _evaluate(frame, velocity, bound=0.5)
+    undecided = _evaluate(frame, velocity, probability=0.999)
     assert overall([passing], frame).word == "PASS"
     assert overall([passing, undecided], frame).word == "INSUFFICIENT"
     assert overall([passing, undecided, failing], frame).word == "FAIL"
@@ -421,8 +423,8 @@ def test_overall_verdict_is_the_worst(velocity: dict[str, Any]) -> None:
 
 def test_exit_code_follows_the_worst_verdict(velocity: dict[str, Any]) -> None:
     frame = _make_rows(230, 0)
-    passing, failing = _judge(frame, velocity), _judge(frame, velocity, bound=0.5)
-    undecided = _judge(frame, velocity, probability=0.999)
+    passing, failing = _evaluate(frame, velocity), _evaluate(frame, velocity, bound=0.5)
+    undecided = _evaluate(frame, velocity, probability=0.999)
     assert exit_code([], crashed=False) == 0
     assert exit_code([passing], crashed=False) == 0
     assert exit_code([passing, undecided], crashed=False) == 3

@@ -18,7 +18,7 @@ from marsyard.algorithms.interface import (
     VelocityEstimate,
     VelocityOutcome,
 )
-from marsyard.reports.verdicts import Status, judge_campaign
+from marsyard.reports.verdicts import Status, evaluate_requirements
 from marsyard.scenarios.algorithm_run import Handover
 from marsyard.scenarios.conformance.inputs import descent
 from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by
@@ -175,7 +175,7 @@ def test_raising_tracker_fails_runs_with_selectable_targets() -> None:
     crashed.pop("handed_over")
     frame = pd.DataFrame([crashed] * 5 + [good] * 15)
     requested = {"id": "VTT-HANDED", "metric": "handed_over", "probability": 0.9, "confidence": 0.9}
-    (result,) = judge_campaign(frame, [{**requested, "population": "selectable", "decide_by": "estimate"}])
+    (result,) = evaluate_requirements(frame, [{**requested, "population": "selectable", "decide_by": "estimate"}])
     assert (result.status, result.n, result.failures) == (Status.FAIL, 20, 5)
 
 

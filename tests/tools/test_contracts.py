@@ -1,4 +1,4 @@
-"""The contracts of imports say what they mean to, whatever modules are added."""
+"""Import contracts: they cover every module of the simulation, including new ones."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parents[2]
 #: All that an algorithm may know of the simulated world (docs/architecture.md).
 OPEN_TO_ALGORITHMS = {"marsyard.sim.frames", "marsyard.sim.camera", "marsyard.sim.measurements"}
 #: What `marsyard.sim.camera` reads files with: checks of files, which hold no truth.
-BELOW_THE_CAMERAS = {"marsyard.sim.cache"}
+BELOW_THE_CAMERAS = {"marsyard.sim.files"}
 #: The base class of parameters and its types of fields: no world, and no truth.
 BASE_OF_PARAMETERS = {"marsyard.sim.parameters"}
 

@@ -9,7 +9,7 @@ import pytest
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.stored import read_run
-from marsyard.reports.verdicts import Status, judge_campaign
+from marsyard.reports.verdicts import Status, evaluate_requirements
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run, write_campaign
 from tests.campaigns.hostile_scenario import FAULTS
 
@@ -72,7 +72,7 @@ def test_conditions_of_crashed_cases_are_kept(rows: list[Any]) -> None:
 
 def test_crashed_cases_stay_in_their_populations(hostile: Path) -> None:
     stored = read_run(hostile)
-    (verdict,) = judge_campaign(stored.frame, stored.requirements)
+    (verdict,) = evaluate_requirements(stored.frame, stored.requirements)
     assert (verdict.status, verdict.n, verdict.failures) == (Status.FAIL, 24, 2 * len(REASONS))
 
 
