@@ -165,8 +165,8 @@ def descent_view(name: str, height_m: float, size: tuple[int, int]) -> View:
             height_m,
             where.photometry.rock_albedo,
         ),
-        texture_of(where.ground_texture),
-        texture_of(where.rock_texture),
+        ground_texture=texture_of(where.ground_texture),
+        object_texture=texture_of(where.rock_texture),
     )
     ground = float(surface.height(*DESCENT_PLACE))
     tilt = Rotation.from_euler("zyx", [20.0, 5.0, -4.0], degrees=True)
@@ -195,8 +195,8 @@ def rock_view(name: str, distance_m: float, size: tuple[int, int] | None = None)
         Sun(direction(np.radians(200.0), np.radians(40.0))),
         law_of(where),
         objects,
-        texture_of(where.ground_texture),
-        texture_of(where.rock_texture),
+        ground_texture=texture_of(where.ground_texture),
+        object_texture=texture_of(where.rock_texture),
         mesh_finest_m=0.04,
         mesh_reach_m=600.0,
         mesh_lines=641,

@@ -23,7 +23,8 @@ from marsyard.sim.terrain import Surface
 #: Rounding of a mean of heights in single precision, metres, at a few km.
 ROUNDING_M = 0.01
 NO_TEXTURE = Texture()
-NO_RELIEF = MicroRelief(1.0, np.empty(0), *np.ones((2, 1, 1), dtype=np.float32), 0.0)
+_NO_COVER = np.ones((1, 1), dtype=np.float32)
+NO_RELIEF = MicroRelief(1.0, np.empty(0), _NO_COVER, _NO_COVER, 0.0)
 NO_CLOUDS = (no_cover(), np.zeros(5))
 #: A cone: apex, unit vector along its axis, and half angle in radians.
 Cone = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]

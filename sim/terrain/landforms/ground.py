@@ -202,11 +202,12 @@ def _column_power(amplitude: Float32[np.ndarray, "samples half"]) -> Float64[np.
     power = np.einsum("ij,ij->j", amplitude, amplitude, dtype=np.float64)
     # a mode of the half spectrum counts for itself and its conjugate, except in the first and the last column
     power[1:-1] *= 2.0
-    return power
+    return np.asarray(power)
 
 
 def _low_pass(samples: int, spacing_m: float, wavelength_m: float) -> Float32[np.ndarray, "samples half"]:
     """Gaussian filter that keeps exp(-1/2) of the amplitude at a wavelength."""
     along_y = scipy.fft.fftfreq(samples, spacing_m).astype(np.float32) * np.float32(wavelength_m)
     along_x = scipy.fft.rfftfreq(samples, spacing_m).astype(np.float32) * np.float32(wavelength_m)
-    return np.exp(np.float32(-0.5) * along_y[:, None] ** 2) * np.exp(np.float32(-0.5) * along_x[None, :] ** 2)
+    exponent = np.float32(-0.5) * (along_y[:, None] ** 2 + along_x[None, :] ** 2)
+    return np.asarray(np.exp(exponent))

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float32, Float64
 from numpy.random import Generator
 from pydantic import Field
 
-from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded
+from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import Grid, Ground, Spectrum
 from marsyard.sim.terrain.landforms.kernels import cut_channels, stamp_cover, stamp_streaks
 from marsyard.sim.terrain.landforms.relief import draw_channels
@@ -32,7 +32,7 @@ class SurfaceUnit(Parameters):
     """One kind of ground. Factors are relative to the terrain's own values; a factor of 1 leaves them unchanged."""
 
     fraction: Annotated[Fraction, Field(description="expected fraction of the terrain's area")]
-    tone: Annotated[float, bounded(-1.0, 1.0, "logarithm of albedo over the terrain's mean")] = 0.0
+    tone: Annotated[float, bounded_field(-1.0, 1.0, "logarithm of albedo over the terrain's mean")] = 0.0
     roughness: Annotated[NonNegative, Field(description="factor of fine relief")] = 1.0
     texture: Annotated[NonNegative, Field(description="factor of fine albedo contrast")] = 1.0
     rocks: Annotated[NonNegative, Field(description="factor of rock density")] = 1.0
@@ -58,7 +58,7 @@ class SurfaceUnits(Parameters):
     concentration: Annotated[Positive, Field(description="of the Dirichlet distribution: larger varies less")] = 8.0
 
     tracks_per_km2: Annotated[NonNegative, Field(description="tracks of dust devils per km2")] = 0.0
-    track_tone: Annotated[float, bounded(-1.0, 0.0, "logarithm of albedo of a track over the ground's")] = -0.12
+    track_tone: Annotated[float, bounded_field(-1.0, 0.0, "logarithm of albedo of a track over the ground's")] = -0.12
     track_width_m: Annotated[Positive, Field(description="median width of a track, m")] = 25.0
     track_length_m: Annotated[Positive, Field(description="mean length of a track, m")] = 900.0
     streak_fraction: Annotated[Fraction, Field(description="fraction of craters with a wind tail")] = 0.0
@@ -94,7 +94,7 @@ class SurfaceUnits(Parameters):
             factors[..., ROUGHNESS] = rough
         # the stated abundance of rocks is that of the whole terrain
         factors[..., ROCKS] /= factors[..., ROCKS].mean(dtype=np.float64)
-        return factors
+        return np.asarray(factors)
 
     def _add_tracks(self, tone: Grid, spacing: float, downwind: float, rng: Generator) -> None:
         period = tone.shape[0] * spacing

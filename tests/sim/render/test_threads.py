@@ -46,7 +46,13 @@ def test_images_do_not_depend_on_threads(
     rocks = Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=0.15)
     light = Sun(direction(2.0, 0.6))
     scene = Scene(
-        rough, (380.0, 200.0), light, Photometry(), rocks, Texture(3.0, (0.03,) * 6), Texture(0.5, (0.05,) * 3)
+        rough,
+        (380.0, 200.0),
+        light,
+        Photometry(),
+        rocks,
+        ground_texture=Texture(3.0, (0.03,) * 6),
+        object_texture=Texture(0.5, (0.05,) * 3),
     )
     rays = PixelRays.of(descent_camera().crop(400, 400, (161, 161)))
     pose = rigid(Rotation.from_euler("x", 4.0, degrees=True), np.array([380.0, 200.0, 400.0]))
