@@ -171,7 +171,7 @@ def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Ob
     reach = min(farthest_m, eye.reach_m)
     smallest_m = float(field.diameter_m.min())
     size_class = np.floor(np.log(field.diameter_m / smallest_m) / np.log(_CLASS_RATIO) + 1e-9).astype(int)
-    arrays = ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up")
+    arrays = ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up", "albedo")
     meshes = []
     for number in np.unique(size_class):
         members, low = np.flatnonzero(size_class == number), smallest_m * _CLASS_RATIO ** int(number)
@@ -195,7 +195,7 @@ def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Ob
         np.concatenate([mesh.vertex_normals for mesh in meshes]),
         np.concatenate([mesh.faces[some] + first for mesh, some, first, _ in kept]),
         np.concatenate([mesh.rock_of_face[some] for mesh, some, _, _ in kept]),
-        ground.site.photometry.rock_albedo,
+        np.minimum(ground.site.photometry.rock_albedo * field.albedo, 1.0),
         np.concatenate([mesh.body_of_face[some] + first for mesh, some, _, first in kept]),
     )
 

@@ -42,22 +42,25 @@ class Objects:
         vertex_normals: Float64[np.ndarray, "vertices 3"],
         faces: Int32[np.ndarray, "triangles 3"],
         name_of_face: Int32[np.ndarray, "triangles"],
-        albedo: float,
+        albedo: float | Float64[np.ndarray, "names"],
         body_of_face: Int32[np.ndarray, "triangles"] | None = None,
     ) -> Objects:
-        """Build bodies of one albedo from a mesh: contiguous faces of one name, or of one `body_of_face`, are one body.
+        """Build bodies from a mesh: contiguous faces of one name, or of one `body_of_face`, are one body.
+
+        The albedo is one for all bodies, or one for each name.
 
         Raises ValueError for more triangles than a picture can number.
         """
         changes = np.flatnonzero(np.diff(name_of_face if body_of_face is None else body_of_face)) + 1
         first = np.concatenate([[0], changes]) if len(faces) else np.empty(0, dtype=np.int64)
+        names = np.asarray(name_of_face, dtype=np.int64)[first]
         # np.take is several times faster than indexing for a scene's million triangles
         return cls._of_bodies(
             np.take(np.asarray(vertices, dtype=np.float64), faces, axis=0),
             np.take(np.asarray(vertex_normals, dtype=np.float64), faces, axis=0),
             np.diff(first, append=len(faces)),
-            np.full(first.size, float(albedo)),
-            np.asarray(name_of_face, dtype=np.int64)[first],
+            np.full(first.size, albedo) if np.ndim(albedo) == 0 else np.asarray(albedo)[names],
+            names,
         )
 
     @classmethod

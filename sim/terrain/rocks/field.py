@@ -14,7 +14,7 @@ from jaxtyping import Float64, Int32, Int64
 from numpy.random import Generator
 from pydantic import Field, model_validator
 
-from marsyard.sim.parameters import Parameters, Positive
+from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.terrain.landforms.ground import substream
 from marsyard.sim.terrain.rocks import shapes
 from marsyard.sim.terrain.rocks.kernels import Placements, assemble, place_discs
@@ -29,6 +29,9 @@ Sizes = Float64[np.ndarray, "rocks"]
 Numbers = Int64[np.ndarray, "found"]
 
 
+Form = Literal["block", "clinker", "vesicular", "slab", "ventifact"]
+
+
 class PlacedRock(Parameters):
     """A rock at a stated position: a rover's target, a landing hazard."""
 
@@ -37,7 +40,7 @@ class PlacedRock(Parameters):
     north_m: Annotated[float, Field(description="y of its centre, m, on the periodic terrain")]
     diameter_m: Annotated[float, Field(gt=0.0, le=50.0, description="mean of longest and shortest diameter, m")]
     height_m: Annotated[Positive | None, Field(description="above the ground, m; default: half the diameter")] = None
-    shape: Annotated[int | None, Field(ge=0, description="0-15: blocks, angular to rounded; 16-31: clinker")] = None
+    shape: Annotated[int | None, Field(ge=0, description="0-15 blocks, then 16 of each further form")] = None
     yaw_deg: Annotated[float | None, Field(description="turn about its vertical, deg; drawn where not given")] = None
 
 
@@ -54,7 +57,11 @@ class RockParameters(Parameters):
     largest_m: Annotated[Positive, Field(description="diameter of the largest, m")] = 3.0
     height_ratio: Annotated[float, Field(gt=0.0, le=1.0, description="mean height/diameter (Golombek & Rapp)")] = 0.5
     height_spread: Annotated[float, Field(ge=0.0, lt=1.0, description="half width of its uniform spread over it")] = 0.3
-    form: Annotated[Literal["block", "clinker"], Field(description="blocks or the jagged clinker of a'a")] = "block"
+    form: Annotated[Form, Field(description="form of all rocks, unless `forms` mixes several")] = "block"
+    forms: dict[Form, NonNegative] = Field(default_factory=dict, description="relative numbers of rocks of each form")
+    albedo_spread: Annotated[NonNegative, Field(description="standard deviation of the logarithm of rocks' albedo")] = (
+        0.0
+    )
     placed: Annotated[tuple[PlacedRock, ...], Field(description="rocks at stated positions")] = ()
 
     @model_validator(mode="after")
@@ -127,6 +134,7 @@ class RockField:
     - height_m: height of the top above the ground
     - yaw_rad: rotation about the rock's own vertical
     - up: unit vector of the rock's own vertical: the ground's normal
+    - albedo: each rock's albedo over that of the site's rocks
     - names: number of each named rock
     """
 
@@ -137,6 +145,7 @@ class RockField:
     height_m: Sizes
     yaw_rad: Sizes
     up: Float64[np.ndarray, "rocks 3"]
+    albedo: Sizes
     names: Mapping[str, int]
 
     @classmethod
@@ -150,7 +159,7 @@ class RockField:
         drawn = draw_diameters(parameters, densest * surface.period_m**2, substream(rng, "rock sizes"))
         appearance = substream(rng, "rock looks")
         ratio = parameters.height_ratio * (1.0 + parameters.height_spread * appearance.uniform(-1.0, 1.0, drawn.size))
-        first = shapes.FORMS.index(parameters.form) * SHAPES_OF_FORM
+        first = list(shapes.FORMS).index(parameters.form) * SHAPES_OF_FORM
         placed_shape, placed_yaw, draws = [], [], substream(rng, "placed rocks")
         for rock in placed:
             if rock.shape is not None and rock.shape >= shapes.SHAPES:
@@ -160,8 +169,16 @@ class RockField:
             placed_shape.append(kind if rock.shape is None else rock.shape)
             placed_yaw.append(turn if rock.yaw_deg is None else float(np.radians(rock.yaw_deg)))
         diameter = np.concatenate([[rock.diameter_m for rock in placed], drawn])
-        height = np.concatenate([[rock.height_m or 0.5 * rock.diameter_m for rock in placed], ratio * drawn])
         kinds = first + appearance.integers(0, SHAPES_OF_FORM, drawn.size)
+        if parameters.forms:
+            weights = np.array(list(parameters.forms.values()))
+            numbers = np.array([list(shapes.FORMS).index(name) for name in parameters.forms])
+            mixed = substream(rng, "rock forms").choice(numbers, drawn.size, p=weights / weights.sum())
+            kinds = mixed * SHAPES_OF_FORM + kinds % SHAPES_OF_FORM
+            ratio *= np.array([form.flatness for form in shapes.FORMS.values()])[mixed]
+        height = np.concatenate([[rock.height_m or 0.5 * rock.diameter_m for rock in placed], ratio * drawn])
+        tone = parameters.albedo_spread * substream(rng, "rock albedo").standard_normal(drawn.size)
+        albedo = np.concatenate([np.ones(len(placed)), np.exp(tone - 0.5 * parameters.albedo_spread**2)])
         shape = np.concatenate([placed_shape, kinds]).astype(np.int32)
         yaw = np.concatenate([placed_yaw, appearance.uniform(-np.pi, np.pi, drawn.size)])
         radius = rock_shapes(shapes.COARSE).reach[shape] * diameter
@@ -172,7 +189,7 @@ class RockField:
             density = surface.cover[cells[:, 1], cells[:, 0], ROCKS]
             kept = densest * substream(rng, "rock cover").random(len(xy)) < density
             kept[: len(placed)] = True
-            xy, diameter, height, shape, yaw = xy[kept], diameter[kept], height[kept], shape[kept], yaw[kept]
+            xy, diameter, height, shape, yaw, albedo = (one[kept] for one in (xy, diameter, height, shape, yaw, albedo))
         position = np.column_stack([xy, surface.height(xy[:, 0], xy[:, 1])])
         # the ground's slope over about the rock's own size
         level = np.clip(np.log2(np.maximum(diameter / surface.spacing_m, 1.0)).astype(int), 0, len(surface.levels) - 1)
@@ -181,10 +198,10 @@ class RockField:
             rows = level == one
             up[rows, :2] = -surface.gradient(xy[rows, 0], xy[rows, 1], int(one))
         up /= np.linalg.norm(up, axis=1, keepdims=True)
-        for array in (shape, position, diameter, height, yaw, up):
+        for array in (shape, position, diameter, height, yaw, up, albedo):
             array.setflags(write=False)
         names = MappingProxyType({rock.name: number for number, rock in enumerate(placed)})
-        return cls(surface.period_m, shape, position, diameter, height, yaw, up, names)
+        return cls(surface.period_m, shape, position, diameter, height, yaw, up, albedo, names)
 
     def __len__(self) -> int:
         return int(self.diameter_m.size)

@@ -1,4 +1,4 @@
-"""Irregular rock shapes from seeds, at several levels of detail: blocks cut by planes, and jagged clinker."""
+"""Irregular rock shapes from seeds, at several levels of detail: blocks, clinker, vesicular, slabs, ventifacts."""
 
 from __future__ import annotations
 
@@ -17,22 +17,73 @@ from scipy.sparse.linalg import splu
 from marsyard.sim.cache import cache_directory, evict_files, load_array, save_array, touch
 from marsyard.sim.kernel_cache import processor_features
 
-SHAPES_OF_FORM = 16  #: Shapes of each form; the first blocks are angular, the last rounded.
-#: Forms in the order of their shapes' numbers: blocks, and the rough clinker of a'a.
-FORMS = ("block", "clinker")
+SHAPES_OF_FORM = 16  #: Shapes of each form; the first are angular, the last rounded.
+
+
+@dataclass(frozen=True)
+class RockForm:
+    """Distributions of the shapes of one form.
+
+    - cuts, cut_distances: ranges of the number of planes that cut an ellipsoid, and of their distances from its centre
+    - sharpness: exponents of the cuts' union, which rounds their edges, of the first and the last shape
+    - bumps: RMS height of bumps over the radius, in each band of wavenumber
+    - depths: range of the shortest axis over the longest; the middle one is 0.65 to 0.95
+    - buried: range of the fraction of the height that is under the ground
+    - flatness: height over diameter, relative to that of a terrain's rocks
+    - folded: whether bumps meet in ridges
+    - bedding: whether two of the cuts are almost horizontal, and the others steep
+    - pits: number of vesicles, open at the surface
+    """
+
+    cuts: tuple[int, int] = (8, 16)
+    cut_distances: tuple[float, float] = (0.45, 0.85)
+    sharpness: tuple[float, float] = (200.0, 10.0)
+    bumps: tuple[float, float, float, float] = (0.03, 0.015, 0.008, 0.004)
+    depths: tuple[float, float] = (0.6, 0.85)
+    buried: tuple[float, float] = (0.15, 0.4)
+    flatness: float = 1.0
+    folded: bool = False
+    bedding: bool = False
+    pits: int = 0
+
+
+#: Forms in the order of their shapes' numbers: blocks, the rough clinker of a'a, vesicular basalt, slabs of bedrock
+#: and wind-faceted ventifacts (all seen from Spirit and Opportunity: Grotzinger et al. 2005, Greeley et al. 2006).
+FORMS = {
+    "block": RockForm(),
+    "clinker": RockForm(bumps=(0.1, 0.045, 0.022, 0.0), buried=(0.3, 0.5), folded=True),
+    "vesicular": RockForm(
+        cuts=(10, 18), sharpness=(80.0, 12.0), bumps=(0.03, 0.02, 0.012, 0.006), buried=(0.1, 0.6), pits=90
+    ),
+    "slab": RockForm(
+        cuts=(8, 12),
+        cut_distances=(0.55, 0.95),
+        sharpness=(250.0, 40.0),
+        depths=(0.9, 1.0),
+        buried=(0.3, 0.7),
+        flatness=0.35,
+        bedding=True,
+    ),
+    "ventifact": RockForm(
+        cuts=(5, 9),
+        cut_distances=(0.4, 0.75),
+        sharpness=(400.0, 120.0),
+        bumps=(0.012, 0.008, 0.004, 0.002),
+        buried=(0.1, 0.5),
+    ),
+}
 SHAPES = SHAPES_OF_FORM * len(FORMS)
+#: Angular radii of vesicles, radians, and their depth over their radius.
+_PIT_RADII, _PIT_DEPTH = (0.07, 0.2), 0.5
+#: Half thickness of slabs in their own axes, and the largest tilt of their bedding planes, radians.
+_BED_HALF, _BED_TILT = (0.35, 0.55), 0.1
 #: Subdivisions of the icosahedron at each level of detail: 80, 320, 1280 and 5120 triangles.
 SUBDIVISIONS = (1, 2, 3, 4)
 COARSE, MEDIUM, FINE, FINEST = range(4)
 DEVIATION_PX = 0.25  #: Allowed RMS deviation of a rock's image from its finest shape, pixels.
 UNIT_HEIGHT = 0.5  #: Height above the ground over diameter of the unit shapes. Each rock is stretched to its own.
-#: Exponents of the cuts' union, which rounds their edges, from the most angular to the most rounded.
-_SHARPEST, _ROUNDEST = 200.0, 10.0
-#: Range of the fraction of a form's height that is under the ground.
-_BURIED = {"block": (0.15, 0.4), "clinker": (0.3, 0.5)}
-#: Bumps in bands of wavenumber (radians per radius): number of waves, and each form's RMS height over the radius.
+#: Bands of wavenumber of bumps, radians per radius, and number of waves in each.
 _BUMP_WAVENUMBERS, _BUMP_WAVES = (3.0, 6.5, 13.0, 24.0), (10, 16, 24, 32)
-_BUMP_RMS = {"block": (0.03, 0.015, 0.008, 0.004), "clinker": (0.1, 0.045, 0.022, 0.0)}
 Points = Float64[np.ndarray, "n 3"]
 
 
@@ -143,7 +194,7 @@ class _Block:
 
     In its own axes the distance of the surface from the centre along direction d is
     ``(|d|**-p + sum((n_i . d / c_i)**p))**(-1/p) (1 + bumps(d))``: for large p the smallest of all cuts. The bumps are
-    waves; clinker's are folded, so that they meet in sharp ridges.
+    waves; clinker's are folded, so that they meet in sharp ridges. Vesicles are paraboloids below the surface.
     """
 
     cut_normals: Float64[np.ndarray, "cuts 3"]
@@ -155,28 +206,43 @@ class _Block:
     folded: bool
     axes: Float64[np.ndarray, "3"]
     buried_fraction: float
+    pit_directions: Float64[np.ndarray, "pits 3"]
+    pit_radii: Float64[np.ndarray, "pits"]
 
     @classmethod
     def draw(cls, number: int) -> _Block:
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(0x70C6, spawn_key=(number,))))
-        form = FORMS[number // SHAPES_OF_FORM]
+        form = list(FORMS.values())[number // SHAPES_OF_FORM]
         roundness = number % SHAPES_OF_FORM / (SHAPES_OF_FORM - 1)
-        cuts = int(rng.integers(8, 16))
+        cuts = int(rng.integers(*form.cuts))
         normals = rng.standard_normal((cuts, 3))
+        if form.bedding:
+            normals[:, 2] *= 0.25
+            normals[:2] = _BED_TILT * normals[:2] + np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         waves = rng.standard_normal((sum(_BUMP_WAVES), 3))
         waves *= (np.repeat(_BUMP_WAVENUMBERS, _BUMP_WAVES) / np.linalg.norm(waves, axis=1))[:, None]
-        bumps = np.repeat(np.array(_BUMP_RMS[form]) * np.sqrt(2.0 / np.array(_BUMP_WAVES)), _BUMP_WAVES)
+        bumps = np.repeat(np.array(form.bumps) * np.sqrt(2.0 / np.array(_BUMP_WAVES)), _BUMP_WAVES)
+        distances = rng.uniform(*form.cut_distances, cuts)
+        if form.bedding:
+            distances[:2] = rng.uniform(*_BED_HALF, 2)
+        sharpest, roundest = form.sharpness
+        phases = rng.uniform(0.0, 2.0 * np.pi, sum(_BUMP_WAVES))
+        axes = np.array([1.0, rng.uniform(0.65, 0.95), rng.uniform(*form.depths)])
+        buried = float(rng.uniform(*form.buried))
+        pits = rng.standard_normal((form.pits, 3))
         return cls(
             cut_normals=normals,
-            cut_distances=rng.uniform(0.45, 0.85, cuts),
-            sharpness=float(_SHARPEST * (_ROUNDEST / _SHARPEST) ** roundness),
+            cut_distances=distances,
+            sharpness=float(sharpest * (roundest / sharpest) ** roundness),
             waves=waves,
-            wave_phases=rng.uniform(0.0, 2.0 * np.pi, sum(_BUMP_WAVES)),
+            wave_phases=phases,
             wave_heights=bumps,
-            folded=form == "clinker",
-            axes=np.array([1.0, rng.uniform(0.65, 0.95), rng.uniform(0.6, 0.85)]),
-            buried_fraction=float(rng.uniform(*_BURIED[form])),
+            folded=form.folded,
+            axes=axes,
+            buried_fraction=buried,
+            pit_directions=pits / np.linalg.norm(pits, axis=1, keepdims=True),
+            pit_radii=rng.uniform(*_PIT_RADII, form.pits),
         )
 
     def to_unit_shape(self, own: Points) -> Points:
@@ -206,7 +272,12 @@ class _Block:
         if self.folded:
             # same mean square, 1/2, about the mean 0; cusps outwards
             wave = (2.0 / np.pi - np.abs(wave)) / np.sqrt(1.0 - 8.0 / np.pi**2)
-        return np.asarray(radius * (1.0 + np.sum(self.wave_heights * wave, axis=1)))
+        radius *= 1.0 + np.sum(self.wave_heights * wave, axis=1)
+        if self.pit_radii.size:
+            # (angle / radius)**2 for small angles; of overlapping vesicles the deepest counts
+            square = 2.0 * (1.0 - _dot_products(d, self.pit_directions)) / self.pit_radii**2
+            radius *= 1.0 - np.max(_PIT_DEPTH * self.pit_radii * np.maximum(1.0 - square, 0.0), axis=1)
+        return np.asarray(radius)
 
     @cached_property
     def finest_radius(self) -> Float64[np.ndarray, "n"]:
