@@ -34,7 +34,7 @@ ROCK_TRIANGLES = 600_000
 #: coarser than the camera resolves.
 DETAIL_TRIANGLES = 1_200_000
 #: Triangles of a coarse rock.
-_COARSE_TRIANGLES = 80
+_COARSE_TRIANGLES = 20
 #: Rocks outside of the sector are kept, for their shadows, within this many heights of the eye, and metres.
 _NEAR_HEIGHTS, _NEAR_M = 3.0, 5.0
 #: Ratio of the diameters of neighbouring size classes.
@@ -204,7 +204,7 @@ def smallest_rock_rad(field: RockField, eye: Eye) -> float:
     """Return the angular size of the smallest rocks in a scene.
 
     Rocks of diameter D are rendered up to the distance D / angle: n per square metre in a sector of half width w have
-    ``80 w D**2 n / angle**2`` triangles.
+    ``20 w D**2 n / angle**2`` triangles.
     """
     if np.isfinite(eye.reach_m):
         return SMALLEST_ROCK_PX * eye.pixel_rad

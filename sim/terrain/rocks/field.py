@@ -155,8 +155,7 @@ class RockField:
         Raises ValueError where a rock finds no free position, or a placed rock has no such shape.
         """
         placed = parameters.placed
-        densest = float(surface.cover[..., ROCKS].max())
-        drawn = draw_diameters(parameters, densest * surface.period_m**2, substream(rng, "rock sizes"))
+        drawn = draw_diameters(parameters, surface.period_m**2, substream(rng, "rock sizes"))
         appearance = substream(rng, "rock looks")
         ratio = parameters.height_ratio * (1.0 + parameters.height_spread * appearance.uniform(-1.0, 1.0, drawn.size))
         first = list(shapes.FORMS).index(parameters.form) * SHAPES_OF_FORM
@@ -182,14 +181,7 @@ class RockField:
         shape = np.concatenate([placed_shape, kinds]).astype(np.int32)
         yaw = np.concatenate([placed_yaw, appearance.uniform(-np.pi, np.pi, drawn.size)])
         radius = rock_shapes(shapes.COARSE).reach[shape] * diameter
-        xy = _draw_positions(parameters, radius, diameter, surface.period_m, substream(rng, "rock places"))
-        if surface.cover.size > 3:
-            side = len(surface.cover)
-            cells = (xy * (side / surface.period_m)).astype(int) % side
-            density = surface.cover[cells[:, 1], cells[:, 0], ROCKS]
-            kept = densest * substream(rng, "rock cover").random(len(xy)) < density
-            kept[: len(placed)] = True
-            xy, diameter, height, shape, yaw, albedo = (one[kept] for one in (xy, diameter, height, shape, yaw, albedo))
+        xy = _draw_positions(parameters, radius, diameter, surface, substream(rng, "rock places"))
         position = np.column_stack([xy, surface.height(xy[:, 0], xy[:, 1])])
         # the ground's slope over about the rock's own size
         level = np.clip(np.log2(np.maximum(diameter / surface.spacing_m, 1.0)).astype(int), 0, len(surface.levels) - 1)
@@ -228,7 +220,7 @@ class RockField:
         - x, y: world position in any period; beyond half a period a rock appears as often as it repeats
         - smallest_m: smallest diameter of interest
         - above_m, pixel_rad: height of the eye above the ground there, and angle that a pixel subtends
-        - detail: level of detail of all rocks, 0 (80 triangles) to 3 (5120); by default each rock's is the coarsest
+        - detail: level of detail of all rocks, 0 (20 triangles) to 4 (5120); by default each rock's is the coarsest
           that deviates too little from the finest to be seen (`DEVIATION_PX`)
         """
         large = np.flatnonzero(self.diameter_m >= smallest_m)
@@ -282,9 +274,10 @@ class RockField:
 
 
 def _draw_positions(
-    parameters: RockParameters, radius: Sizes, diameter: Sizes, period_m: float, rng: Generator
+    parameters: RockParameters, radius: Sizes, diameter: Sizes, surface: Surface, rng: Generator
 ) -> Float64[np.ndarray, "rocks 2"]:
     """Positions of the placed rocks as stated, and of the others where they do not overlap, the largest first."""
+    period_m, density = surface.period_m, np.ascontiguousarray(surface.cover[..., ROCKS])
     placed = np.array([(rock.east_m, rock.north_m) for rock in parameters.placed], dtype=np.float64).reshape(-1, 2)
     placed %= period_m
     count = placed.shape[0]
@@ -292,7 +285,7 @@ def _draw_positions(
         return placed
     occupied = np.column_stack([placed, radius[:count]])
     cell = max(CELL_OVER_DIAMETER * float(diameter[count:].mean()), period_m / 4096)
-    drawn = place_discs(radius[count:], occupied, period_m, cell, MAX_TRIES, rng)
+    drawn = place_discs(radius[count:], occupied, density, period_m, cell, MAX_TRIES, rng)
     crowded = int(np.count_nonzero(np.isnan(drawn[:, 0])))
     if crowded:
         raise ValueError(f"{crowded} of {len(drawn)} rocks find no free position; a smaller rocks.abundance is needed")

@@ -25,13 +25,21 @@ class Placements(NamedTuple):
 
 @njit(cache=True)
 def place_discs(
-    radii: Array, occupied: Array, period: float, cell_m: float, max_tries: int, rng: np.random.Generator
+    radii: Array,
+    occupied: Array,
+    density: NDArray[np.float32],
+    period: float,
+    cell_m: float,
+    max_tries: int,
+    rng: np.random.Generator,
 ) -> Array:
-    """Draw positions (x, y) of discs on a periodic square, uniform where they do not overlap.
+    """Draw positions (x, y) of discs on a periodic square, where they do not overlap, by a relative density.
 
     Discs are placed in order, the largest first, each at the first of its random positions that is free. `occupied` has
-    rows (x, y, radius) of existing discs. A disc without a free position after `max_tries` gets NaN.
+    rows (x, y, radius) of existing discs; `density` covers the square, rows along y. A disc without a free position
+    after `max_tries` gets NaN.
     """
+    rows, densest = density.shape[0], density.max()
     side = max(int(period / cell_m), 1)
     cell = period / side
     entries = 0
@@ -55,6 +63,10 @@ def place_discs(
         while not free and tries < max_tries:
             tries += 1
             x, y, free = rng.random() * period, rng.random() * period, True
+            i, j = int(y / period * rows) % rows, int(x / period * rows) % rows
+            if rows > 1 and rng.random() * densest > density[i, j]:
+                free = False
+                continue
             span = min(int((y + radius) / cell + side) - int((y - radius) / cell + side) + 1, side)
             width = min(int((x + radius) / cell + side) - int((x - radius) / cell + side) + 1, side)
             for di in range(span):
