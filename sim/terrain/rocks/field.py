@@ -180,7 +180,7 @@ class RockField:
         albedo = np.concatenate([np.ones(len(placed)), np.exp(tone - 0.5 * parameters.albedo_spread**2)])
         shape = np.concatenate([placed_shape, kinds]).astype(np.int32)
         yaw = np.concatenate([placed_yaw, appearance.uniform(-np.pi, np.pi, drawn.size)])
-        radius = rock_shapes(shapes.COARSE).reach[shape] * diameter
+        radius = rock_shapes(shapes.COARSEST).reach[shape] * diameter
         xy = _draw_positions(parameters, radius, diameter, surface, substream(rng, "rock places"))
         position = np.column_stack([xy, surface.height(xy[:, 0], xy[:, 1])])
         # the ground's slope over about the rock's own size

@@ -79,7 +79,7 @@ _PIT_RADII, _PIT_DEPTH = (0.07, 0.2), 0.5
 _BED_HALF, _BED_TILT = (0.35, 0.55), 0.1
 #: Subdivisions of the icosahedron at each level of detail: 20, 80, 320, 1280 and 5120 triangles.
 SUBDIVISIONS = (0, 1, 2, 3, 4)
-COARSE, FINEST = 0, 4
+COARSEST, COARSE, MEDIUM, FINE, FINEST = range(5)
 DEVIATION_PX = 0.25  #: Allowed RMS deviation of a rock's image from its finest shape, pixels.
 UNIT_HEIGHT = 0.5  #: Height above the ground over diameter of the unit shapes. Each rock is stretched to its own.
 #: Bands of wavenumber of bumps, radians per radius, and number of waves in each.
@@ -107,7 +107,7 @@ class ShapeSet:
 
 @cache
 def rock_shapes(detail: int) -> ShapeSet:
-    """Return the shapes at a level of detail, 0 (`COARSE`) to 4 (`FINEST`); coarser ones are fitted to the finest."""
+    """Return the shapes at a level of detail, 0 (`COARSEST`) to 4 (`FINEST`); coarser ones are fitted to the finest."""
     directions, faces = _icosphere(detail)
     normals = _load_or_build(f"normals-{detail}", lambda: np.stack([block.normals(directions) for block in _blocks()]))
     return ShapeSet(_vertices(detail), normals, faces, _reach())

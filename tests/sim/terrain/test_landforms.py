@@ -248,7 +248,7 @@ def test_ejecta_lie_in_seven_and_twelve_rays() -> None:
     """Outside a round crater the ejecta blanket falls with the cube of distance, and its rays vary with azimuth."""
     side, spacing, radius, rim, reach, phase = 128, 1.0, 12.0, 0.8, 4.0, 0.7
     height, tone = np.zeros((2, side, side), dtype=np.float32)
-    crater = np.array([[64.0, 64.0, radius, 3.0, rim, 0.1, 0.3, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phase]])
+    crater = np.array([[64.0, 64.0, radius, 3.0, rim, 0.1, 0.3, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phase]])
     stamp_craters(height, tone, spacing, crater, reach)
     y, x = np.mgrid[:side, :side] - 64.0
     r, azimuth = np.hypot(x, y) / radius, np.arctan2(y, x)

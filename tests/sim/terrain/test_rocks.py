@@ -14,6 +14,7 @@ from marsyard.sim.terrain.rocks import shapes
 from marsyard.sim.terrain.rocks.field import decay_per_m, draw_diameters
 from marsyard.sim.terrain.rocks.shapes import (
     COARSE,
+    COARSEST,
     FINE,
     FINEST,
     MEDIUM,
@@ -53,7 +54,9 @@ def field(ground: Surface) -> RockField:
     return make_field(ground)
 
 
-@pytest.mark.parametrize(("detail", "triangles"), [(COARSE, 80), (MEDIUM, 320), (FINE, 1280), (FINEST, 5120)])
+@pytest.mark.parametrize(
+    ("detail", "triangles"), [(COARSEST, 20), (COARSE, 80), (MEDIUM, 320), (FINE, 1280), (FINEST, 5120)]
+)
 def test_shapes_are_closed_and_of_unit_size(detail: int, triangles: int) -> None:
     shapes = rock_shapes(detail)
     for number in range(SHAPES):
@@ -61,7 +64,7 @@ def test_shapes_are_closed_and_of_unit_size(detail: int, triangles: int) -> None
         assert len(mesh.faces) == triangles
         assert mesh.is_watertight
         assert mesh.volume > 0.0
-        assert mesh.bounds[0, 2] < -0.05, "part of it is buried"
+        assert mesh.bounds[0, 2] < -0.02, "part of it is buried"
         assert np.hypot(*shapes.vertices[number, :, :2].T).max() <= shapes.reach[number] + 1e-12
     np.testing.assert_allclose(np.linalg.norm(shapes.normals, axis=2), 1.0, atol=1e-12)
 
@@ -194,9 +197,10 @@ def test_clinker_is_rougher_than_blocks_and_has_separate_shapes(ground: Surface)
     shapes = rock_shapes(FINEST)
     meshes = [trimesh.Trimesh(vertices, shapes.faces, process=False) for vertices in shapes.vertices]
     bends = [float(np.median(mesh.face_adjacency_angles)) for mesh in meshes]
-    assert max(bends[:SHAPES_OF_FORM]) < 0.07 < 0.18 < min(bends[SHAPES_OF_FORM:])
+    clinker = slice(SHAPES_OF_FORM, 2 * SHAPES_OF_FORM)
+    assert max(bends[:SHAPES_OF_FORM]) < 0.07 < 0.18 < min(bends[clinker])
     field = make_field(ground, form="clinker", placed=())
-    assert set(np.unique(field.shape)) == set(range(SHAPES_OF_FORM, SHAPES))
+    assert set(np.unique(field.shape)) == set(range(SHAPES_OF_FORM, 2 * SHAPES_OF_FORM))
     assert set(np.unique(make_field(ground, placed=()).shape)) == set(range(SHAPES_OF_FORM))
 
 
@@ -245,8 +249,8 @@ def test_too_many_rocks_and_unknown_shapes_are_rejected(ground: Surface) -> None
         make_field(ground, placed=(strange,))
 
 
-@pytest.mark.parametrize("number", [0, 9, 15, 16, 27])
-@pytest.mark.parametrize("detail", [COARSE, MEDIUM, FINE])
+@pytest.mark.parametrize("number", [0, 9, 15, 16, 27, 32, 47, 50, 63, 70])
+@pytest.mark.parametrize("detail", [COARSEST, COARSE, MEDIUM, FINE])
 def test_coarse_rock_matches_the_finest_within_subpixels(number: int, detail: int) -> None:
     """Requirement: 0.25 px rms above the ground, from the plane of the nearest coarse triangle."""
     coarse = mesh_of(rock_shapes(detail), number)
@@ -255,11 +259,11 @@ def test_coarse_rock_matches_the_finest_within_subpixels(number: int, detail: in
     finest = finest[finest[:, 2] > 0.0]
     nearest = cKDTree(samples).query(finest)[1]
     away = np.sum((finest - samples[nearest]) * coarse.face_normals[triangles[nearest]], axis=1)
-    assert 0.15 < np.sqrt(np.mean(away**2)) * max_pixels()[number, detail] < 0.28
+    assert 0.15 < np.sqrt(np.mean(away**2)) * max_pixels()[number, detail] < 0.3
 
 
 def test_rock_detail_follows_camera_resolution(field: RockField) -> None:
-    faces = [rock_shapes(detail).faces.shape[0] for detail in (COARSE, MEDIUM, FINE, FINEST)]
+    faces = [rock_shapes(detail).faces.shape[0] for detail in (COARSEST, COARSE, MEDIUM, FINE, FINEST)]
     for pixel_rad in (3e-4, 1e-3, 1e-2):
         mesh = field.near(32.0, 32.0, 25.0, smallest_m=0.3, above_m=1.5, pixel_rad=pixel_rad)
         for rock, count in zip(*np.unique(mesh.rock_of_face, return_counts=True), strict=True):
@@ -280,8 +284,8 @@ def test_stored_shapes_equal_the_built_ones(tmp_path: Path, monkeypatch: pytest.
         one = rock_shapes(COARSE)
         results.append([one.vertices, one.normals, one.reach, max_pixels()])
         files = sorted((tmp_path / "terrain").glob("rocks-*.npy"))
-    # Vertices of four levels, normals of the coarsest and finest level, sizes in pixels.
-    assert len(files) == 7
+    # Vertices of five levels, normals of two, sizes in pixels.
+    assert len(files) == 8
     for built, stored in zip(*results, strict=True):
         np.testing.assert_array_equal(built, stored)
     assert not any(array.flags.writeable for array in results[1][:2])

@@ -78,7 +78,7 @@ def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:
     height, tone = np.zeros((256, 256), dtype=np.float32), np.zeros((256, 256), dtype=np.float32)
     radius, depth, rim = 20.0, 6.4, 1.6
     # Sharp rim and round outline, centred on the corner of the periodic border.
-    crater = [0.0, 0.0, radius, depth, rim, 0.0, 0.0, 0.1, *np.zeros(6), 0.3]
+    crater = [0.0, 0.0, radius, depth, rim, 0.0, 0.0, 0.1, *np.zeros(7), 0.3]
     stamp_craters(height, tone, 1.0, np.array([crater]), 3.0)
     centred = np.roll(height, (128, 128), axis=(0, 1))
     assert centred[128, 128] == pytest.approx(-depth)
@@ -91,7 +91,7 @@ def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:
 
 def test_filled_crater_has_a_flat_floor_at_its_depth() -> None:
     height, tone = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
-    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.4, 0.0, *np.zeros(6), 0.0]
+    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.4, 0.0, *np.zeros(7), 0.0]
     stamp_craters(height, tone, 1.0, np.array([crater]), 3.0)
     assert height[64, 64] == pytest.approx(-3.0, abs=0.05)
     assert np.ptp(height[64, 56:73]) < 0.15
