@@ -1,0 +1,176 @@
+"""Tests of relief finer than the terrain's samples: its spectrum, its shading, and what stays exact."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import special
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
+
+from marsyard.sim.camera import Cahvor
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
+from marsyard.sim.render.kernels.microrelief import (
+    FADING,
+    HEIGHT_VARIANCE,
+    MIN_CELLS,
+    SLOPE_VARIANCE,
+    add_relief_slopes,
+    relief_noise,
+    smith_shadowing,
+)
+from marsyard.sim.render.kernels.structs import MicroRelief
+from marsyard.sim.terrain import Surface
+from marsyard.sim.terrain.microrelief import octave_heights
+
+LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
+EVEN = np.ones((1, 1), dtype=np.float32)
+POSE = rigid(Rotation.identity(), np.array([30.0, 40.0, 20.0]))
+
+
+def _make_relief(coarsest_m: float, *heights_m: float) -> MicroRelief:
+    return MicroRelief(coarsest_m, np.array(heights_m), EVEN, EVEN, 0.0)
+
+
+def _sample_noise(x: np.ndarray, y: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Value and derivatives of the noise, shape (n, 3)."""
+    return np.array([relief_noise(a, b, seed) for a, b in zip(x.ravel(), y.ravel(), strict=True)])
+
+
+@pytest.fixture(scope="module")
+def flat() -> Surface:
+    levels = [np.zeros((side, side, 2), dtype=np.float32) for side in (64, 32, 16, 8)]
+    for level in levels:
+        level[..., 1] = 0.2
+    return Surface(tuple(levels), 1.0)
+
+
+def test_noise_has_the_stated_variances_and_derivatives() -> None:
+    x, y = np.random.default_rng(3).uniform(-200.0, 200.0, (2, 40000))
+    noise = _sample_noise(x, y)
+    assert np.mean(noise[:, 0]) == pytest.approx(0.0, abs=0.005)
+    assert np.mean(noise[:, 0] ** 2) == pytest.approx(HEIGHT_VARIANCE, rel=0.03)
+    assert np.mean(noise[:, 1:] ** 2) == pytest.approx(SLOPE_VARIANCE, rel=0.03)
+    step = 1e-5
+    along_x = (_sample_noise(x + step, y)[:, 0] - _sample_noise(x - step, y)[:, 0]) / (2.0 * step)
+    along_y = (_sample_noise(x, y + step)[:, 0] - _sample_noise(x, y - step)[:, 0]) / (2.0 * step)
+    np.testing.assert_allclose(noise[:, 1], along_x, atol=1e-5)
+    np.testing.assert_allclose(noise[:, 2], along_y, atol=1e-5)
+
+
+@pytest.mark.parametrize("hurst", [0.5, 0.75, 0.9])
+def test_octaves_continue_the_spectrum_of_the_terrain(hurst: float) -> None:
+    """Differences of height over short lags, against the integral of the terrain's spectrum beyond its samples'."""
+    slope_rad, baseline_m, outer_m, spacing_m = np.radians(3.0), 1.0, 15.0, 0.2
+    coarsest, heights = octave_heights(hurst, slope_rad, baseline_m, outer_m, spacing_m)
+    k0 = 2.0 * np.pi / outer_m
+
+    def structure(lag: float, above: float = 0.0) -> float:
+        """Mean square difference over a lag, by waves of wavenumbers above a bound, for heights of unit variance."""
+        k = np.geomspace(max(above, 1e-4 * k0), 2.0 * np.pi / 0.0005, 200_001)
+        power = 2.0 * hurst * k0 ** (2.0 * hurst) * k * (k**2 + k0**2) ** -(hurst + 1.0)
+        return float(np.trapezoid(2.0 * power * (1.0 - special.j0(k * lag)), k))
+
+    scale = (np.tan(slope_rad) * baseline_m) ** 2 / structure(baseline_m)
+    shortest = 2.0 * np.pi * 0.61 / coarsest / np.sqrt(2.0)
+    x, y = np.random.default_rng(4).uniform(0.0, 50.0, (2, 20000))
+    for lag in (0.01, 0.03):
+        change = np.zeros(x.size)
+        for octave, height in enumerate(heights):
+            cell = coarsest * 0.5**octave
+            change += height * (_sample_noise((x + lag) / cell, y / cell, octave)[:, 0])
+            change -= height * (_sample_noise(x / cell, y / cell, octave)[:, 0])
+        assert np.sqrt(np.mean(change**2)) == pytest.approx(np.sqrt(scale * structure(lag, shortest)), rel=0.1)
+
+
+@pytest.mark.parametrize("cell_px", [4.0, 2.0])
+def test_slopes_fade_as_by_the_mean_over_a_pixel(cell_px: float) -> None:
+    """Slopes averaged over pixels of 15 x 15 samples, against the attenuation of the footprint."""
+    pixels, inside = 40, 15
+    centre = np.arange(pixels) / cell_px
+    offset = (np.arange(inside) - 7.0) / inside / cell_px
+    x, y = np.meshgrid((centre[:, None] + offset).ravel(), (centre[:, None] + offset).ravel())
+    slope = _sample_noise(x, y)[:, 1].reshape(pixels, inside, pixels, inside)
+    expected = slope.mean(axis=(1, 3))
+    x, y = (grid.ravel() for grid in np.meshgrid(centre, centre))
+    outputs = [np.zeros(x.size) for _ in range(4)]
+    add_relief_slopes(x, y, np.full(x.size, 1.0 / cell_px), _make_relief(1.0, 1.0), *outputs)
+    assert np.std(outputs[0]) == pytest.approx(np.std(expected), rel=0.06)
+    np.testing.assert_allclose(outputs[2] + outputs[3], SLOPE_VARIANCE)
+
+
+def test_unresolved_octaves_only_add_to_the_variance() -> None:
+    outputs = [np.zeros(1) for _ in range(4)]
+    position = np.array([0.3])
+    add_relief_slopes(position, position, np.array([1.001 / MIN_CELLS]), _make_relief(1.0, 0.1, 0.1), *outputs)
+    assert outputs[0][0] == outputs[1][0] == outputs[2][0] == 0.0
+    assert outputs[3][0] == pytest.approx((0.1**2 + 0.2**2) * SLOPE_VARIANCE)
+    assert FADING == pytest.approx(MIN_CELLS**2)
+
+
+@pytest.mark.parametrize("elevation_deg", [5.0, 15.0, 30.0, 60.0])
+@pytest.mark.parametrize("slope_deg", [5.0, 15.0, 25.0])
+def test_shadowing_equals_smiths_formula(elevation_deg: float, slope_deg: float) -> None:
+    cosine, sigma = np.sin(np.radians(elevation_deg)), np.tan(np.radians(slope_deg))
+    a = cosine / (np.sqrt(2.0) * sigma * np.sqrt(1.0 - cosine**2))
+    hidden = 0.5 * (np.exp(-(a**2)) / (a * np.sqrt(np.pi)) - special.erfc(a))
+    assert smith_shadowing(cosine, sigma**2) == pytest.approx(1.0 / (1.0 + hidden), abs=0.005)
+
+
+def _shade_heights(heights: np.ndarray, step_m: float, sun: np.ndarray) -> np.ndarray:
+    """Lambert shading of a fine height field with cast shadows, found by marching along the sun's azimuth."""
+    slope_y, slope_x = np.gradient(heights, step_m)
+    cosine = (sun[2] - slope_x * sun[0] - slope_y * sun[1]) / np.sqrt(1.0 + slope_x**2 + slope_y**2)
+    horizontal = np.hypot(*sun[:2])
+    rise, shadow = sun[2] / horizontal * step_m, np.zeros(heights.shape, dtype=bool)
+    rows, columns = np.mgrid[: heights.shape[0], : heights.shape[1]].astype(float)
+    for k in range(1, int(np.ptp(heights) / rise) + 2):
+        at = [rows + k * sun[1] / horizontal, columns + k * sun[0] / horizontal]
+        shadow |= map_coordinates(heights, at, order=1, mode="nearest") > heights + k * rise
+    return np.where(shadow, 0.0, np.maximum(cosine, 0.0))
+
+
+@pytest.mark.parametrize("rms_slope_deg", [8.0, 15.0])
+def test_appearance_changes_with_the_sun_as_that_of_geometry(
+    renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor], rms_slope_deg: float
+) -> None:
+    """Correlation of pictures under two suns 90 deg apart: equal, within 0.05, to that of a ray-cast height field."""
+    cell, pixels, inside = 0.8, 96, 6
+    relief = _make_relief(cell, np.tan(np.radians(rms_slope_deg)) * cell / np.sqrt(SLOPE_VARIANCE))
+    rays = PixelRays.of(descent_camera(pixels, (0.0, 0.0, 0.0)))
+    suns = [direction(np.radians(azimuth), np.radians(35.0)) for azimuth in (60.0, 150.0)]
+    scene = Scene(flat, (30.0, 40.0), Sun(suns[0]), LAMBERT, relief=relief)
+    frames = [renderer.render(replace(scene, sun=Sun(sun)), rays, POSE) for sun in suns]
+    rendered = np.corrcoef(frames[0].radiance.ravel(), frames[1].radiance.ravel())[0, 1]
+    points = frames[0].points_world()
+    x0, x1 = np.sort(points[0, [0, -1], 0])
+    y0, y1 = np.sort(points[[0, -1], 0, 1])
+    step = (x1 - x0) / (pixels - 1) / inside
+    x, y = np.meshgrid(np.arange(x0, x1, step), np.arange(y0, y1, step))
+    heights = relief.heights[0] * _sample_noise(x / cell, y / cell)[:, 0].reshape(x.shape)
+    shaded = []
+    for sun in suns:
+        picture = _shade_heights(heights, step, sun)
+        side = [n // inside * inside for n in picture.shape]
+        picture = picture[: side[0], : side[1]].reshape(side[0] // inside, inside, side[1] // inside, inside)
+        shaded.append(picture.mean(axis=(1, 3)).ravel())
+    assert rendered == pytest.approx(np.corrcoef(*shaded)[0, 1], abs=0.05)
+    for frame in frames:
+        assert frame.radiance.std() > 0.03 * frame.radiance.mean()
+
+
+def test_geometric_truth_and_mean_brightness_are_kept(
+    renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor]
+) -> None:
+    rays = PixelRays.of(descent_camera(128))
+    bare = Scene(flat, (30.0, 40.0), Sun(direction(2.0, np.radians(50.0))), LAMBERT)
+    rough = replace(bare, relief=_make_relief(1.2, *0.02 * 0.5 ** np.arange(8.0)))
+    first, second = (renderer.render(scene, rays, POSE) for scene in (bare, rough))
+    np.testing.assert_array_equal(first.range_m, second.range_m)
+    np.testing.assert_array_equal(first.normal, second.normal)
+    assert second.radiance.std() > 2.0 * first.radiance.std()
+    assert second.radiance.mean() == pytest.approx(first.radiance.mean(), rel=0.01)
