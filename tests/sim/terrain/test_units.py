@@ -1,0 +1,170 @@
+"""Tests of surface units, crater populations, tracks and wind tails."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from marsyard.sim.terrain import RockField, RockParameters, Surface, TerrainParameters, synthesise
+from marsyard.sim.terrain.landforms.ground import Ground, Spectrum
+from marsyard.sim.terrain.landforms.kernels import stamp_cover, stamp_craters, stamp_streaks
+from marsyard.sim.terrain.landforms.relief import draw_craters
+from marsyard.sim.terrain.landforms.units import SurfaceUnits
+from marsyard.sim.terrain.surface import ROCKS, ROUGHNESS, TEXTURE
+
+KINDS = {
+    "plain": {"fraction": 0.5},
+    "dust": {"fraction": 0.3, "tone": 0.2, "roughness": 0.3, "texture": 0.2, "rocks": 0.1},
+    "rubble": {"fraction": 0.2, "tone": -0.2, "roughness": 2.0, "texture": 1.5, "rocks": 3.0},
+}
+NO_CRATERS = np.empty((0, 16))
+
+
+def _make_units(**changes: Any) -> SurfaceUnits:
+    return SurfaceUnits.model_validate({"kinds": KINDS, "boundary": 0.02, **changes})
+
+
+def _apply(units: SurfaceUnits, seed: int = 1, side: int = 1024) -> tuple[Ground, np.ndarray]:
+    ground = Ground(np.zeros((side, side), dtype=np.float32), np.zeros((side, side), dtype=np.float32), 2.0)
+    return ground, units.apply(ground, NO_CRATERS, np.random.default_rng(seed))
+
+
+def _make_parameters(**changes: Any) -> TerrainParameters:
+    settings = {"samples": 512, "spacing_m": 2.0, "albedo_contrast": 0.1, "albedo_hurst": 0.3, "craters_per_km2": 0.0}
+    return TerrainParameters.model_validate({**settings, **changes})
+
+
+def test_areas_factors_and_tones_are_as_stated() -> None:
+    """With sharp boundaries and fixed areas, each unit has its area, its factors and its albedo."""
+    ground, cover = _apply(_make_units(concentration=1e6))
+    for kind in KINDS.values():
+        inside = np.isclose(cover[..., TEXTURE], kind.get("texture", 1.0), rtol=0.05)
+        assert inside.mean() == pytest.approx(kind["fraction"], abs=0.05)
+        assert np.median(cover[inside, ROUGHNESS]) == pytest.approx(kind.get("roughness", 1.0), rel=0.05)
+        assert np.median(ground.tone[::4, ::4][inside]) == pytest.approx(kind.get("tone", 0.0), abs=0.02)
+    assert cover[..., ROCKS].mean() == pytest.approx(1.0, rel=1e-4)
+
+
+def test_areas_vary_from_terrain_to_terrain() -> None:
+    dust = [np.mean(_apply(_make_units(), seed, 256)[1][..., TEXTURE] < 0.4) for seed in range(40)]
+    # Dirichlet: variance a (1 - a) / (concentration + 1)
+    assert np.std(dust) == pytest.approx(np.sqrt(0.3 * 0.7 / 9.0), rel=0.35)
+    assert np.mean(dust) == pytest.approx(0.3, abs=0.08)
+
+
+def test_patches_are_longer_along_the_wind() -> None:
+    units = _make_units(wind_from_deg=270.0, wind_spread_deg=0.0, elongation=4.0, largest_m=300.0)
+    texture = np.log(_apply(units)[1][..., TEXTURE])
+    texture -= texture.mean()
+    along_x, along_y = (np.mean(texture * np.roll(texture, 10, axis=axis)) for axis in (1, 0))
+    assert along_x > 1.2 * along_y
+
+
+def test_ground_with_units_is_textured_unevenly() -> None:
+    def patchiness(parameters: TerrainParameters) -> float:
+        tone = np.log(synthesise(parameters, np.random.default_rng(3)).levels[0][..., 1].astype(float))
+        blocks = tone.reshape(32, 16, 32, 16).std(axis=(1, 3))
+        return float(np.percentile(blocks, 90) / np.percentile(blocks, 10))
+
+    even = patchiness(_make_parameters())
+    uneven = patchiness(_make_parameters(units=_make_units(boundary=0.2)))
+    assert even < 2.3
+    assert uneven > 1.5 * even
+
+
+def test_split_field_is_the_same_field() -> None:
+    spectrum = Spectrum.power_law(128, 1.0, 0.4, 60.0)
+    coarse, fine = spectrum.split_field(np.random.default_rng(2), 1.5, 20.0)
+    np.testing.assert_allclose(coarse + fine, spectrum.field(np.random.default_rng(2), 1.5), atol=1e-5)
+    waves = np.abs(np.fft.rfft2(coarse)).sum(axis=0)
+    assert waves[40:].max() < 1e-3 * waves[:5].max()
+
+
+def test_crater_sizes_follow_saturation_and_production() -> None:
+    """Cumulative numbers fall as D**-1.83 below the knee and as D**-3.2 beyond it."""
+    parameters = _make_parameters(
+        samples=4096,
+        spacing_m=3.0,
+        craters_per_km2=600.0,
+        crater_diameter_min_m=8.0,
+        crater_diameter_max_m=2000.0,
+        crater_exponent=1.83,
+        crater_knee_m=60.0,
+    )
+    diameter = 2.0 * draw_craters(parameters, np.random.default_rng(5))[:, 2]
+    assert np.all(np.diff(diameter) <= 0.0)
+    above = {size: np.count_nonzero(diameter > size) for size in (8.0, 16.0, 32.0, 64.0, 128.0)}
+    assert np.log2(above[8.0] / above[16.0]) == pytest.approx(1.83, abs=0.15)
+    assert np.log2(above[16.0] / above[32.0]) == pytest.approx(1.83, abs=0.15)
+    assert np.log2(above[64.0] / above[128.0]) == pytest.approx(3.2, abs=0.25)
+
+
+def test_crater_floor_has_its_tone() -> None:
+    height, tone = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
+    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.0, 0.0, 0.15, *np.zeros(6), 0.0]
+    stamp_craters(height, tone, 1.0, np.array([crater]), 3.0)
+    assert tone[64, 64] == pytest.approx(0.15)
+    assert not tone[np.hypot(*(np.mgrid[:128, :128] - 64.0)) > 34.0].any()
+
+
+def test_craters_smooth_their_floor_and_roughen_their_ejecta() -> None:
+    factors = np.ones((64, 64), dtype=np.float32)
+    stamp_cover(factors, 1.0, np.array([[32.0, 32.0, 10.0, 0.4, 1.8]]), 2.0)
+    assert factors[32, 32] == pytest.approx(0.4)
+    assert factors[32, 43] > 1.6
+    assert factors[32, 54] == 1.0
+
+
+def test_wind_tails_lie_downwind_of_their_craters() -> None:
+    tone = np.zeros((128, 128), dtype=np.float32)
+    stamp_streaks(tone, 1.0, np.array([[30.0, 64.0, 6.0, 50.0, 1.0, 0.0, -0.2]]))
+    rows, columns = np.nonzero(tone)
+    assert columns.min() >= 30
+    assert columns.max() <= 80
+    assert abs(rows - 64).max() < 12
+    assert tone.min() == pytest.approx(-0.2, abs=0.05)
+
+
+def test_dust_devil_tracks_are_darker() -> None:
+    ground, _ = _apply(_make_units(kinds={"plain": {"fraction": 1.0}}, tracks_per_km2=20.0, track_tone=-0.12))
+    assert -0.3 < ground.tone.min() < -0.08
+    assert ground.tone.max() < 1e-6
+    assert 0.02 < np.mean(ground.tone < -0.02) < 0.9
+
+
+def test_rocks_follow_their_density_and_keep_the_abundance() -> None:
+    surface = synthesise(_make_parameters(samples=256, spacing_m=0.5, units=_make_units()), np.random.default_rng(4))
+    parameters = RockParameters(abundance=0.05, smallest_m=0.1)
+    rocks = RockField.on(surface, parameters, np.random.default_rng(2))
+    bare = RockField.on(Surface(surface.levels, surface.spacing_m), parameters, np.random.default_rng(2))
+    assert len(rocks) == len(bare)
+    side = len(surface.cover)
+    cell = (rocks.position_m[:, :2] / surface.period_m * side).astype(int) % side
+    density = surface.cover[..., ROCKS]
+    dense = density[cell[:, 1], cell[:, 0]] > 1.0
+    expected = float(density[density > 1.0].sum() / density.sum())
+    assert dense.mean() == pytest.approx(expected, abs=4.0 * np.sqrt(expected * (1.0 - expected) / len(rocks)))
+
+
+def test_forms_are_mixed_as_stated_and_albedo_keeps_its_mean() -> None:
+    surface = synthesise(_make_parameters(samples=128, spacing_m=0.5), np.random.default_rng(4))
+    parameters = RockParameters(abundance=0.1, smallest_m=0.05, forms={"block": 3.0, "slab": 1.0}, albedo_spread=0.3)
+    rocks = RockField.on(surface, parameters, np.random.default_rng(2))
+    slab = rocks.shape // 16 == 3
+    assert set(np.unique(rocks.shape // 16)) == {0, 3}
+    assert slab.mean() == pytest.approx(0.25, abs=0.02)
+    ratio = rocks.height_m / rocks.diameter_m
+    assert ratio[slab].mean() == pytest.approx(0.35 * ratio[~slab].mean(), rel=0.05)
+    assert rocks.albedo.mean() == pytest.approx(1.0, abs=0.02)
+    assert np.log(rocks.albedo).std() == pytest.approx(0.3, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"kinds": {}}, {"elongation": 0.5}, {"kinds": {"plain": {"fraction": 2.0}}}, {"boundary": 0.0}]
+)
+def test_invalid_units_are_rejected(changes: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        _make_units(**changes)
