@@ -96,9 +96,9 @@ def test_slopes_fade_as_by_the_mean_over_a_pixel(cell_px: float) -> None:
     x, y = np.meshgrid((centre[:, None] + offset).ravel(), (centre[:, None] + offset).ravel())
     slope = _sample_noise(x, y)[:, 1].reshape(pixels, inside, pixels, inside)
     expected = slope.mean(axis=(1, 3))
-    x, y = (grid.ravel() for grid in np.meshgrid(centre, centre))
-    outputs = [np.zeros(x.size) for _ in range(4)]
-    add_relief_slopes(x, y, np.full(x.size, 1.0 / cell_px), _make_relief(1.0, 1.0), *outputs)
+    u, v = (grid.ravel() for grid in np.meshgrid(centre, centre))
+    outputs = [np.zeros(u.size) for _ in range(4)]
+    add_relief_slopes(u, v, np.full(u.size, 1.0 / cell_px), _make_relief(1.0, 1.0), *outputs)
     assert np.std(outputs[0]) == pytest.approx(np.std(expected), rel=0.06)
     np.testing.assert_allclose(outputs[2] + outputs[3], SLOPE_VARIANCE)
 
@@ -109,7 +109,7 @@ def test_unresolved_octaves_only_add_to_the_variance() -> None:
     add_relief_slopes(position, position, np.array([1.001 / MIN_CELLS]), _make_relief(1.0, 0.1, 0.1), *outputs)
     assert outputs[0][0] == outputs[1][0] == outputs[2][0] == 0.0
     assert outputs[3][0] == pytest.approx((0.1**2 + 0.2**2) * SLOPE_VARIANCE)
-    assert FADING == pytest.approx(MIN_CELLS**2)
+    assert pytest.approx(MIN_CELLS**2) == FADING
 
 
 @pytest.mark.parametrize("elevation_deg", [5.0, 15.0, 30.0, 60.0])

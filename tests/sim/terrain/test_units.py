@@ -137,7 +137,7 @@ def test_dust_devil_tracks_are_darker() -> None:
 
 def test_rocks_follow_their_density_and_keep_the_abundance() -> None:
     surface = synthesise(_make_parameters(samples=256, spacing_m=0.5, units=_make_units()), np.random.default_rng(4))
-    parameters = RockParameters(abundance=0.05, smallest_m=0.1)
+    parameters = RockParameters(abundance=0.005, smallest_m=0.02)  # so few that they rarely overlap
     rocks = RockField.on(surface, parameters, np.random.default_rng(2))
     bare = RockField.on(Surface(surface.levels, surface.spacing_m), parameters, np.random.default_rng(2))
     assert len(rocks) == len(bare)
