@@ -21,6 +21,7 @@ from marsyard.sim.render.kernels.structs import MicroRelief
 from marsyard.sim.sensor import CameraDesign
 from marsyard.sim.terrain import RockField, RockMesh, Site, Surface, TerrainBank, TerrainParameters
 from marsyard.sim.terrain.microrelief import octave_heights
+from marsyard.sim.terrain.rocks.field import ROCK_ARRAYS
 from marsyard.sim.terrain.rocks.shapes import FINEST, max_pixels, rock_shapes
 from marsyard.sim.terrain.surface import ROUGHNESS, TEXTURE
 
@@ -171,7 +172,6 @@ def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Ob
     reach = min(farthest_m, eye.reach_m)
     smallest_m = float(field.diameter_m.min())
     size_class = np.floor(np.log(field.diameter_m / smallest_m) / np.log(_CLASS_RATIO) + 1e-9).astype(int)
-    arrays = ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up", "albedo")
     meshes = []
     for number in np.unique(size_class):
         members, low = np.flatnonzero(size_class == number), smallest_m * _CLASS_RATIO ** int(number)
@@ -180,7 +180,7 @@ def select_rocks(ground: SiteGround, eye: Eye, farthest_m: float = np.inf) -> Ob
         radius = float(min(horizontal, reach))
         selected = members[_near_sector(field, members, eye, radius)]
         if selected.size:
-            subset = replace(field, names={}, **{name: getattr(field, name)[selected] for name in arrays})
+            subset = replace(field, names={}, **{name: getattr(field, name)[selected] for name in ROCK_ARRAYS})
             mesh = subset.near(eye.east_m, eye.north_m, radius, above_m=eye.height_m, pixel_rad=pixel_rad)
             meshes.append(replace(mesh, rock_of_face=selected[mesh.rock_of_face].astype(np.int32)))
     if not meshes:

@@ -22,6 +22,7 @@ from marsyard.sim.sensor.odometry import Odometer, PoseEstimate
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, TerrainParameters, site
 from marsyard.sim.terrain.landforms import Ramp
+from marsyard.sim.terrain.rocks.field import ROCK_ARRAYS
 
 #: Name of the target's rock.
 TARGET = "target"
@@ -40,7 +41,6 @@ CLEARED_M = 2.0
 MIN_GAP_M = 0.05
 #: Maximum distance from the route of rocks that wheels roll over, metres.
 ROUTE_MARGIN_M = 1.5
-_ROCK_ARRAYS = ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up")
 
 
 def terrain_parameters(w: WorldParameters) -> TerrainParameters:
@@ -141,7 +141,7 @@ def place_rocks(p: RoverScenarioParameters, bare: SiteGround, rng: np.random.Gen
     for position, diameter in zip(rocks.position_m[:, :2], rocks.diameter_m, strict=True):
         kept &= _distances(bare.rocks, position) - 0.6 * (bare.rocks.diameter_m + diameter) > MIN_GAP_M
     arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(rocks, name), getattr(bare.rocks, name)[kept]]) for name in _ROCK_ARRAYS
+        name: np.concatenate([getattr(rocks, name), getattr(bare.rocks, name)[kept]]) for name in ROCK_ARRAYS
     }
     rocks = replace(rocks, **arrays)
     return replace(bare, rocks=rocks), rocks

@@ -43,7 +43,7 @@ def test_entry_point_is_named_like_builtin_algorithms(monkeypatch: pytest.Monkey
     points = [
         EntryPoint(name, "marsyard.algorithms.baselines:HomographyEstimator", group) for name in ("theirs", "dimes")
     ]
-    monkeypatch.setattr(estimators, "installed", lambda: {point.name: point for point in points})
+    monkeypatch.setattr(estimators, "list_installed", lambda: {point.name: point for point in points})
     assert isinstance(VELOCITY.make("theirs", DimesOptions(), LIMITS), HomographyEstimator)
     assert not isinstance(VELOCITY.make("dimes", DimesOptions(), LIMITS), HomographyEstimator)
     with pytest.raises(ValueError, match=r"did you mean 'theirs'.*dimes, phase-correlation, homography, theirs"):
@@ -115,7 +115,7 @@ def test_streams_are_distinguished_from_three_image_estimators(tmp_path: Path, m
     (tmp_path / "streams_half.py").write_text(STREAM)
     monkeypatch.chdir(tmp_path)
     point = EntryPoint("theirs", "streams_here:Mine", estimators.GROUP)
-    monkeypatch.setattr(estimators, "installed", lambda: {"theirs": point})
+    monkeypatch.setattr(estimators, "list_installed", lambda: {"theirs": point})
     for spec in ("streams_here:Mine", "streams_here:made", "theirs", "exec-stream:cat", "serve-stream:cat -u"):
         VELOCITY.check(spec)
         assert isinstance(VELOCITY.make(spec, DimesOptions(), LIMITS), StreamedEstimator)

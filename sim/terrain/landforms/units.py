@@ -31,6 +31,7 @@ _FIT_STEPS, _FIT_SIDE = 40, 128
 class SurfaceUnit(Parameters):
     """One kind of ground. Factors are relative to the terrain's own values; a factor of 1 leaves them unchanged."""
 
+    name: Annotated[str, Field(min_length=1, description="what it is")]
     fraction: Annotated[Fraction, Field(description="expected fraction of the terrain's area")]
     tone: Annotated[float, bounded_field(-1.0, 1.0, "logarithm of albedo over the terrain's mean")] = 0.0
     roughness: Annotated[NonNegative, Field(description="factor of fine relief")] = 1.0
@@ -44,7 +45,7 @@ class SurfaceUnits(Parameters):
     The areas vary from terrain to terrain by a Dirichlet distribution around the expected fractions.
     """
 
-    kinds: Annotated[dict[str, SurfaceUnit], Field(min_length=1, description="units by name")]
+    kinds: Annotated[tuple[SurfaceUnit, ...], Field(min_length=1, description="the units")]
     largest_m: Annotated[Positive, Field(description="size of the largest patches, m")] = 500.0
     smallest_m: Annotated[Positive, Field(description="size of the smallest patches, m")] = 10.0
     boundary: Annotated[Positive, Field(description="softness of boundaries, standard deviations of the field")] = 0.15
@@ -69,7 +70,7 @@ class SurfaceUnits(Parameters):
         self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], rng: Generator
     ) -> Float32[np.ndarray, "cover cover 3"]:
         """Add the units' tones, the tracks of dust devils and the craters' wind tails; return the cover."""
-        kinds = list(self.kinds.values())
+        kinds = self.kinds
         expected = np.array([kind.fraction for kind in kinds])
         areas = rng.dirichlet(self.concentration * expected / expected.sum())
         side = ground.side // COVER_STEP

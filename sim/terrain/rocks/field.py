@@ -24,6 +24,8 @@ from marsyard.sim.terrain.surface import ROCKS, Surface
 MAX_ROCKS = 2_000_000  #: Largest number of rocks on one terrain; more are an error of the configuration.
 CELL_OVER_DIAMETER = 3.0  #: Side of the cells in which placement searches for neighbours, over the mean diameter.
 MAX_TRIES = 20000  #: Random positions tried for a rock; even at k = 0.4 a handful suffices.
+#: Arrays of a `RockField` with one row per rock.
+ROCK_ARRAYS = ("shape", "position_m", "diameter_m", "height_m", "yaw_rad", "up", "albedo")
 Positions = Float64[np.ndarray, "found 3"]
 Sizes = Float64[np.ndarray, "rocks"]
 Numbers = Int64[np.ndarray, "found"]
@@ -44,6 +46,26 @@ class PlacedRock(Parameters):
     yaw_deg: Annotated[float | None, Field(description="turn about its vertical, deg; drawn where not given")] = None
 
 
+class RockForms(Parameters):
+    """Relative numbers of rocks of each form."""
+
+    block: NonNegative = 0.0
+    clinker: NonNegative = 0.0
+    vesicular: NonNegative = 0.0
+    slab: NonNegative = 0.0
+    ventifact: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _check_sum(self) -> RockForms:
+        if sum(self.weights()) == 0.0:
+            raise ValueError("all forms have the number 0; at least one must be above 0")
+        return self
+
+    def weights(self) -> tuple[float, ...]:
+        """The numbers, in the order of `marsyard.sim.terrain.rocks.shapes.FORMS`."""
+        return self.block, self.clinker, self.vesicular, self.slab, self.ventifact
+
+
 class RockParameters(Parameters):
     """Rocks of a terrain: the size-frequency distribution of Golombek & Rapp (1997), and rocks at stated positions.
 
@@ -58,7 +80,7 @@ class RockParameters(Parameters):
     height_ratio: Annotated[float, Field(gt=0.0, le=1.0, description="mean height/diameter (Golombek & Rapp)")] = 0.5
     height_spread: Annotated[float, Field(ge=0.0, lt=1.0, description="half width of its uniform spread over it")] = 0.3
     form: Annotated[Form, Field(description="form of all rocks, unless `forms` mixes several")] = "block"
-    forms: dict[Form, NonNegative] = Field(default_factory=dict, description="relative numbers of rocks of each form")
+    forms: Annotated[RockForms | None, Field(description="a mixture of forms instead")] = None
     albedo_spread: Annotated[NonNegative, Field(description="standard deviation of the logarithm of rocks' albedo")] = (
         0.0
     )
@@ -169,10 +191,9 @@ class RockField:
             placed_yaw.append(turn if rock.yaw_deg is None else float(np.radians(rock.yaw_deg)))
         diameter = np.concatenate([[rock.diameter_m for rock in placed], drawn])
         kinds = first + appearance.integers(0, SHAPES_OF_FORM, drawn.size)
-        if parameters.forms:
-            weights = np.array(list(parameters.forms.values()))
-            numbers = np.array([list(shapes.FORMS).index(name) for name in parameters.forms])
-            mixed = substream(rng, "rock forms").choice(numbers, drawn.size, p=weights / weights.sum())
+        if parameters.forms is not None:
+            weights = np.array(parameters.forms.weights())
+            mixed = substream(rng, "rock forms").choice(weights.size, drawn.size, p=weights / weights.sum())
             kinds = mixed * SHAPES_OF_FORM + kinds % SHAPES_OF_FORM
             ratio *= np.array([form.flatness for form in shapes.FORMS.values()])[mixed]
         height = np.concatenate([[rock.height_m or 0.5 * rock.diameter_m for rock in placed], ratio * drawn])

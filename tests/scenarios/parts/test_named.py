@@ -98,7 +98,7 @@ def test_options_have_defaults_and_can_be_dispersed() -> None:
 
 def test_part_is_found_by_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        named, "installed", lambda group: {"glider": "custom_parts:Glider"} if group in DYNAMICS.group else {}
+        named, "list_installed", lambda group: {"glider": "custom_parts:Glider"} if group in DYNAMICS.group else {}
     )
     assert type(DYNAMICS.create("glider", {})).__name__ == "Glider"
     with pytest.raises(ValueError, match=r"unknown motion 'glidr' \(did you mean 'glider'\?\)"):

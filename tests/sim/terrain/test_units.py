@@ -13,13 +13,15 @@ from marsyard.sim.terrain.landforms.ground import Ground, Spectrum
 from marsyard.sim.terrain.landforms.kernels import stamp_cover, stamp_craters, stamp_streaks
 from marsyard.sim.terrain.landforms.relief import draw_craters
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
+from marsyard.sim.terrain.rocks.field import RockForms
 from marsyard.sim.terrain.surface import ROCKS, ROUGHNESS, TEXTURE
 
-KINDS = {
-    "plain": {"fraction": 0.5},
-    "dust": {"fraction": 0.3, "tone": 0.2, "roughness": 0.3, "texture": 0.2, "rocks": 0.1},
-    "rubble": {"fraction": 0.2, "tone": -0.2, "roughness": 2.0, "texture": 1.5, "rocks": 3.0},
-}
+KINDS: list[dict[str, Any]] = [
+    {"name": "plain", "fraction": 0.5},
+    {"name": "dust", "fraction": 0.3, "tone": 0.2, "roughness": 0.3, "texture": 0.2, "rocks": 0.1},
+    {"name": "rubble", "fraction": 0.2, "tone": -0.2, "roughness": 2.0, "texture": 1.5, "rocks": 3.0},
+]
+PLAIN = [{"name": "plain", "fraction": 1.0}]
 NO_CRATERS = np.empty((0, 16))
 
 
@@ -40,7 +42,7 @@ def _make_parameters(**changes: Any) -> TerrainParameters:
 def test_areas_factors_and_tones_are_as_stated() -> None:
     """With sharp boundaries and fixed areas, each unit has its area, its factors and its albedo."""
     ground, cover = _apply(_make_units(concentration=1e6))
-    for kind in KINDS.values():
+    for kind in KINDS:
         inside = np.isclose(cover[..., TEXTURE], kind.get("texture", 1.0), rtol=0.05)
         assert inside.mean() == pytest.approx(kind["fraction"], abs=0.05)
         assert np.median(cover[inside, ROUGHNESS]) == pytest.approx(kind.get("roughness", 1.0), rel=0.05)
@@ -129,7 +131,7 @@ def test_wind_tails_lie_downwind_of_their_craters() -> None:
 
 
 def test_dust_devil_tracks_are_darker() -> None:
-    ground, _ = _apply(_make_units(kinds={"plain": {"fraction": 1.0}}, tracks_per_km2=20.0, track_tone=-0.12))
+    ground, _ = _apply(_make_units(kinds=PLAIN, tracks_per_km2=20.0, track_tone=-0.12))
     assert -0.3 < ground.tone.min() < -0.08
     assert ground.tone.max() < 1e-6
     assert 0.02 < np.mean(ground.tone < -0.02) < 0.9
@@ -151,7 +153,7 @@ def test_rocks_follow_their_density_and_keep_the_abundance() -> None:
 
 def test_forms_are_mixed_as_stated_and_albedo_keeps_its_mean() -> None:
     surface = synthesise(_make_parameters(samples=128, spacing_m=0.5), np.random.default_rng(4))
-    parameters = RockParameters(abundance=0.1, smallest_m=0.05, forms={"block": 3.0, "slab": 1.0}, albedo_spread=0.3)
+    parameters = RockParameters(abundance=0.1, smallest_m=0.05, forms=RockForms(block=3.0, slab=1.0), albedo_spread=0.3)
     rocks = RockField.on(surface, parameters, np.random.default_rng(2))
     slab = rocks.shape // 16 == 3
     assert set(np.unique(rocks.shape // 16)) == {0, 3}
@@ -163,7 +165,7 @@ def test_forms_are_mixed_as_stated_and_albedo_keeps_its_mean() -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"kinds": {}}, {"elongation": 0.5}, {"kinds": {"plain": {"fraction": 2.0}}}, {"boundary": 0.0}]
+    "changes", [{"kinds": []}, {"elongation": 0.5}, {"kinds": [{"name": "plain", "fraction": 2.0}]}, {"boundary": 0.0}]
 )
 def test_invalid_units_are_rejected(changes: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
