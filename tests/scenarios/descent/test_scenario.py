@@ -197,6 +197,7 @@ def test_velocity_over_a_site_is_accurate() -> None:
 def test_descent_over_imported_terrain(tmp_path: Path) -> None:
     """A terrain model from a file in the surround of a site appears in the images."""
     heights = 30.0 * np.sin(np.arange(200) / 9.0)[:, None] * np.cos(np.arange(200) / 7.0)
+    heights += np.random.default_rng(1).normal(0.0, 1.5, heights.shape)
     np.savez(tmp_path / "dtm.npz", dem=heights, dem_gsd=8.0)
     middle = {"location": {"bank": 1, "east_m": 1536.0, "north_m": 1536.0}}
     source = {"source": {"dtm": str(tmp_path / "dtm.npz")}}
