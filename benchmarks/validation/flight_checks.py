@@ -1,0 +1,70 @@
+"""Checks of the world against flight: statistics of rendered pictures next to those of pictures from Mars.
+
+The bounds are those of Spirit's descent pictures (public copies, 843 pixels), HiRISE orthoimages, and both rovers' mast
+pictures. Terrains whose figures are fitted to them are no predictions (`sim/terrain/sites.toml` says which).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from benchmarks.validation.image_statistics import ImageStatistics, image_statistics
+from benchmarks.validation.records import Check, Measure
+from marsyard.cli.pictures import Shot, take
+
+#: Altitudes of two of Spirit's descent pictures, metres.
+ALTITUDES_M = (1433.0, 1983.0)
+#: Azimuths and elevation of mast pictures, degrees: like the flown ones, without the horizon.
+AZIMUTHS_DEG, ELEVATION_DEG = (0.0, 90.0, 180.0, 270.0), -35.0
+
+
+def _measure(site: str, camera: str, **settings: float | int) -> ImageStatistics:
+    image = take(Shot.usual(site, camera, **settings), both=False)[0]
+    return image_statistics(image.sixteen_bit().astype(np.float64))
+
+
+def run_descent(quick: bool) -> Iterator[Measure]:
+    """Compare descent pictures over Gusev and Meridiani with Spirit's."""
+    for site in ("gusev", "meridiani"):
+        seeds = range(1, 4 if quick else 21)
+        rows = [
+            _measure(site, "mer-descent-flown", altitude_m=altitude, seed=seed)
+            for seed in seeds
+            for altitude in ALTITUDES_M
+        ]
+        middle = ImageStatistics(*np.median(rows, axis=0))
+        spread = np.diff(np.percentile([row.patchiness for row in rows], [10.0, 90.0]))
+        how, name = f"median of {len(rows)} pictures of {len(seeds)} terrains", f"descent over {site}"
+        yield Measure(f"patchiness, {name}", middle.patchiness, "", 2.6, f"{how}; Spirit: 2.83 to 3.00", "at least")
+        yield Measure(f"patchiness, {name}, upper bound", middle.patchiness, "", 3.3, f"{how}; HiRISE: 2.67 to 3.31")
+        yield Measure(f"10 to 90 % range of patchiness, {name}", float(spread[0]), "", 0.5, how, "at least")
+        yield Measure(f"slope of the spectrum, {name}", middle.slope, "", -2.0, f"{how}; Spirit: -2.24 to -2.94")
+        claim = f"slope of the spectrum, {name}, lower bound"
+        yield Measure(claim, middle.slope, "", -2.9, how, "at least")
+        claim = f"contrast of the smoothest tenth, {name}"
+        yield Measure(claim, middle.local_p10, "", 0.042, f"{how}; Spirit: 0.036 to 0.038")
+        yield Measure(f"corners over centre, {name}", middle.corner, "", None, f"{how}; cos^4 of the lens, see docs")
+
+
+def run_mast(quick: bool) -> Iterator[Measure]:
+    """Compare mast pictures with those of both rovers."""
+    for site, flown in (("gusev", "Spirit: 0.061 to 0.065"), ("meridiani", "Opportunity: 0.046 to 0.055")):
+        seeds = range(1, 2 if quick else 6)
+        rows = [
+            _measure(site, "mer-navcam", azimuth_deg=azimuth, elevation_deg=ELEVATION_DEG, seed=seed)
+            for seed in seeds
+            for azimuth in AZIMUTHS_DEG
+        ]
+        contrast = float(np.median([row.local_p50 for row in rows]))
+        how = f"median of {len(rows)} pictures of {len(seeds)} terrains; {flown}"
+        claim = f"contrast of blocks of mast pictures, {site}"
+        yield Measure(claim, contrast, "", 0.045, how, "at least")
+        yield Measure(f"{claim}, upper bound", contrast, "", 0.075, how)
+
+
+CHECKS = (
+    Check("flight", "The world against pictures from Mars: descents", run_descent),
+    Check("flight-mast", "The world against pictures from Mars: masts", run_mast),
+)

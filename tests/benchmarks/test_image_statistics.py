@@ -1,0 +1,38 @@
+"""Statistics of pictures: known spectra, contrasts and fall-offs are measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.validation.image_statistics import SIDE, image_statistics, spectral_slope
+
+
+@pytest.mark.parametrize("exponent", [-1.5, -2.5])
+def test_slope_of_a_power_law_is_measured(exponent: float) -> None:
+    rng = np.random.default_rng(2)
+    k = np.hypot(*np.meshgrid(np.fft.fftfreq(4 * SIDE), np.fft.fftfreq(4 * SIDE)))
+    k[0, 0] = 1.0
+    modes = np.fft.fft2(rng.standard_normal(k.shape)) * k ** (0.5 * exponent)
+    field = np.fft.ifft2(modes).real[:SIDE, :SIDE]
+    assert spectral_slope(100.0 + field / field.std()) == pytest.approx(exponent, abs=0.15)
+
+
+def test_patchiness_is_the_ratio_of_contrasts() -> None:
+    """Noise of 10 % on one half and of 2 % on the other."""
+    rng = np.random.default_rng(3)
+    sd = np.where(np.arange(SIDE) < SIDE // 2, 0.1, 0.02)
+    found = image_statistics(1000.0 * (1.0 + sd * rng.standard_normal((SIDE, SIDE))))
+    assert found.local_p10 == pytest.approx(0.02, rel=0.1)
+    assert found.local_p90 == pytest.approx(0.1, rel=0.1)
+    assert found.patchiness == pytest.approx(found.local_p90 / found.local_p10)
+
+
+def test_corners_are_compared_with_the_centre() -> None:
+    """A linear fall-off, in a wide picture whose central square counts."""
+    offset = np.arange(512) - 255.5
+    radius = np.hypot(offset[:, None], offset) / np.hypot(255.5, 255.5)
+    picture = np.pad(1.0 - 0.4 * radius, ((0, 0), (100, 100)))
+    found = image_statistics(picture)
+    assert found.corner == pytest.approx((1.0 - 0.4 * 0.93) / (1.0 - 0.4 * 0.165), abs=0.01)
+    assert 0.0 < found.rms < 0.2
