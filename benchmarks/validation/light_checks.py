@@ -68,7 +68,7 @@ def _peak(radiance: np.ndarray) -> np.ndarray:
     return np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
 
 
-def _uniform(view: View, sun: Sun) -> View:
+def make_uniform(view: View, sun: Sun) -> View:
     """The view with another sun, uniform albedo and Lambert's law."""
     samples = view.scene.surface.levels[0].copy()
     samples[..., 1] = FLAT_ALBEDO
@@ -87,7 +87,7 @@ def _uniform(view: View, sun: Sun) -> View:
 
 
 def _shadow_row(name: str, view: View, sun: Sun, count: int, farthest: float, step: float) -> Measure:
-    view = _uniform(view, sun)
+    view = make_uniform(view, sun)
     frame = render(renderer(), view)
     points = frame.points_world().reshape(-1, 3)
     seen = np.flatnonzero(frame.range_m.ravel() < farthest)

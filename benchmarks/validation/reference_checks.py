@@ -1,0 +1,131 @@
+"""Check of rendering against an independent renderer: Mitsuba 3, with the same camera rays, sun and Lambertian ground.
+
+Needs the extra `validate`. Mitsuba gets the ground as a mesh of the spline surface, finer than its samples, with
+interpolated normals, and the objects' triangles. Every pixel's ray is the same in both.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Float64
+from scipy import ndimage
+
+from benchmarks.validation.light_checks import FLAT_ALBEDO, make_uniform
+from benchmarks.validation.motion import View, render
+from benchmarks.validation.records import Check, Measure
+from benchmarks.validation.scenes import descent_view, renderer
+from marsyard.sim.frames import direction
+from marsyard.sim.render import Frame, Sun
+from marsyard.sim.terrain import Surface
+
+#: Relative difference of radiance that counts as equal.
+EQUAL = 0.01
+#: Pixels about a shadow's edge that are left out of the comparison of radiance.
+EDGE_PX = 1
+#: Samples of the terrain per vertex of the mesh.
+FINER = 5
+
+
+def ground_mesh(
+    surface: Surface, low: Float64[np.ndarray, "2"], high: Float64[np.ndarray, "2"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, their normals, and triangles of a rectangle of the surface."""
+    step = surface.spacing_m / FINER
+    x, y = (np.arange(low[axis], high[axis], step) for axis in (0, 1))
+    east, north = (grid.ravel() for grid in np.meshgrid(x, y))
+    vertices = np.column_stack([east, north, surface.height(east, north)])
+    normals = np.column_stack([-surface.gradient(east, north, 0), np.ones(east.size)])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    corner = (np.arange(len(y) - 1)[:, None] * len(x) + np.arange(len(x) - 1)).ravel()
+    right, above = corner + 1, corner + len(x)
+    faces = np.concatenate([np.column_stack([corner, right, above]), np.column_stack([right, above + 1, above])])
+    return vertices, normals, faces
+
+
+def _load_mesh(mi: Any, path: Path, vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> Any:
+    """Mesh with interpolated normals, by way of a file: Mitsuba then needs no LLVM newer than Debian's."""
+    mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False, validate=False)
+    path.write_bytes(trimesh.exchange.ply.export_ply(mesh, vertex_normal=True))
+    reflectance = {"type": "uniform", "value": FLAT_ALBEDO}
+    bsdf = {"type": "twosided", "nested": {"type": "diffuse", "reflectance": reflectance}}
+    return mi.load_dict({"type": "ply", "filename": str(path), "bsdf": bsdf})
+
+
+def render_reference(
+    view: View, frame: Frame
+) -> tuple[Float[np.ndarray, "rows columns"], Bool[np.ndarray, "rows columns"]]:
+    """Radiance factor by Mitsuba along the rays of a frame, and whether the points they meet are in cast shadow."""
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_mono")
+    sun = np.asarray(view.scene.sun.direction, dtype=np.float64)
+    points = frame.points_world().reshape(-1, 3)
+    seen = points[np.isfinite(points).all(axis=1)]
+    # terrain that may shade the points seen lies towards the sun
+    reach = np.ptp(view.scene.surface.levels[0][..., 0]) / sun[2] * sun[:2]
+    low = np.minimum(seen[:, :2].min(axis=0), (seen[:, :2] + np.minimum(reach, 0.0)).min(axis=0)) - 5.0
+    high = np.maximum(seen[:, :2].max(axis=0), (seen[:, :2] + np.maximum(reach, 0.0)).max(axis=0)) + 5.0
+    # single precision: coordinates about the middle of what is seen
+    origin = seen.mean(axis=0)
+    vertices, normals, faces = ground_mesh(view.scene.surface, low, high)
+    objects = view.scene.objects
+    corners = objects.triangles.reshape(-1, 3) - origin
+    numbers = np.arange(len(corners)).reshape(-1, 3)
+    with tempfile.TemporaryDirectory() as folder:
+        shapes = {"ground": _load_mesh(mi, Path(folder) / "ground.ply", vertices - origin, normals, faces)}
+        if len(objects):
+            path = Path(folder) / "objects.ply"
+            shapes["objects"] = _load_mesh(mi, path, corners, objects.normals.reshape(-1, 3), numbers)
+    light = {"type": "directional", "direction": list(-sun), "irradiance": {"type": "uniform", "value": np.pi}}
+    scene = mi.load_dict({"type": "scene", "light": light, **shapes})
+    pose, rays = frame.world_from_body, frame.rays
+    starts = pose.apply(rays.centre + rays.origins.reshape(-1, 3)) - origin
+    towards = pose.rotation.apply(rays.directions.reshape(-1, 3).astype(np.float64))
+    ray = mi.Ray3f(mi.Point3f(*starts.T.astype(np.float32)), mi.Vector3f(*towards.T.astype(np.float32)))
+    sampler = mi.load_dict({"type": "independent", "sample_count": 1})
+    sampler.seed(1, len(starts))
+    integrator = mi.load_dict({"type": "direct", "emitter_samples": 1, "bsdf_samples": 0, "hide_emitters": True})
+    radiance = np.asarray(integrator.sample(scene, sampler, mi.RayDifferential3f(ray))[0]).reshape(-1)
+    hit = scene.ray_intersect(ray)
+    shadow = scene.ray_test(hit.spawn_ray(mi.Vector3f(sun.tolist())))
+    return radiance.reshape(frame.radiance.shape), np.asarray(shadow).reshape(frame.radiance.shape)
+
+
+def _compare(name: str, view: View, sun: Sun) -> Iterator[Measure]:
+    view = make_uniform(view, sun)
+    frame = render(renderer(), view)
+    reference, in_shadow = render_reference(view, frame)
+    facing = frame.normal @ np.asarray(sun.direction) > 0.0
+    lit = frame.radiance > 0.0
+    reference_lit = reference > 0.0
+    edge = ndimage.binary_dilation(
+        ndimage.maximum_filter(reference_lit, 3) != ndimage.minimum_filter(reference_lit, 3), iterations=EDGE_PX
+    )
+    difference = np.abs(frame.radiance - reference)
+    equal = difference <= EQUAL * np.maximum(reference, 0.02 * FLAT_ALBEDO)
+    how = (
+        f"{equal.size:,} pixels, {np.mean(edge):.1%} at a shadow's edge, "
+        f"{np.mean(in_shadow & facing):.1%} in cast shadow; median difference "
+        f"{np.median(difference[~edge] / np.maximum(reference[~edge], 1e-3)):.2%}"
+    )
+    claim = f"radiance within 1 % of Mitsuba's: {name}"
+    yield Measure(claim, float(np.mean(equal[~edge])), "", 0.995, how, "at least")
+    yield Measure(f"shadows as Mitsuba's: {name}", float(np.mean(lit == reference_lit)), "", 0.995, how, "at least")
+
+
+def run_reference(quick: bool) -> Iterator[Measure]:
+    """Compare descent pictures pixel by pixel."""
+    size = (256, 256) if quick else (512, 512)
+    for site, height_m, elevation_deg in (("gusev", 300.0, 35.0), ("pisgah", 300.0, 20.0), ("pisgah", 300.0, 10.0)):
+        sun = Sun(direction(np.radians(110.0), np.radians(elevation_deg)))
+        name = f"{site} from {height_m:g} m, sun at {elevation_deg:g} deg"
+        yield from _compare(name, descent_view(site, height_m, size), sun)
+
+
+CHECKS = (Check("reference", "An independent renderer: Mitsuba", run_reference),)
