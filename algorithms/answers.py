@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -10,29 +11,33 @@ import numpy as np
 from jaxtyping import Float64
 
 from marsyard.algorithms import interface
-from marsyard.sim.measurements import MastCalibration
+from marsyard.algorithms.interface import VelocityEstimate, VelocityStream
+from marsyard.sim.measurements import DescentMeasurements, MastCalibration
 
 
 class Fault(Enum):
-    """How an algorithm failed to answer at all. None of these is an expected failure: those are in its own outcomes."""
+    """Reason why an algorithm returned no usable answer. Expected failures are outcomes of the algorithm instead."""
 
-    CRASHED = "it raised, or its process ended without an answer"
-    TIMED_OUT = "it took longer than it may"
-    OUT_OF_MEMORY = "it asked for more memory than it may have"
-    TOO_MUCH_OUTPUT = "it wrote more than it may"
-    BAD_ANSWER = "its answer is not of the form that the interface states"
+    CRASHED = "it raised an exception, or its process ended without an answer"
+    TIMED_OUT = "it exceeded the time limit"
+    OUT_OF_MEMORY = "it exceeded the memory limit"
+    TOO_MUCH_OUTPUT = "it exceeded the output limit"
+    BAD_ANSWER = "its answer does not have the form that the interface defines"
 
 
 def describe_error(error: BaseException | None) -> str:
-    """Type and message of an error; the type alone if the message cannot be formatted."""
+    """Return the type and message of an error; the type alone if the message cannot be formatted."""
     try:
         return f"{type(error).__name__}: {error}"
     except Exception:
-        return f"{type(error).__name__}, whose message cannot be had"
+        return f"{type(error).__name__} (its message cannot be formatted)"
 
 
 class AlgorithmError(Exception):
-    """Failure of an algorithm under test to answer; `stderr` is the end of its standard error output, if known."""
+    """Error for an algorithm under test that returned no usable answer.
+
+    `stderr` is the end of its standard error output, if known.
+    """
 
     def __init__(self, fault: Fault, message: str, stderr: str = "") -> None:
         super().__init__(message)
@@ -44,7 +49,7 @@ class AlgorithmError(Exception):
 
 
 def bad_answer(message: str) -> AlgorithmError:
-    """The error for an answer of the wrong form."""
+    """Return the error for an answer of the wrong form."""
     return AlgorithmError(Fault.BAD_ANSWER, message)
 
 
@@ -52,18 +57,18 @@ def bad_answer(message: str) -> AlgorithmError:
 _ROUNDING = 1e-9
 
 
-def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> interface.VelocityEstimate:
-    """A copy of a valid `VelocityEstimate` in plain float64 arrays and Python numbers.
+def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> VelocityEstimate:
+    """Validate a `VelocityEstimate`; return a copy with plain float64 arrays and Python numbers.
 
-    `tags_s` are the time tags of the images, between which the span must lie; None if unknown. Raises AlgorithmError
-    (BAD_ANSWER) that names the fault.
+    `tags_s` are the time tags of the images; the span must lie between the first and the last. None if unknown. Raises
+    AlgorithmError (BAD_ANSWER) with the reason.
     """
-    _check_type("the answer", answer, interface.VelocityEstimate)
+    _check_type("the answer", answer, VelocityEstimate)
     _check_type("outcome", answer.outcome, interface.VelocityOutcome)
     if (answer.outcome is interface.VelocityOutcome.VALID) != (answer.velocity_m_s is not None):
-        count = "none" if answer.velocity_m_s is None else "one"
-        fault = f"but of velocity_m_s {count} is given; allowed: one with VALID alone"
-        raise bad_answer(f"outcome is {answer.outcome.name}, {fault}")
+        problem = "is missing" if answer.velocity_m_s is None else "is given"
+        allowed = "a velocity if and only if the outcome is VALID"
+        raise bad_answer(f"outcome is {answer.outcome.name}, but velocity_m_s {problem}; allowed: {allowed}")
     velocity = _check_numbers("velocity_m_s", answer.velocity_m_s, (2,))
     if answer.covariance_m2_s2 is not None and velocity is None:
         raise bad_answer("covariance_m2_s2 is given without a velocity")
@@ -74,37 +79,34 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> interf
             raise bad_answer(f"covariance_m2_s2 is not symmetric: {covariance.tolist()}")
         if scale == 0.0 or float(np.linalg.eigvalsh(covariance)[0]) <= 0.0:
             raise bad_answer(f"covariance_m2_s2 is not positive definite: {covariance.tolist()}")
-    span, answered = None, answer.span_s
-    if answered is not None:
-        if (
-            not isinstance(answered, tuple)
-            or len(answered) != 2
-            or not all(isinstance(n, float | int) for n in answered)
-        ):
-            raise bad_answer(f"span_s is {answered!r}; allowed: a tuple of two time tags, or None")
-        span = (float(answered[0]), float(answered[1]))
+    span, limits = None, answer.span_s
+    if limits is not None:
+        if not isinstance(limits, tuple) or len(limits) != 2 or not all(isinstance(n, float | int) for n in limits):
+            raise bad_answer(f"span_s is {limits!r}; allowed: a tuple of two time tags, or None")
+        span = (float(limits[0]), float(limits[1]))
         if not (np.all(np.isfinite(span)) and span[0] <= span[1]):
             raise bad_answer(f"span_s is {span}; allowed: two finite time tags, the first not after the second")
         if tags_s and not tags_s[0] <= span[0] <= span[1] <= tags_s[-1]:
-            raise bad_answer(f"span_s is {span}; allowed: within the pictures' tags, {tags_s[0]} to {tags_s[-1]} s")
+            allowed = f"within the images' time tags, {tags_s[0]} to {tags_s[-1]} s"
+            raise bad_answer(f"span_s is {span}; allowed: {allowed}")
     elif tags_s is not None and len(tags_s) < 2 and velocity is not None:
-        raise bad_answer("of one picture there is no last interval; allowed: a velocity with a span_s, or a failure")
-    return interface.VelocityEstimate(answer.outcome, velocity, answer.details, covariance, span, answer.after_pictures)
+        raise bad_answer("one image has no last interval; allowed: a velocity with a span_s, or a failure outcome")
+    return VelocityEstimate(answer.outcome, velocity, answer.details, covariance, span, answer.after_pictures)
 
 
 def check_site(answer: Any) -> interface.SiteEstimate:
-    """A copy of a valid `SiteEstimate` in plain arrays; raises as `check_velocity`."""
+    """Validate a `SiteEstimate`; return a copy with plain arrays. Raises as `check_velocity`."""
     _check_type("the answer", answer, interface.SiteEstimate)
     _check_type("outcome", answer.outcome, interface.SiteOutcome)
     if (answer.outcome is interface.SiteOutcome.NO_SAFE_SITE) != (answer.site_world is None):
-        answered = "none" if answer.site_world is None else "one"
-        fault = f"but site_world: {answered} is given; allowed: none with NO_SAFE_SITE only"
-        raise bad_answer(f"outcome is {answer.outcome.name}, {fault}")
+        problem = "is missing" if answer.site_world is None else "is given"
+        allowed = "None if and only if the outcome is NO_SAFE_SITE"
+        raise bad_answer(f"outcome is {answer.outcome.name}, but site_world {problem}; allowed: {allowed}")
     return interface.SiteEstimate(answer.outcome, _check_numbers("site_world", answer.site_world, (3,)), answer.details)
 
 
 def check_update(answer: Any) -> interface.TargetUpdate:
-    """A copy of a valid `TargetUpdate` in plain arrays; raises as `check_velocity`."""
+    """Validate a `TargetUpdate`; return a copy with plain arrays. Raises as `check_velocity`."""
     _check_type("the answer", answer, interface.TargetUpdate)
     _check_type("state", answer.state, interface.TrackingState)
     position = _check_numbers("position_rover", answer.position_rover, (3,))
@@ -114,7 +116,7 @@ def check_update(answer: Any) -> interface.TargetUpdate:
 
 
 def check_aim(answer: Any, mast: MastCalibration) -> interface.MastAim | None:
-    """A copy of a valid `MastAim` for this mast, or None; raises as `check_velocity`."""
+    """Validate a `MastAim` for this mast, or None; return a copy. Raises as `check_velocity`."""
     if answer is None:
         return None
     if not isinstance(answer, interface.MastAim):
@@ -127,16 +129,16 @@ def check_aim(answer: Any, mast: MastCalibration) -> interface.MastAim | None:
         box = getattr(answer, name)
         if not isinstance(box, interface.PixelBox):
             raise bad_answer(f"{name} is a {_type_name(box)}; allowed: a PixelBox")
-        for corner, extent, whole in zip(box.corner, box.size, camera.size, strict=True):
-            whole_numbers = all(isinstance(n, int | np.integer) for n in (corner, extent))
-            if not whole_numbers or corner < 0 or extent < 1 or corner + extent > whole:
-                allowed = f"a part of the frame of {camera.size} pixels"
-                raise bad_answer(f"{name} is {box.corner} and {box.size}; allowed: {allowed}")
+        for corner, extent, frame_extent in zip(box.corner, box.size, camera.size, strict=True):
+            are_integers = all(isinstance(n, int | np.integer) for n in (corner, extent))
+            if not are_integers or corner < 0 or extent < 1 or corner + extent > frame_extent:
+                allowed = f"whole pixels inside the frame of {camera.size} pixels"
+                raise bad_answer(f"{name} has corner {box.corner} and size {box.size}; allowed: {allowed}")
     return interface.MastAim(float(answer.azimuth_rad), float(answer.elevation_rad), answer.left, answer.right)
 
 
 def _check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."] | None:
-    """A plain copy of an array of finite floats of this shape, never a subclass of ndarray; None stays None."""
+    """Validate an array of finite floats of this shape; return a plain ndarray copy. None stays None."""
     if value is None:
         return None
     if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
@@ -157,3 +159,39 @@ def _check_type(name: str, value: Any, kind: type) -> None:
 
 def _type_name(value: object) -> str:
     return type(value).__name__
+
+
+#: Methods of a stream, in calling order.
+STREAM_METHODS = ("start", "picture", "finish")
+
+
+@dataclass(frozen=True)
+class StreamedEstimator:
+    """`VelocityEstimator` that passes any number of images one by one to a stream."""
+
+    stream: VelocityStream
+
+    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
+        """Return the final estimate with the intermediate estimates; raises AlgorithmError for an invalid answer."""
+        tags = measurements.tags_s
+        self.stream.start()
+        earlier: list[VelocityEstimate | None] = []
+        for number, frame in enumerate(measurements.frames(), start=1):
+            answer = self.stream.picture(frame)
+            earlier.append(None if answer is None else _check_answer(answer, tags[:number]))
+        final = _check_answer(self.stream.finish(), tags)
+        return replace(final, after_pictures=tuple(earlier))
+
+
+def check_and_set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
+    """Validate an estimate; a missing time span becomes the last image interval. Raises as `check_velocity`."""
+    estimate = check_velocity(answer, tags_s)
+    if estimate.span_s is not None or len(tags_s) < 2:
+        return estimate
+    return replace(estimate, span_s=(tags_s[-2], tags_s[-1]))
+
+
+def _check_answer(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
+    if isinstance(answer, VelocityEstimate) and answer.after_pictures:
+        raise bad_answer("after_pictures is given; it must be empty: the caller sets it")
+    return check_and_set_span(answer, tags_s)

@@ -1,4 +1,4 @@
-"""The protocols that algorithms under test implement, and the answers they give."""
+"""Protocols that algorithms under test implement, and the types of their answers."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from marsyard.sim.measurements import (
 
 
 class VelocityOutcome(Enum):
-    """How a velocity estimation ended. Every member but VALID is an expected failure: no velocity is reported."""
+    """Result of a velocity estimation. All members except VALID are expected failures: no velocity is reported."""
 
     VALID = "a velocity is reported"
-    NO_TEMPLATE_AREA = "no place in an image pair has room for a template and its search window"
+    NO_TEMPLATE_AREA = "an image pair has no feasible overlap for a template and its search window"
     NO_VALID_TRACK = "in an image pair no template passed the validity checks"
     IMU_MISMATCH = "no combination of tracks agrees with the change of velocity measured by the IMU"
 
@@ -36,12 +36,12 @@ class VelocityEstimate:
     - outcome: Result of the estimation
     - velocity_m_s: Mean horizontal velocity of the camera (east, north) over `span_s`; None unless the outcome is VALID
     - details: Intermediate products for figures and diagnosis, or None
-    - covariance_m2_s2: Covariance of the velocity error (east, north) by the algorithm, or None. Errors are then tested
-      against it as well.
-    - span_s: Begin and end of the averaging interval, as time tags within those of the images; equal ones mean the
+    - covariance_m2_s2: Covariance of the velocity error (east, north) estimated by the algorithm, or None. If given,
+      errors are tested against it as well.
+    - span_s: Start and end of the averaging interval, within the time tags of the images. Equal values mean the
       velocity at that instant. None: the last interval, from the second to the third of three images.
-    - after_pictures: Answers of a stream (`VelocityStream`) after each image, None for no answer; filled in by the
-      caller. Empty for other estimators.
+    - after_pictures: Answers of a stream (`VelocityStream`) after each image, None for no answer; set by the caller.
+      Empty for other estimators.
     """
 
     outcome: VelocityOutcome
@@ -56,14 +56,14 @@ class VelocityEstimator(Protocol):
     """Estimates horizontal velocity from three descent images and their measurements."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """The estimate; never raises for a picture, attitude or altitude that an instrument can deliver."""
+        """Estimate the velocity; never raises for an image, attitude or altitude that an instrument can deliver."""
 
 
 @runtime_checkable
 class VelocityStream(Protocol):
-    """Estimates horizontal velocity from any number of descent images, given one by one.
+    """Estimates horizontal velocity from any number of descent images, received one by one.
 
-    `marsyard.algorithms.streams.StreamedEstimator` makes it a `VelocityEstimator`.
+    `marsyard.algorithms.answers.StreamedEstimator` converts it to a `VelocityEstimator`.
     """
 
     def start(self) -> None:
@@ -73,32 +73,32 @@ class VelocityStream(Protocol):
         """Process the next image; return an estimate or None. Never raises, as `VelocityEstimator.estimate`."""
 
     def finish(self) -> VelocityEstimate:
-        """The final answer for the descent; a failure outcome if there were too few images."""
+        """Return the final estimate of the descent; a failure outcome if there were too few images."""
 
 
 class TrackingState(Enum):
     """State of a target tracker (tracking paper, Fig. 6)."""
 
     NO_TARGET = "no target is designated, or it was cleared"
-    NORMAL = "a target is designated and, since it was first seen, tracked"
-    LOST = "the target is lost and may yet be found again"
-    FAILURE = "the target stayed lost; only clearing it ends this"
+    NORMAL = "a target is designated and, after its first match, tracked"
+    LOST = "the target is lost and can be recovered"
+    FAILURE = "the target was not recovered; it must be cleared"
 
 
 class TargetLoss(Enum):
     """Reason for the loss of the target in an update. Each is an expected failure."""
 
-    LOW_MATCH_SCORE = "the template matches nowhere well enough"
-    LOW_STEREO_SCORE = "the target is not found in the right picture"
+    LOW_MATCH_SCORE = "the match score of the template is too low"
+    LOW_STEREO_SCORE = "the stereo match score in the right image is too low"
     DISTANCE_JUMP = "the target's distance changed by more than pose and stereo errors explain"
-    POSITION_JUMP = "the target has moved too far from where it was first seen"
-    OUT_OF_VIEW = "the place where the target should be is not in the picture"
-    NO_RANGE = "the two lines of sight do not meet before the cameras"
+    POSITION_JUMP = "the target's position is too far from its first position"
+    OUT_OF_VIEW = "the predicted target position is outside the image"
+    NO_RANGE = "the two lines of sight do not intersect in front of the cameras"
 
 
 @dataclass(frozen=True)
 class PixelBox:
-    """Part of a full frame: its upper left pixel (column, row) and its size (columns, rows)."""
+    """Region of a full frame: upper left pixel (column, row) and size (columns, rows)."""
 
     corner: tuple[int, int]
     size: tuple[int, int]
@@ -106,10 +106,10 @@ class PixelBox:
 
 @dataclass(frozen=True)
 class MastAim:
-    """Requested mast angles and image parts.
+    """Requested mast angles and image regions.
 
     - azimuth_rad, elevation_rad: Mast angles to command (see `marsyard.sim.measurements.MastGeometry`)
-    - left, right: The parts of the full frames to deliver; exposures should be set for them too
+    - left, right: Regions of the full frames to deliver; the exposure should be controlled for these regions
     """
 
     azimuth_rad: float
@@ -122,10 +122,10 @@ class MastAim:
 class TargetUpdate:
     """Result of one tracking update.
 
-    - losses: Reasons of the loss, in the order of `TargetLoss`; empty after a match or without a search (no target,
-      failure)
-    - position_rover: The target in the rover frame of this stop, metres: triangulated, else propagated by the pose
-      estimate; None before the first match.
+    - losses: Reasons of the loss, in the order of `TargetLoss`; empty after a match or without a search (states
+      NO_TARGET and FAILURE)
+    - position_rover: The target in the rover frame of this stop, metres: triangulated, or propagated by the pose
+      estimate after a loss; None before the first match.
     - details: Intermediate products for figures and diagnosis, or None
     """
 
@@ -141,9 +141,9 @@ class TargetUpdate:
 
 
 class TargetTracker(Protocol):
-    """Tracks one designated target from stop to stop of a rover.
+    """Tracks one designated target over the stops of a rover.
 
-    At each stop: `aim`, point the mast, take images, `update`. The first update after `designate` seeds the template.
+    At each stop: `aim`, point the mast, take images, `update`. The first update after `designate` sets the template.
     """
 
     @property
@@ -151,12 +151,12 @@ class TargetTracker(Protocol):
         """State of the tracker."""
 
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
-        """Set the target, with the rover's estimated pose; replaces any other."""
+        """Set the target, with the rover's estimated pose; replaces the previous target."""
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
-        """Mast aim from this pose; None if the mast cannot show the target.
+        """Compute the mast aim from this pose; None if the mast cannot point at the target.
 
-        An update with images taken at other angles then loses the target.
+        An update with images taken at other angles can lose the target.
         """
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
@@ -169,17 +169,17 @@ class TargetTracker(Protocol):
 class SiteOutcome(Enum):
     """Result of the search for a landing site.
 
-    SAFE_SITE reports a site. NO_SAFE_SITE reports none: the ground was mapped and no part of it is safe. With every
-    other member the algorithm did not converge: the a-priori site is reported, untested.
+    SAFE_SITE reports a site. NO_SAFE_SITE reports none: the ground was mapped and no part of it is safe. All other
+    members mean that the algorithm did not converge: the a-priori site is reported without a check.
     """
 
     SAFE_SITE = "a safe site is reported"
     NO_SAFE_SITE = "the mapped ground has no safe site"
     NO_RANGE = "the altimeter gave no range"
-    NO_FEATURES = "the first picture has too few features"
-    NO_TRACKS = "too few features were found again in the second picture"
+    NO_FEATURES = "the first image has too few features"
+    NO_TRACKS = "too few features were tracked to the second image"
     NO_MOTION = "no rigid motion explains the tracks"
-    NO_BASELINE = "the camera has not moved enough for depths"
+    NO_BASELINE = "the camera motion is too small for depth estimation"
     NO_STRUCTURE = "too few points were matched for an elevation map"
 
     @property
@@ -207,4 +207,4 @@ class SiteEstimator(Protocol):
     """Selects a safe landing site from two images and their measurements."""
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
-        """The estimate; never raises for pictures, poses or a range that instruments can deliver."""
+        """Select the site; never raises for images, poses or a range that instruments can deliver."""

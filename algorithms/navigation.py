@@ -1,16 +1,16 @@
-"""Local path planner in the manner of Autonav: arcs to a goal around obstacles, over mapped ground.
+"""Local path planner similar to Autonav: arcs to a goal around obstacles, over mapped ground.
 
-This is flight software: it sees estimated poses and sensed rocks, never the truth. It is not under test but closes the
-loop of the tracking paper's sections 6 and 7 (GESTALT: Maimone, Leger & Biesiadecki 2007), with these properties:
+This is flight software: its inputs are estimated poses and sensed rocks, never the truth. It is not under test. It
+closes the loop of the tracking paper's sections 6 and 7 (GESTALT: Maimone, Leger & Biesiadecki 2007):
 
-- It drives only where wedges of stereo images have mapped the ground. A single navcam wedge, 45 deg wide, is too narrow
-  to pass a near obstacle; two wedges are enough (section 6). The ground right in front of the cameras is not imaged:
-  the first metres after the start of a map are driven without it (section 7.3).
-- Rocks that wheels can climb are no obstacles. A large rock that carries the target is excluded by name (section 6).
+- It drives only over ground that wedges of stereo images have mapped. A single navcam wedge, 45 deg wide, is too narrow
+  to pass a near obstacle; two wedges are enough (section 6). The ground directly in front of the cameras is not imaged:
+  the rover drives the first metres of a map over unmapped ground (section 7.3).
+- Rocks that wheels can climb are not obstacles. A large rock with the target on it is excluded by name (section 6).
 
-Each step searches all paths again: an optional turn in place, an arc, and the arc from its end to the goal. The
-cheapest path that is clear and mapped up to the lookahead distance is followed for one step. The swept area is that of
-a disc: the footprint of a rover of any heading.
+Each step searches all paths again: an optional turn in place, an arc, and a second arc to the goal. The rover follows
+the path of minimum cost that is clear and mapped up to the lookahead distance, for one step. The swept area is that of
+a disc: the footprint of a rover at any heading.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _FOOTPRINT_POINTS = np.concatenate(
 )
 #: Distance below which the goal counts as reached, metres.
 AT_GOAL_M = 0.02
-#: Largest angle between the heading at the start of the last arc and the goal: a wider arc turns back.
-_MAX_ARC_HEADING_RAD = np.radians(75.0)
+#: Largest angle between the heading at the start of the second arc and the goal: a wider arc turns back.
+_MAX_HEADING_RAD = np.radians(75.0)
 #: Initial turns in place, in addition to the turn towards the goal.
 _TURNS_DEG = (0.0, 20.0, -20.0, 40.0, -40.0, 60.0, -60.0, 80.0, -80.0, 100.0, -100.0)
 
@@ -63,10 +63,10 @@ class Wedge:
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A sensed rock: identifying name, centre (east, north) in the estimated world frame, and extent."""
+    """Sensed rock: identifying name, centre (east, north) in the estimated world frame, and size."""
 
     name: str
-    place_m: Float[np.ndarray, "2"]
+    position_m: Float[np.ndarray, "2"]
     radius_m: float
     height_m: float
 
@@ -79,14 +79,14 @@ class TerrainMap:
     obstacles: tuple[Obstacle, ...] = ()
 
     def add_wedge(self, wedge: Wedge, rocks: Iterable[Obstacle]) -> TerrainMap:
-        """The map with a wedge added, and with every rock of which the wedge covers a part; occlusion is neglected.
+        """Return the map with a wedge added, and with every rock that the wedge covers at least in part.
 
-        The latest sighting of a rock replaces earlier ones.
+        Occlusion is neglected. The latest measurement of a rock replaces earlier ones.
         """
-        rims = ((rock, rock.place_m + rock.radius_m * _FOOTPRINT_POINTS) for rock in rocks)
-        newly_seen = {rock.name: rock for rock, rim in rims if wedge.covers(rim).any()}
-        kept = tuple(rock for rock in self.obstacles if rock.name not in newly_seen)
-        return TerrainMap((*self.wedges, wedge), kept + tuple(newly_seen.values()))
+        rims = ((rock, rock.position_m + rock.radius_m * _FOOTPRINT_POINTS) for rock in rocks)
+        visible_rocks = {rock.name: rock for rock, rim in rims if wedge.covers(rim).any()}
+        remaining_rocks = tuple(rock for rock in self.obstacles if rock.name not in visible_rocks)
+        return TerrainMap((*self.wedges, wedge), remaining_rocks + tuple(visible_rocks.values()))
 
     def contains(self, positions_m: Float[np.ndarray, "*batch 2"]) -> Bool[np.ndarray, "*batch"]:
         """Whether positions (east, north) lie in any wedge."""
@@ -98,15 +98,15 @@ class TerrainMap:
 
 @dataclass(frozen=True)
 class NavigationOptions:
-    """Parameters of the planner; all but those of the wheels are assumed.
+    """Parameters of the planner; all except those of the wheels are assumed.
 
-    - half_width_m: Radius of the swept disc: a MER's outer wheels reach 0.69 m to the side
+    - half_width_m: Radius of the swept disc: a MER's outer wheels are 0.69 m from its centre line
     - margin_m: Clearance between disc and obstacle
-    - climb_m: Height of the highest rock that wheels climb (MER: about a wheel's radius)
+    - climb_m: Maximum height of a rock that wheels climb (MER: about a wheel's radius)
     - lookahead_m: Length of the path that must be mapped and clear
     - curvature_m: Largest curvature, 1/m
-    - turn_cost_m: Cost of a radian of turning in place, in metres of path
-    - bend_cost_m2: Cost of the integral of the squared curvature, in metres of path
+    - turn_cost_m: Cost of a turn in place, metres of path per radian
+    - bend_cost_m2: Weight of the integral of the squared curvature in the cost (in metres of path)
     """
 
     half_width_m: float = 0.75
@@ -126,7 +126,7 @@ class NavigationOptions:
 
 
 class NavigationOutcome(Enum):
-    """How a search ended. Every member but PATH and AT_GOAL is an expected failure: nothing is driven."""
+    """Result of a search. All members except PATH and AT_GOAL are expected failures: the rover does not drive."""
 
     PATH = "a path was found"
     AT_GOAL = "the goal is reached"
@@ -139,7 +139,7 @@ class NavigationPlan:
     """The next step to drive.
 
     - commands: One step along the path, in order; empty unless the outcome is PATH
-    - path_m: The whole path (east, north) in the estimated world frame; empty without one
+    - path_m: The complete path (east, north) in the estimated world frame; empty without a path
     """
 
     outcome: NavigationOutcome
@@ -159,31 +159,31 @@ def navigate(
     """Plan the next step to a goal.
 
     - goal_m: Position (east, north) for the rover's origin, in the estimated world frame
-    - step_m: Longest path to drive in this step
-    - target: Name of a rock that is not avoided; None avoids all
-    - backwards: Whether to drive with the rear ahead
+    - step_m: Maximum path length to drive in this step
+    - target: Name of a rock that is not avoided; None: all rocks are avoided
+    - backwards: Whether to drive backwards
     """
     forward = world_from_rover.rotation.as_matrix()[:2, 0] * (-1.0 if backwards else 1.0)
     position, heading = world_from_rover.translation[:2], _rotation_matrix(np.arctan2(forward[1], forward[0]))
     goal = np.asarray((goal_m - position) @ heading)
-    none = np.empty((0, 2))
+    no_path = np.empty((0, 2))
     if float(np.hypot(*goal)) < AT_GOAL_M:
-        return NavigationPlan(NavigationOutcome.AT_GOAL, (), none)
+        return NavigationPlan(NavigationOutcome.AT_GOAL, (), no_path)
     if not bool(terrain.contains(position + options.half_width_m * _FOOTPRINT_POINTS).all()):
-        return NavigationPlan(NavigationOutcome.NOT_MAPPED, (), none)
-    avoided = [rock for rock in terrain.obstacles if rock.name != target and rock.height_m > options.climb_m]
+        return NavigationPlan(NavigationOutcome.NOT_MAPPED, (), no_path)
+    obstacles = [rock for rock in terrain.obstacles if rock.name != target and rock.height_m > options.climb_m]
     for path in _candidates(goal, options):
         lookahead = position + path.points(np.arange(0.0, min(path.length_m, options.lookahead_m), 0.1)) @ heading.T
-        disc = lookahead[:, None] + options.half_width_m * _FOOTPRINT_POINTS
-        if _is_clear(lookahead, avoided, options) and bool(terrain.contains(disc).all()):
-            footprint = np.asarray(position + path.points(np.linspace(0.0, path.length_m, 60)) @ heading.T)
-            return NavigationPlan(NavigationOutcome.PATH, path.commands(step_m, backwards), footprint)
-    return NavigationPlan(NavigationOutcome.NO_PATH, (), none)
+        footprint_points = lookahead[:, None] + options.half_width_m * _FOOTPRINT_POINTS
+        if _is_clear(lookahead, obstacles, options) and bool(terrain.contains(footprint_points).all()):
+            path_points = np.asarray(position + path.points(np.linspace(0.0, path.length_m, 60)) @ heading.T)
+            return NavigationPlan(NavigationOutcome.PATH, path.commands(step_m, backwards), path_points)
+    return NavigationPlan(NavigationOutcome.NO_PATH, (), no_path)
 
 
 @dataclass(frozen=True)
 class _Path:
-    """A turn in place, then two arcs, each of a curvature (to the left) and a length."""
+    """Turn in place, then two arcs, each with a curvature (positive to the left) and a length."""
 
     turn_rad: float
     curvatures_m: tuple[float, float]
@@ -193,31 +193,31 @@ class _Path:
     def length_m(self) -> float:
         return self.lengths_m[0] + self.lengths_m[1]
 
-    def points(self, along_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
+    def points(self, distances_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
         """Positions at distances along the path, in the axes of the rover before the turn."""
-        first = np.minimum(along_m, self.lengths_m[0])
-        bend = _arc(self.curvatures_m[0], np.array([self.lengths_m[0]]))[0]
+        first_m = np.minimum(distances_m, self.lengths_m[0])
+        first_end = _arc(self.curvatures_m[0], np.array([self.lengths_m[0]]))[0]
         heading = self.curvatures_m[0] * self.lengths_m[0]
-        beyond = bend + _arc(self.curvatures_m[1], along_m - first) @ _rotation_matrix(heading).T
-        points = np.where((along_m > self.lengths_m[0])[:, None], beyond, _arc(self.curvatures_m[0], first))
+        second_arc = first_end + _arc(self.curvatures_m[1], distances_m - first_m) @ _rotation_matrix(heading).T
+        points = np.where((distances_m > self.lengths_m[0])[:, None], second_arc, _arc(self.curvatures_m[0], first_m))
         return np.asarray(points @ _rotation_matrix(self.turn_rad).T)
 
     def commands(self, step_m: float, backwards: bool) -> tuple[DriveCommand, ...]:
-        """The turn, and the first `step_m` metres of the arcs."""
+        """Drive commands for the turn and the first `step_m` metres of the arcs."""
         commands = [DriveCommand(turn_left_rad=self.turn_rad)] if self.turn_rad else []
         remaining_m = step_m
         for curvature, length in zip(self.curvatures_m, self.lengths_m, strict=True):
-            driven = min(length, remaining_m)
-            remaining_m -= driven
-            if driven > 0.0:
-                commands.append(DriveCommand(-driven if backwards else driven, 0.0, curvature * driven))
+            length_m = min(length, remaining_m)
+            remaining_m -= length_m
+            if length_m > 0.0:
+                commands.append(DriveCommand(-length_m if backwards else length_m, 0.0, curvature * length_m))
         return tuple(commands)
 
 
-def _arc(curvature_m: float, along_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
-    """Positions along an arc that starts at the origin along x."""
-    half = 0.5 * curvature_m * along_m
-    chord = along_m * np.sinc(half / np.pi)
+def _arc(curvature_m: float, distances_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
+    """Positions at distances along an arc that starts at the origin along x."""
+    half = 0.5 * curvature_m * distances_m
+    chord = distances_m * np.sinc(half / np.pi)
     return np.stack([chord * np.cos(half), chord * np.sin(half)], axis=-1)
 
 
@@ -228,32 +228,34 @@ def _rotation_matrix(angle_rad: float) -> Float[np.ndarray, "2 2"]:
 
 def _candidates(goal: Float[np.ndarray, "2"], options: NavigationOptions) -> Iterator[_Path]:
     """Paths to the goal by increasing cost: an optional turn, an optional arc, and the arc to the goal."""
-    straight = float(np.arctan2(goal[1], goal[0]))
-    turns = np.concatenate([np.radians(_TURNS_DEG), [straight]])
+    goal_direction = float(np.arctan2(goal[1], goal[0]))
+    turns = np.concatenate([np.radians(_TURNS_DEG), [goal_direction]])
     curvatures = options.curvature_m * np.linspace(-1.0, 1.0, 9)
     lengths = 0.75 * float(np.hypot(*goal)) * np.linspace(0.0, 1.0, 9)
-    turn, first, length = (grid.ravel() for grid in np.meshgrid(turns, curvatures, lengths, indexing="ij"))
-    # the end of the first arc, and the goal seen from there
-    half = 0.5 * first * length
-    chord = length * np.sinc(half / np.pi)
+    turn, curvature_1, length_1 = (grid.ravel() for grid in np.meshgrid(turns, curvatures, lengths, indexing="ij"))
+    # the end of the first arc, and distance and direction from it to the goal
+    half = 0.5 * curvature_1 * length_1
+    chord = length_1 * np.sinc(half / np.pi)
     heading = turn + 2.0 * half
     east, north = goal[0] - chord * np.cos(turn + half), goal[1] - chord * np.sin(turn + half)
-    left, angle = np.hypot(east, north), np.arctan2(north, east) - heading
+    range_m, angle = np.hypot(east, north), np.arctan2(north, east) - heading
     angle = (angle + np.pi) % (2.0 * np.pi) - np.pi
-    second = 2.0 * np.sin(angle) / np.maximum(left, AT_GOAL_M)
-    rest = left / np.sinc(angle / np.pi)
-    fits = (left >= AT_GOAL_M) & (np.abs(angle) <= _MAX_ARC_HEADING_RAD) & (np.abs(second) <= options.curvature_m)
-    bent = first**2 * length + second**2 * rest
-    cost = np.where(fits, length + rest + options.turn_cost_m * np.abs(turn) + options.bend_cost_m2 * bent, np.inf)
-    for best in np.argsort(cost, kind="stable")[: np.count_nonzero(fits)]:
-        arcs = (float(first[best]), float(second[best])), (float(length[best]), float(rest[best]))
+    curvature_2 = 2.0 * np.sin(angle) / np.maximum(range_m, AT_GOAL_M)
+    length_2 = range_m / np.sinc(angle / np.pi)
+    feasible = (range_m >= AT_GOAL_M) & (np.abs(angle) <= _MAX_HEADING_RAD)
+    feasible &= np.abs(curvature_2) <= options.curvature_m
+    bending = curvature_1**2 * length_1 + curvature_2**2 * length_2
+    cost = length_1 + length_2 + options.turn_cost_m * np.abs(turn) + options.bend_cost_m2 * bending
+    cost = np.where(feasible, cost, np.inf)
+    for best in np.argsort(cost, kind="stable")[: np.count_nonzero(feasible)]:
+        arcs = (float(curvature_1[best]), float(curvature_2[best])), (float(length_1[best]), float(length_2[best]))
         yield _Path(float(turn[best]), *arcs)
 
 
 def _is_clear(positions_m: Float[np.ndarray, "n 2"], rocks: Iterable[Obstacle], options: NavigationOptions) -> bool:
-    """Whether the disc avoids all rocks, except a rock that it already overlaps and moves away from."""
+    """Whether the disc avoids all rocks; a rock that it overlaps at the start is allowed if the distance grows."""
     for rock in rocks:
-        distances = np.hypot(*(positions_m - rock.place_m).T)
+        distances = np.hypot(*(positions_m - rock.position_m).T)
         clearance = options.half_width_m + options.margin_m + rock.radius_m
         if float(distances.min()) < min(clearance, float(distances[0])):
             return False

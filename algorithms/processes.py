@@ -1,4 +1,4 @@
-"""Child processes and memory use from Linux's /proc; empty or zero on other systems."""
+"""Child processes and memory use, read from Linux's /proc; empty or zero on other systems."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ def descendants(process: int) -> list[int]:
     return result
 
 
-def used_memory(processes: Sequence[int], worth_knowing: float = 0.0) -> float:
+def used_memory(processes: Sequence[int], exact_above: float = 0.0) -> float:
     """Bytes of private and shared anonymous memory of the processes of one tree; 0 for ended ones.
 
     Mapped files do not count: workers share those of a terrain, and Linux reclaims them. Pages shared by forked
-    processes count once. That count is slow: a total of at most `worth_knowing`, shared pages counted in each process,
-    is returned as it is.
+    processes count once; this count is slow. Therefore a fast upper bound (shared pages counted in each process) is
+    returned if it is at most `exact_above`.
     """
-    counted = sum(_read_kilobytes(process, "status", r"Rss(?:Anon|Shmem)") for process in processes) * 1024.0
-    if len(processes) < 2 or counted <= worth_knowing:
-        return counted
+    upper_bound = sum(_read_kilobytes(process, "status", r"Rss(?:Anon|Shmem)") for process in processes) * 1024.0
+    if len(processes) < 2 or upper_bound <= exact_above:
+        return upper_bound
     return sum(_read_kilobytes(process, "smaps_rollup", r"Pss_(?:Anon|Shmem)") for process in processes) * 1024.0
 
 
 def resident_bytes(processes: Sequence[int]) -> float:
-    """Resident memory of processes, pages of mapped files included; 0 for those that are gone."""
+    """Resident memory of processes, bytes, including pages of mapped files; 0 for ended processes."""
     return sum(_read_kilobytes(process, "status", "VmRSS") for process in processes) * 1024.0
 
 

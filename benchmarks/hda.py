@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from benchmarks.timing import Figure, core_seconds
 from marsyard.algorithms.hda import ElevationMap, HdaDetails, HdaEstimator, HdaOptions, hazard_maps
 from marsyard.algorithms.hda.baselines import SemiGlobalEstimator
-from marsyard.algorithms.hda.estimator import expected_pixels, map_ground, matched_structure, motion_from_tracks
+from marsyard.algorithms.hda.estimator import expected_pixels, map_ground, match_structure, motion_from_tracks
 from marsyard.algorithms.hda.hazards import map_resolution
 from marsyard.algorithms.hda.motion import build_scene, undistort
 from marsyard.algorithms.hda.structure import scale_factor
@@ -93,7 +93,7 @@ def table_one(given: LandingMeasurements, repeats: int) -> list[Figure]:
         Figure(f"HDA motion, {tracks.accepted.sum()} tracks (paper: 59, 0.10 s)", core_seconds(move, repeats)),
         Figure(
             f"HDA structure, {len(matches.points)} points (paper: 600, 0.41 s)",
-            core_seconds(lambda: matched_structure(seen, motion, PAPER), repeats),
+            core_seconds(lambda: match_structure(seen, motion, PAPER), repeats),
         ),
         Figure(
             f"HDA map and hazards, {rows} x {columns} (paper: 0.05 s)",

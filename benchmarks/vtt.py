@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.timing import Figure, core_seconds
 from marsyard.algorithms.image.correlation import coarse_to_fine_peak, normalized_correlation
 from marsyard.algorithms.vtt.lucas_kanade import lucas_kanade_tracker
-from marsyard.algorithms.vtt.matching import cut_patch, search_window
+from marsyard.algorithms.vtt.matching import extract_patch, search_window
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.tracker import VisualTargetTracker
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
@@ -82,7 +82,7 @@ def searches(repeats: int) -> list[Figure]:
         place = navcam().left.project(
             navcam().geometry.rover_from_head(first.azimuth_rad, first.elevation_rad).inv().apply(TARGET)
         )[0]
-        template = cut_patch(first.left, place, 21)
+        template = extract_patch(first.left, place, 21)
         window = search_window(second.left, place, side)[0].astype(np.float64)
         a, b = template.astype(np.float32), window.astype(np.float32)
         timed: dict[str, Callable[[], object]] = {

@@ -13,34 +13,34 @@ class CampaignError(Exception):
 
 
 class StoreError(CampaignError):
-    """A campaign folder that cannot be written, or lacks the requested contents."""
+    """A campaign folder that cannot be written, or whose requested contents are missing."""
 
 
 @contextmanager
-def report_write_errors(what: object) -> Iterator[None]:
-    """Raise StoreError that names `what` where the system refuses to write it inside the context."""
+def report_write_errors(target: object) -> Iterator[None]:
+    """Raise StoreError with the name of `target` if the operating system fails to write it inside the context."""
     try:
         yield
     except OSError as error:
-        raise StoreError(f"{what} cannot be written: {error.strerror or error}") from error
+        raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
 
 
 @dataclass(frozen=True)
 class Problem:
     """One problem: its location (a file or an option), its key, and a message with the allowed values."""
 
-    where: str
+    location: str
     key: str
     message: str
 
     def __str__(self) -> str:
         """One line, with the control characters of a file escaped."""
-        text = ": ".join(part for part in (self.where, self.key, self.message) if part)
-        return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
+        text = ": ".join(part for part in (self.location, self.key, self.message) if part)
+        return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)
 
 
 class ConfigurationError(CampaignError):
-    """A campaign that cannot be run as written; `problems` lists all that is wrong, at least one."""
+    """A campaign with an invalid configuration; `problems` lists all problems, at least one."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         self.problems = tuple(problems)
@@ -48,16 +48,16 @@ class ConfigurationError(CampaignError):
 
 
 def near_match(word: str, allowed: Iterable[str]) -> str:
-    """``(did you mean 'x'?)`` with a leading blank where an allowed word is similar, otherwise empty."""
+    """``(did you mean 'x'?)`` with a leading blank if an allowed word is similar, otherwise empty."""
     matches = difflib.get_close_matches(word, list(allowed), n=1, cutoff=0.6)
     return f" (did you mean '{matches[0]}'?)" if matches else ""
 
 
-def unknown_name_message(what: str, word: str, allowed: Iterable[str], listed_only: Iterable[str] | None = None) -> str:
-    """Message that a word is unknown, with a similar word and the allowed ones, or those of `listed_only`."""
-    known = sorted(allowed)
-    listed = ", ".join(known if listed_only is None else sorted(listed_only)) or "none"
-    return f"unknown {what} '{word}'{near_match(word, known)}; allowed: {listed}"
+def unknown_name_message(kind: str, word: str, allowed: Iterable[str], listed_only: Iterable[str] | None = None) -> str:
+    """Message for an unknown word, with a similar word and the allowed words, or those of `listed_only`."""
+    allowed_words = sorted(allowed)
+    listed = ", ".join(allowed_words if listed_only is None else sorted(listed_only)) or "none"
+    return f"unknown {kind} '{word}'{near_match(word, allowed_words)}; allowed: {listed}"
 
 
 #: The case raised an exception, or its worker process died.
@@ -70,20 +70,19 @@ OUT_OF_MEMORY = "OUT_OF_MEMORY"
 TOO_MUCH_OUTPUT = "TOO_MUCH_OUTPUT"
 #: The algorithm's answer violated its interface.
 BAD_ANSWER = "BAD_ANSWER"
-#: All of them, by the names on the command line.
+#: Outcomes by their command-line names (`--retry`).
 _OUTCOMES = (CRASHED, TIMED_OUT, OUT_OF_MEMORY, TOO_MUCH_OUTPUT, BAD_ANSWER)
 RETRYABLE: Mapping[str, str] = {outcome.lower().replace("_", "-"): outcome for outcome in _OUTCOMES}
 #: Cases with these outcomes fail requirements on all cases, and cause exit status 1.
-UNFINISHED = frozenset(RETRYABLE.values())
+ENGINE_FAILURES = frozenset(RETRYABLE.values())
 
 
-class CaseEndedError(Exception):
-    """A task that ended together with its process.
+class WorkerExitError(Exception):
+    """The worker process ended before its task finished.
 
-    outcome: one of this module's.
-    reason: the same text each time that the task ends in this way.
-    trace: where the process stood in Python, and its last output, as far as known.
-    note: text that the task left through `worker_process.leave_note`.
+    outcome: one of this module's outcomes. reason: deterministic text, equal for equal causes. trace: Python stack of
+    the process and its last output, as far as available. note: diagnostic text recorded by the task
+    (`worker_process.record_note`).
     """
 
     def __init__(self, outcome: str, reason: str, trace: str, note: str = "") -> None:
@@ -92,5 +91,5 @@ class CaseEndedError(Exception):
         self.trace = trace
         self.note = note
 
-    def __reduce__(self) -> tuple[type[CaseEndedError], tuple[str, str, str, str]]:
+    def __reduce__(self) -> tuple[type[WorkerExitError], tuple[str, str, str, str]]:
         return type(self), (self.outcome, str(self), self.trace, self.note)

@@ -1,9 +1,9 @@
-"""Marsyard, a virtual Mars Yard: tests vision software on rendered cases with known truth.
+"""Marsyard, a virtual Mars Yard: test vision software on rendered cases with ground truth.
 
-The names of `marsyard.api` are available here, and imported on first use.
+This package exports all names of `marsyard.api` and imports that module on first use.
 """
 
-# ruff: noqa: F405  (the names are those of marsyard.api)
+# ruff: noqa: F405  (defined by the star import)
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ __all__ += ["read_cameras", "render_view", "results", "run_campaign", "run_case"
 
 
 def __getattr__(name: str) -> Any:
-    """Import the API on first use: the command line starts without it."""
+    """Import the API on first use, so that the command line starts fast."""
     if name not in __all__:
         raise AttributeError(f"module 'marsyard' has no attribute {name!r}; it has {', '.join(__all__)}")
     from marsyard import api

@@ -1,9 +1,9 @@
-"""Write data sets for learning: a campaign's pictures with their truth, as shards in the WebDataset format.
+"""Write training data: images of a campaign with ground truth, as shards in the WebDataset format.
 
-A shard is a tar file of whole cases. Per picture it holds, under one key, the 16-bit picture (`image.png`), range
-(`range.npy`, m), normals (`normal.npy`, world axes), masks (`rocks.png`; for landings `hazard.png`: 0 safe, 1 hazard,
-255 unknown), the camera (`cahvor`) and metadata (`json`). Existing shards are complete and not written again: an
-interrupted data set continues, and the same campaign gives the same bytes.
+A shard is a tar file with all images of its cases. Each image has a key with these files: 16-bit image (`image.png`),
+range (`range.npy`, m), normals (`normal.npy`, world axes), masks (`rocks.png`; for landings `hazard.png`: 0 safe,
+1 hazard, 255 unknown), camera model (`cahvor`) and metadata (`json`). The same campaign gives the same bytes. Existing
+shards are complete and are not written again, so that an interrupted command can be repeated.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ MANIFEST = "dataset.json"
 
 
 def write_dataset(campaign: Campaign, folder: Path, cases_per_shard: int, jobs: int) -> list[Path]:
-    """Write the missing shards; return the paths of all.
+    """Write the missing shards; return the paths of all shards.
 
-    Raises CampaignError where the scenario gives no samples, or the folder holds another data set or is not writable.
+    Raises CampaignError if the scenario provides no samples, or the folder is read-only or contains another data set.
     """
     if not isinstance(campaign.scenario, ProvidesSamples):
         name = campaign.configuration.scenario
         allowed = ", ".join(name for name in scenario_names() if isinstance(scenario(name), ProvidesSamples))
-        raise CampaignError(f"the scenario '{name}' gives no samples to learn from; allowed: {allowed}")
+        raise CampaignError(f"the scenario '{name}' provides no training samples; allowed: {allowed}")
     _write_manifest(campaign, folder, cases_per_shard)
     total = campaign.configuration.total_cases
     starts = range(0, total, cases_per_shard)
@@ -50,7 +50,7 @@ def write_dataset(campaign: Campaign, folder: Path, cases_per_shard: int, jobs: 
     if missing:
         from joblib import Parallel, delayed
 
-        # before the processes start, which would each build them
+        # built once here; otherwise each worker process would build them
         _prepare_inputs(campaign, itertools.chain.from_iterable(cases for _, cases in missing))
         Parallel(n_jobs=jobs)(delayed(_write_shard)(campaign, path, cases) for path, cases in missing)
     return paths
@@ -63,7 +63,7 @@ def _prepare_inputs(campaign: Campaign, cases: Iterable[int]) -> None:
 
 
 def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int) -> None:
-    """Write the manifest of the data set. Raises StoreError where the folder holds another data set."""
+    """Write the manifest of the data set. Raises StoreError if the folder contains another data set."""
     configuration = campaign.configuration
     manifest = {
         "campaign": configuration.name,
@@ -75,34 +75,34 @@ def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int) -> N
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if path.exists():
-            before = json.loads(path.read_text(encoding="utf-8"))
+            previous = json.loads(path.read_text(encoding="utf-8"))
             for key in ("configuration_sha256", "cases_per_shard"):
-                if before.get(key) != manifest[key]:
-                    raise StoreError(f"{folder} holds another data set ({key} differs); choose another folder")
+                if previous.get(key) != manifest[key]:
+                    raise StoreError(f"{folder} contains another data set ({key} differs); choose another folder")
             return
         path.write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
     except (OSError, ValueError) as error:
-        raise StoreError(f"{path}: cannot be used: {error}") from error
+        raise StoreError(f"{path} cannot be read or written: {error}") from error
 
 
 def _write_shard(campaign: Campaign, path: Path, cases: range) -> None:
-    part = path.with_suffix(".part")
-    with tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as shard:
+    partial_path = path.with_suffix(".part")
+    with tarfile.open(partial_path, "w", format=tarfile.USTAR_FORMAT) as shard:
         for case in cases:
-            for name, contents in _files(campaign, case):
+            for name, contents in _create_files(campaign, case):
                 entry = tarfile.TarInfo(name)
                 entry.size = len(contents)
                 shard.addfile(entry, io.BytesIO(contents))
-    part.replace(path)
+    partial_path.replace(path)
 
 
-def _files(campaign: Campaign, case: int) -> Iterator[tuple[str, bytes]]:
+def _create_files(campaign: Campaign, case: int) -> Iterator[tuple[str, bytes]]:
     scenario = campaign.scenario
     assert isinstance(scenario, ProvidesSamples)  # noqa: S101  (checked by `write_dataset`)
-    drawn = campaign.draws(case)
+    draws = campaign.draws(case)
     for number, sample in enumerate(scenario.samples(campaign.parameters(case), campaign.streams(case))):
         key = f"{case:07d}-{number}"
-        metadata = {"campaign": campaign.configuration.name, "case": case, "picture": number, "drawn": drawn}
+        metadata = {"campaign": campaign.configuration.name, "case": case, "picture": number, "drawn": draws}
         yield f"{key}.image.png", _encode(sample.image * np.uint16(2 ** (16 - sample.bits)))
         yield f"{key}.range.npy", _encode(sample.range_m)
         yield f"{key}.normal.npy", _encode(sample.normal)
@@ -122,7 +122,7 @@ def _encode(values: np.ndarray[Any, Any]) -> bytes:
         return buffer.getvalue()
     import cv2
 
-    written, encoded = cv2.imencode(".png", values)
-    if not written:
-        raise ValueError("a picture could not be written as PNG")
+    is_encoded, encoded = cv2.imencode(".png", values)
+    if not is_encoded:
+        raise ValueError("an image could not be encoded as PNG")
     return encoded.tobytes()

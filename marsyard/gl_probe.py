@@ -1,7 +1,7 @@
 """Render a small frame with one GL backend and check its depth: ``python -P gl_probe.py osmesa``.
 
 A separate program: PyOpenGL reads the backend from the environment at import, and a broken driver crashes its process.
-It imports nothing of Marsyard, as set-up runs it too. The result is one line of JSON on standard output.
+It does not import Marsyard, because the installer also runs it. The result is one line of JSON on standard output.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 COLUMNS, ROWS = 96, 64
 FOCAL_PX = 96.0
 NEAR_M, FAR_M = 40.0, 400.0
-#: The planes ``z = -DISTANCE_M + TILT x`` and ``z = -DISTANCE_M + TILT y`` before a camera that looks along -z.
+#: The planes ``z = -DISTANCE_M + TILT x`` and ``z = -DISTANCE_M + TILT y`` in front of a camera that looks along -z.
 DISTANCE_M, TILT = 100.0, 0.5
 #: Tolerance of the depth, metres: 24 bits between near and far resolve 1e-5 m here.
 DEPTH_TOLERANCE_M = 2e-3
@@ -32,15 +32,15 @@ def probe(backend: str) -> dict[str, Any]:
         import pyrender
         from OpenGL import GL
     except (AttributeError, ImportError) as error:
-        # PyOpenGL detects a missing library only when it looks up a function in it
-        raise SystemExit(f"its libraries do not load ({error})") from None
+        # PyOpenGL detects a missing library only when it looks up one of its functions
+        raise SystemExit(f"cannot load the OpenGL libraries ({error})") from None
 
     x, y = (axis.ravel() for axis in np.meshgrid([-400.0, 400.0], [-400.0, 400.0]))
     # pyrender counts pixels from the image's corner, so a pixel's centre lies at +0.5; its y axis points up
     u, v = np.meshgrid(np.arange(COLUMNS) + 0.5 - COLUMNS / 2, np.arange(ROWS) + 0.5 - ROWS / 2)
     camera = pyrender.IntrinsicsCamera(FOCAL_PX, FOCAL_PX, COLUMNS / 2, ROWS / 2, znear=NEAR_M, zfar=FAR_M)
     renderer = pyrender.OffscreenRenderer(COLUMNS, ROWS)
-    offsets_px, errors_m, lit = [], [], True
+    offsets_px, errors_m, has_colour = [], [], True
     try:
         for axis, pixels in ((x, u), (y, -v)):
             corners = np.column_stack([x, y, -DISTANCE_M + TILT * axis])
@@ -49,12 +49,12 @@ def probe(backend: str) -> dict[str, Any]:
             scene.add(pyrender.Mesh.from_trimesh(plane, smooth=False))
             scene.add(camera, pose=np.eye(4))
             colour, depth = renderer.render(scene)
-            # position on the plane at which the depth was sampled, which may be off the pixel's centre
-            sampled = (DISTANCE_M / depth - 1.0) * FOCAL_PX / TILT
-            offset = float(np.mean(sampled - pixels))
+            # pixel coordinates at which the depth was sampled; may differ from the pixel centre
+            sample_positions = (DISTANCE_M / depth - 1.0) * FOCAL_PX / TILT
+            offset = float(np.mean(sample_positions - pixels))
             offsets_px.append(offset)
             errors_m.append(float(np.abs(depth - DISTANCE_M / (1.0 + TILT * (pixels + offset) / FOCAL_PX)).max()))
-            lit = lit and bool(colour.any())
+            has_colour = has_colour and bool(colour.any())
         strings = {name: GL.glGetString(getattr(GL, f"GL_{name}")).decode() for name in ("RENDERER", "VERSION")}
     finally:
         renderer.delete()
@@ -63,11 +63,11 @@ def probe(backend: str) -> dict[str, Any]:
         "version": strings["VERSION"],
         "depth_error_m": max(errors_m),
         "offset_px": [offsets_px[0], -offsets_px[1]],
-        "lit": lit,
+        "has_colour": has_colour,
     }
 
 
 if __name__ == "__main__":
     result = probe(sys.argv[1])
     print(json.dumps(result))
-    sys.exit(not (result["lit"] and result["depth_error_m"] <= DEPTH_TOLERANCE_M))
+    sys.exit(not (result["has_colour"] and result["depth_error_m"] <= DEPTH_TOLERANCE_M))

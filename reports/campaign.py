@@ -18,7 +18,7 @@ from marsyard.reports import common_sections, sections
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
 from marsyard.reports.evaluation import Evaluation, OverallVerdict, evaluate_run
-from marsyard.reports.presentation import presentations, shown_cases
+from marsyard.reports.presentation import presentations, showcase_views
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
 from marsyard.reports.stored import StoredRun
@@ -35,15 +35,15 @@ COMMON_SECTIONS: tuple[SectionMaker, ...] = (
 )  # fmt: skip
 
 #: Maximum number of sites and algorithms in `report.json`.
-_MAX_KINDS = 24
+_MAX_LISTED = 24
 
 #: Version of the layout of `report.json`, raised by removals and changes of meaning, and its JSON Schema.
 SCHEMA = 5
 SCHEMA_FILE = Path(__file__).with_name("report.schema.json")
-#: Properties of a verdict in `report.json`.
-_DERIVED = ("note", "plain_status", "confident_status", "consumer_risk", "margin")
+#: Properties of a verdict that `report.json` contains next to its fields.
+_VERDICT_PROPERTIES = ("note", "plain_status", "confident_status", "consumer_risk", "margin")
 PAGE_FILE = "report.html"
-TWIN_FILE = "report.json"
+REPORT_JSON = "report.json"
 VERIFICATION_FILE = "verification.csv"
 JUNIT_FILE = "junit.xml"
 
@@ -51,29 +51,30 @@ JUNIT_FILE = "junit.xml"
 def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Path:
     """Write a campaign's report into its folder from the files there; returns the path of the self-contained page.
 
-    requirements: in place of the campaign's own
-    Raises StoreError if the folder holds no rows, OSError if the report cannot be written.
+    requirements: replace the campaign's own
+    Raises StoreError if the folder contains no rows, OSError if the report cannot be written.
     """
     return write_evaluation(evaluate_run(directory, requirements))
 
 
 def write_evaluation(evaluation: Evaluation) -> Path:
     """Write the report of an evaluated campaign into its folder."""
-    run, how, verdicts, whole = evaluation.run, evaluation.how, evaluation.verdicts, evaluation.whole
+    run, verdicts, overall_verdict = evaluation.run, evaluation.verdicts, evaluation.overall_verdict
     directory = run.directory
-    drawn = replace(run, frame=how.draw(run.frame), whole=how.draw(run.whole))
-    metric = primary_metric(drawn.frame, run.requirements)
-    bound = next((v.bound for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
-    subject = Subject(drawn, metric, bound)
-    further = [section for make in section_makers() if (section := make(subject)) is not None]
-    twin = summary(evaluation, subject, further)
+    exclude_nominal = evaluation.sampling.exclude_nominal_case
+    random_run = replace(run, frame=exclude_nominal(run.frame), all_cases=exclude_nominal(run.all_cases))
+    metric = primary_metric(random_run.frame, run.requirements)
+    bound = next((v.bound / v.scale for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
+    subject = Subject(random_run, metric, bound)
+    extra_sections = [section for make in section_makers() if (section := make(subject)) is not None]
+    report_data = summary(evaluation, subject, extra_sections)
     algorithms = tested_algorithms(run.record)
-    write_whole(directory / TWIN_FILE, json.dumps(twin, indent=2, allow_nan=False) + "\n")
-    write_whole(directory / VERIFICATION_FILE, verification_csv(requirement_evidence(run.name, verdicts, algorithms)))
-    write_whole(directory / JUNIT_FILE, junit_xml(run.name, verdicts, whole, algorithms))
+    write_atomic(directory / REPORT_JSON, json.dumps(report_data, indent=2, allow_nan=False) + "\n")
+    write_atomic(directory / VERIFICATION_FILE, verification_csv(requirement_evidence(run.name, verdicts, algorithms)))
+    write_atomic(directory / JUNIT_FILE, junit_xml(run.name, verdicts, overall_verdict, algorithms))
     page = directory / PAGE_FILE
-    context = page_context(run, subject, verdicts, whole, further)
-    write_whole(page, page_environment().get_template("report.html.j2").render(context))
+    context = page_context(run, subject, verdicts, overall_verdict, extra_sections)
+    write_atomic(page, page_environment().get_template("report.html.j2").render(context))
     return page
 
 
@@ -85,27 +86,27 @@ def section_makers() -> list[SectionMaker]:
 
 
 def page_context(
-    run: StoredRun, subject: Subject, verdicts: Sequence[Verdict], whole: OverallVerdict, further: Sequence[Section]
+    run: StoredRun, subject: Subject, verdicts: Sequence[Verdict], overall: OverallVerdict, extra: Sequence[Section]
 ) -> dict[str, Any]:
-    """Context of the page's template: statistics of the subject's cases, all else of the whole run."""
+    """Context of the page's template: statistics use the cases of `subject`, everything else uses all cases."""
     metric, bound = subject.metric, subject.bound
-    text = f"{count(whole.crashed, 'case')} crashed: fix this before you use the verdict."
-    crashed = [text] if whole.crashed else []
+    text = f"{count(overall.crashed, 'case')} crashed: fix this before you use the verdict."
+    cautions = [text] if overall.crashed else []
     context: dict[str, Any] = {
         "run": run,
         "description": str(run.recorded("description") or ""),
-        "whole": whole,
-        "cautions": [*crashed, *sampling_cautions(run, metric)],
+        "overall_verdict": overall,
+        "cautions": [*cautions, *sampling_cautions(run, metric)],
         "interrupted": run.recorded("state") not in (None, "finished"),
         "verdicts": [sections.verdict_row(verdict) for verdict in verdicts],
         "metric": metric,
         "bound": bound,
-        "further": further,
-        "outcomes": sections.outcome_grid(run.whole),
-        "outcome_plates": sections.outcome_plates(run.whole),
+        "extra_sections": extra,
+        "outcomes": sections.outcome_grid(run.all_cases),
+        "outcome_figures": sections.outcome_figures(run.all_cases),
         "crashed": sections.crashed_rows(run),
         "dispersions": sections.dispersion_grid(subject.run),
-        "shown": shown_cases(run),
+        "showcases": showcase_views(run),
         "provenance": sections.provenance(run),
         "versions": sections.versions(run),
         "configuration": json.dumps(run.configuration or run.record, indent=2, ensure_ascii=False, default=str),
@@ -115,80 +116,79 @@ def page_context(
         "replay": sections.replay_command(run, "CASE"),
         "gallery": shlex.join(["marsyard", "report", str(run.directory), "--gallery"]),
     }
-    pictured = [str(case.case) for case in context["shown"]]
+    cases_with_images = [str(case.case) for case in context["showcases"]]
     if metric is None:
-        none = sections.CaseTable((), ())
-        context |= {"error_plates": [], "driver_plates": [], "statistics": Grid((), ())}
-        return context | {"explorer": None, "worst": none, "silent": none}
-    context["explorer"], drawn = None, subject.run
-    if np.isfinite(numbers(drawn.frame, metric)).any():
-        data, script = sections.explorer_data(drawn, metric, bound, pictured), sections.script()
-        hashed = sections.script_hash(script)
-        context["explorer"] = {"data": data, "json": sections.embed_json(data), "script": script, "hash": hashed}
+        empty_table = sections.CaseTable((), ())
+        context |= {"error_figures": [], "driver_figures": [], "statistics": Grid((), ())}
+        return context | {"explorer": None, "worst": empty_table, "unanswered": empty_table}
+    context["explorer"], random_run = None, subject.run
+    if np.isfinite(numbers(random_run.frame, metric)).any():
+        data, script = sections.explorer_data(random_run, metric, bound, cases_with_images), sections.script()
+        content_hash = sections.script_hash(script)
+        context["explorer"] = {"data": data, "json": sections.embed_json(data), "script": script, "hash": content_hash}
     return context | {
-        "error_plates": sections.error_plates(drawn.frame, drawn.whole, metric, bound),
-        "driver_plates": sections.driver_plates(drawn.frame, metric, bound),
-        "statistics": statistics_grid(drawn.whole, metric),
-        "worst": sections.worst_cases(drawn, metric, pictured),
-        "silent": sections.unanswered_cases(drawn, metric, pictured),
+        "error_figures": sections.error_figures(random_run.frame, random_run.all_cases, metric, bound),
+        "driver_figures": sections.driver_figures(random_run.frame, metric, bound),
+        "statistics": statistics_grid(random_run.all_cases, metric),
+        "worst": sections.worst_cases(random_run, metric, cases_with_images),
+        "unanswered": sections.unanswered_cases(random_run, metric, cases_with_images),
     }
 
 
 def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
     """Warnings about the sampling: designs without probabilities, very many cases, a nominal case."""
-    how = read_sampling_design(run.configuration)
+    sampling = read_sampling_design(run.configuration)
     texts = []
-    if not how.independent:
+    if not sampling.independent:
         texts.append(
-            f"The cases are no independent random draws: {how.text}. Statistics describe these cases; intervals, "
-            "bounds and probabilities on this page assume independent draws and do not hold for them."
+            f"The cases are not independent random samples: {sampling.text}. Statistics describe these cases; "
+            "intervals, bounds and probabilities on this page assume independent samples and do not apply to them."
         )
     if run.sampled_from is not None:
         texts.append(
-            f"Verdicts, outcomes, answers, statistics and convergence are of all {run.sampled_from:,} cases; points, "
-            f"conditions and drivers of the first {len(run.frame):,}, which are as random as all."
+            f"Verdicts, outcomes, answers, statistics and convergence use all {run.sampled_from:,} cases. Scatter "
+            f"plots, conditions and drivers use the first {len(run.frame):,} cases, which are also a random sample."
         )
-    nominal = run.frame[run.frame["case"] == 0] if how.nominal and "case" in run.frame else run.frame[:0]
+    nominal = run.frame[run.frame["case"] == 0] if sampling.nominal and "case" in run.frame else run.frame[:0]
     if len(nominal):
-        result = str(nominal["outcome"].iloc[0]) if "outcome" in nominal else "stored"
+        nominal_text = str(nominal["outcome"].iloc[0]) if "outcome" in nominal else "stored"
         if metric is not None:
-            result += f", {label(metric)} {number(float(numbers(nominal, metric)[0]))}"
-        texts.append(f"Case 0 is the nominal one ({result}); it counts in no verdict and in no statistic.")
+            nominal_text += f", {label(metric)} {number(float(numbers(nominal, metric)[0]))}"
+        texts.append(f"Case 0 is the nominal case ({nominal_text}). It is excluded from verdicts and statistics.")
     return texts
 
 
-def summary(found: Evaluation, subject: Subject, further: Sequence[Section]) -> dict[str, Any]:
+def summary(evaluation: Evaluation, subject: Subject, extra_sections: Sequence[Section]) -> dict[str, Any]:
     """The report as plain data; NaN and infinities are null."""
-    run, how, whole, metric = found.run, found.how, found.whole, subject.metric
-    summaries = error_summaries(subject.whole, metric) if metric is not None else []
-    twin = {
+    run, sampling, overall_verdict = evaluation.run, evaluation.sampling, evaluation.overall_verdict
+    metric = subject.metric
+    summaries = error_summaries(subject.all_cases, metric) if metric is not None else []
+    report_data = {
         "schema": SCHEMA,
         "campaign": run.name,
         **{key: run.recorded(key) for key in ("state", "seed", "git_commit", "started_utc", "finished_utc")},
-        "cases": len(run.whole),
-        "crashed": whole.crashed,
-        "sites": _kinds(run.frame, "site"),
-        "algorithms": _kinds(run.frame, "algorithm"),
-        "algorithm_details": [asdict(one) for one in tested_algorithms(run.record)],
-        "sampling": {**asdict(how), "independent": how.independent, "text": how.text},
-        "verdict": whole.word,
-        "sentence": whole.sentence,
-        "exit_code": found.exit_code,
-        "verdicts": [asdict(one) | {name: getattr(one, name) for name in _DERIVED} for one in found.verdicts],
-        "outcomes": dict(outcome_counts(run.whole)),
+        "cases": len(run.all_cases),
+        "crashed": overall_verdict.crashed,
+        "sites": _unique_values(run.frame, "site"),
+        "algorithms": _unique_values(run.frame, "algorithm"),
+        "algorithm_details": [asdict(algorithm) for algorithm in tested_algorithms(run.record)],
+        "sampling": {**asdict(sampling), "independent": sampling.independent, "text": sampling.text},
+        "verdict": overall_verdict.word,
+        "sentence": overall_verdict.sentence,
+        "exit_code": evaluation.exit_code,
+        "verdicts": [asdict(v) | {name: getattr(v, name) for name in _VERDICT_PROPERTIES} for v in evaluation.verdicts],
+        "outcomes": dict(outcome_counts(run.all_cases)),
         "metric": metric,
-        "statistics": {name: asdict(summarized) for name, summarized in summaries},
+        "statistics": {name: asdict(values) for name, values in summaries},
         "worst_cases": [] if metric is None else [row.case for row in sections.worst_cases(subject.run, metric).rows],
-        "sections": {section.key: section.data for section in further},
+        "sections": {section.key: section.data for section in extra_sections},
         "showcases": run.showcases,
     }
-    return dict(_plain(twin))
+    return dict(_to_json_types(report_data))
 
 
-def _kinds(frame: pd.DataFrame, column: str) -> list[str]:
-    if column not in frame:
-        return []
-    return [str(value) for value in frame[column].dropna().unique()[:_MAX_KINDS]]
+def _unique_values(frame: pd.DataFrame, column: str) -> list[str]:
+    return [] if column not in frame else [str(value) for value in frame[column].dropna().unique()[:_MAX_LISTED]]
 
 
 def page_environment() -> Environment:
@@ -202,19 +202,19 @@ def page_environment() -> Environment:
     )
 
 
-def _plain(value: Any) -> Any:
+def _to_json_types(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {str(name): _plain(inner) for name, inner in value.items()}
+        return {str(name): _to_json_types(inner) for name, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
+        return [_to_json_types(inner) for inner in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, str | int | bool) else str(value)
 
 
-def write_whole(path: Path, text: str) -> None:
+def write_atomic(path: Path, text: str) -> None:
     """Write a file atomically."""
     partial = path.with_suffix(path.suffix + ".partial")
-    # lone surrogates, which JSON can hold, cannot be encoded as UTF-8
+    # JSON can contain lone surrogates, which cannot be encoded as UTF-8
     partial.write_text(text, encoding="utf-8", errors="replace")
     partial.replace(path)

@@ -2,8 +2,8 @@
 
 Algorithms are paired case by case: successes are compared by discordant cases, errors by the differences of cases that
 both answered (`marsyard.reports.statistics.changes`). Campaigns with the same draws (name, seed, dispersions) are
-paired as well; others are compared terrain by terrain, or by whole terrains without common terrains. Shared
-terrains count by terrain. All p are corrected for their number by Holm's method.
+paired as well; otherwise they are compared per terrain if they share terrains, else with terrains as independent
+clusters. Cases on one terrain form a cluster. All p-values are corrected by Holm's method.
 """
 
 from __future__ import annotations
@@ -39,12 +39,11 @@ from marsyard.reports.wording import (
 
 
 @dataclass(frozen=True)
-class Contender:
+class AlgorithmResult:
     """Results of one algorithm.
 
-    failed: cases in which it crashed or broke a limit
-    succeeded: cases within the bound; None without a bound
-    median, p95: of the metric's magnitude over the answered cases
+    failed: cases in which it crashed or exceeded a resource limit succeeded: cases within the bound; None without a
+    bound median, p95: of the metric's magnitude over the answered cases
     """
 
     name: str
@@ -57,14 +56,13 @@ class Contender:
 
 
 @dataclass(frozen=True)
-class Difference:
-    """Another algorithm against the one under test on the same cases; both p are corrected for their number (Holm).
+class PairedComparison:
+    """Another algorithm compared with the one under test on the same cases; p-values are corrected by Holm's method.
 
-    only_first, only_other: cases in which only the one under test, or only the other, is within the bound, if any
-    success_p: two-sided probability of so uneven a split if both succeed equally often
-    pairs: cases that both answered
-    mean, lower, upper: mean of the other's magnitude less that of the algorithm under test, with its interval
-    error_p: two-sided probability of such differences if they are symmetric about zero (Wilcoxon)
+    only_first, only_other: cases within the bound only for the tested or only for the other one; None without a bound
+    success_p: two-sided p-value of the difference in successes (`compare_successes`) pairs: number of cases that both
+    answered mean, lower, upper: mean magnitude of the other minus that of the algorithm under test, with its interval
+    error_p: two-sided p-value of Wilcoxon's signed-rank test of the differences
     """
 
     name: str
@@ -85,21 +83,21 @@ def compared_names(frame: pd.DataFrame) -> list[str]:
 
 
 def select_algorithm(frame: pd.DataFrame, name: str) -> pd.DataFrame:
-    """The rows with a compared algorithm in place of the algorithm under test."""
+    """Return the rows with the results of a compared algorithm instead of the algorithm under test."""
     prefix = f"{name}."
-    own = {str(column): str(column).removeprefix(prefix) for column in frame.columns if str(column).startswith(prefix)}
-    renamed = frame.drop(columns=[column for column in own.values() if column in frame])
-    return renamed.rename(columns=own)
+    names = [str(column) for column in frame.columns if str(column).startswith(prefix)]
+    new_names = {name: name.removeprefix(prefix) for name in names}
+    return frame.drop(columns=[name for name in new_names.values() if name in frame]).rename(columns=new_names)
 
 
-def contender(frame: pd.DataFrame, name: str, metric: str | None, bound: float | None) -> Contender:
-    """Results of the algorithm under test in the rows."""
+def summarize_algorithm(frame: pd.DataFrame, name: str, metric: str | None, bound: float | None) -> AlgorithmResult:
+    """Summarize the results of the algorithm under test in the rows."""
     magnitude = np.abs(numbers(frame, metric)) if metric is not None else np.full(len(frame), np.nan)
     finite = magnitude[np.isfinite(magnitude)]
     within = None
     if metric is not None and bound is not None:
         within = int(success_mask(frame, metric, bound).sum()) if metric in frame else 0
-    return Contender(
+    return AlgorithmResult(
         name=name,
         cases=len(frame),
         answered=int(frame["answered"].eq(True).sum()),
@@ -110,97 +108,95 @@ def contender(frame: pd.DataFrame, name: str, metric: str | None, bound: float |
     )
 
 
-def difference(first: pd.DataFrame, other: pd.DataFrame, name: str, metric: str, bound: float | None) -> Difference:
-    """Another algorithm against the first, from rows of the same cases in the same order."""
-    mine, its = (np.abs(numbers(frame, metric)) for frame in (first, other))
-    both, groups = np.isfinite(mine) & np.isfinite(its), rates.terrain_groups(first)
-    split: tuple[int | None, int | None, float] = (None, None, math.nan)
+def compare_with_baseline(
+    first: pd.DataFrame, other: pd.DataFrame, name: str, metric: str, bound: float | None
+) -> PairedComparison:
+    """Compare another algorithm with the first, from rows of the same cases in the same order."""
+    first_error, other_error = (np.abs(numbers(frame, metric)) for frame in (first, other))
+    answered, groups = np.isfinite(first_error) & np.isfinite(other_error), rates.terrain_groups(first)
+    success: tuple[int | None, int | None, float] = (None, None, math.nan)
     if bound is not None:
-        split = compare_successes(mine <= bound, its <= bound, groups)
-    shared = None if groups is None else groups[both]
-    mean, lower, upper, p = compare_errors((its - mine)[both], shared, CONFIDENCE)
-    return Difference(name, *split, int(both.sum()), mean, lower, upper, p)
+        success = compare_successes(first_error <= bound, other_error <= bound, groups)
+    answered_groups = None if groups is None else groups[answered]
+    mean, lower, upper, p = compare_errors((other_error - first_error)[answered], answered_groups, CONFIDENCE)
+    return PairedComparison(name, *success, int(answered.sum()), mean, lower, upper, p)
 
 
-def comparison(
+def compare_algorithms(
     frame: pd.DataFrame, metric: str | None, bound: float | None
-) -> tuple[list[Contender], list[Difference]]:
-    """Results of all algorithms, the one under test first, and differences of the others; empty for a single one."""
+) -> tuple[list[AlgorithmResult], list[PairedComparison]]:
+    """Summarize all algorithms, the one under test first, and compare the others with it; empty for a single one."""
     names = compared_names(frame)
     # cases that ended before any algorithm ran have no answers to compare
     frame = frame[np.logical_and.reduce([frame[f"{name}.answered"].notna() for name in names])] if names else frame
     if not names or frame.empty:
         return [], []
     tested = str(frame["algorithm"].iloc[0]) if "algorithm" in frame else "tested"
-    others = {name: select_algorithm(frame, name) for name in names}
-    contenders = [contender(frame, tested, metric, bound)]
-    contenders += [contender(own, name, metric, bound) for name, own in others.items()]
+    frames = {name: select_algorithm(frame, name) for name in names}
+    results = [summarize_algorithm(frame, tested, metric, bound)]
+    results += [summarize_algorithm(rows, name, metric, bound) for name, rows in frames.items()]
     if metric is None:
-        return contenders, []
-    differences = [difference(frame, own, name, metric, bound) for name, own in others.items() if metric in own]
-    of_success, of_errors = (holm([getattr(one, key) for one in differences]) for key in ("success_p", "error_p"))
-    return contenders, [
-        replace(one, success_p=success, error_p=error)
-        for one, success, error in zip(differences, of_success, of_errors, strict=True)
-    ]
+        return results, []
+    differences = [compare_with_baseline(frame, rows, n, metric, bound) for n, rows in frames.items() if metric in rows]
+    success_p, error_p = holm([d.success_p for d in differences]), holm([d.error_p for d in differences])
+    corrected = zip(differences, success_p, error_p, strict=True)
+    return results, [replace(difference, success_p=p, error_p=q) for difference, p, q in corrected]
 
 
 def comparison_section(subject: Subject) -> Section | None:
-    """The algorithms side by side; None for a single algorithm."""
-    contenders, differences = comparison(subject.frame, subject.metric, subject.bound)
-    if not contenders:
+    """Compare the algorithms; None for a single algorithm."""
+    results, differences = compare_algorithms(subject.frame, subject.metric, subject.bound)
+    if not results:
         return None
-    grids = comparison_grids(contenders, differences, subject.metric)
-    tested = contenders[0].name
+    grids = comparison_grids(results, differences, subject.metric)
+    tested = results[0].name
     note = note_text("common.comparison", tested=tested, confidence=format_fraction(CONFIDENCE))
     blocks = [Block(grid=grids[0])]
     if differences:
         blocks.append(Block(heading=f"Against {tested}", grid=grids[1], note=note))
     data = {
-        "algorithms": [asdict(one) for one in contenders],
+        "algorithms": [asdict(result) for result in results],
         "against": tested,
-        "differences": [asdict(one) for one in differences],
+        "differences": [asdict(difference) for difference in differences],
     }
     return Section("algorithms", "Algorithms", "Algorithms on the same cases", blocks, data)
 
 
 def comparison_grids(
-    contenders: Sequence[Contender], differences: Sequence[Difference], metric: str | None
+    results: Sequence[AlgorithmResult], differences: Sequence[PairedComparison], metric: str | None
 ) -> tuple[Grid, Grid]:
     """Tables of results and of differences."""
     unit = f" ({split_unit(metric)[1]})" if metric is not None and split_unit(metric)[1] else ""
     first = build_grid(
-        contenders,
+        results,
         {
-            "Algorithm": lambda one: one.name,
-            "Answered": lambda one: percent(one.answered / one.cases),
-            "Failed": lambda one: f"{one.failed:,}",
-            "Within bound": lambda one: NOTHING if one.succeeded is None else percent(one.succeeded / one.cases),
-            f"Median{unit}": lambda one: number(one.median),
-            f"95 %{unit}": lambda one: number(one.p95),
+            "Algorithm": lambda result: result.name,
+            "Answered": lambda result: percent(result.answered / result.cases),
+            "Failed": lambda result: f"{result.failed:,}",
+            "Within bound": lambda r: NOTHING if r.succeeded is None else percent(r.succeeded / r.cases),
+            f"Median{unit}": lambda result: number(result.median),
+            f"95th percentile{unit}": lambda result: number(result.p95),
         },
     )
-    tested = contenders[0].name if contenders else ""
+    tested = results[0].name if results else ""
     rows = [
         [
-            one.name,
-            *(NOTHING if only is None else f"{only:,}" for only in (one.only_first, one.only_other)),
-            p_text(one.success_p),
-            f"{one.pairs:,}",
-            f"{number(one.mean)} ({number(one.lower)} to {number(one.upper)})" if one.pairs else NOTHING,
-            p_text(one.error_p),
+            *(d.name, *(NOTHING if cases is None else f"{cases:,}" for cases in (d.only_first, d.only_other))),
+            *(p_text(d.success_p), f"{d.pairs:,}"),
+            f"{number(d.mean)} ({number(d.lower)} to {number(d.upper)})" if d.pairs else NOTHING,
+            p_text(d.error_p),
         ]
-        for one in differences
+        for d in differences
     ]
-    return first, Grid(["Algorithm", f"Only {tested}", "Only it", "p", "Pairs", f"Difference{unit}", "p"], rows)
+    head = ["Algorithm", f"Success only: {tested}", "Success only: other", "p (success)", "Pairs"]
+    return first, Grid([*head, f"Difference{unit}", "p (error)"], rows)
 
 
 @dataclass(frozen=True)
-class Figure:
-    """One figure of a campaign, case by case.
+class Metric:
+    """One metric of a campaign, case by case.
 
-    larger_is_better: whether it is a rate of successes
-    values: 0 and 1 of a rate, or magnitudes; NaN for cases that do not count
+    larger_is_better: whether it is a success rate values: 0 and 1 of a rate, or magnitudes; NaN for excluded cases
     """
 
     name: str
@@ -209,75 +205,77 @@ class Figure:
 
     @property
     def text(self) -> str:
-        """The rate with its cases, or median and 95 % quantile."""
-        values = self.known
+        """The rate with its number of cases, or median and 95 % quantile."""
+        values = self.finite_values
         if values.size == 0:
             return NOTHING
         if self.larger_is_better:
-            return f"{percent(self.level)} of {values.size:,}"
-        return f"{number(self.level)}, 95 % {number(float(np.quantile(values, 0.95)))}"
+            return f"{percent(self.summary_value)} of {values.size:,}"
+        return f"{number(self.summary_value)}, 95 % {number(float(np.quantile(values, 0.95)))}"
 
     @property
-    def known(self) -> Float[np.ndarray, " known"]:
-        """Values of the cases that count."""
+    def finite_values(self) -> Float[np.ndarray, " finite"]:
+        """Values of the cases that are not excluded."""
         return np.asarray(self.values[np.isfinite(self.values)])
 
     @property
-    def level(self) -> float:
+    def summary_value(self) -> float:
         """The rate, or the median; NaN for no cases."""
-        values = self.known
+        values = self.finite_values
         if values.size == 0:
             return math.nan
         return float(values.mean() if self.larger_is_better else np.median(values))
 
 
 @dataclass(frozen=True)
-class Contrast:
-    """One figure of both campaigns, and the corrected two-sided p of their difference."""
+class MetricComparison:
+    """One metric of both campaigns, and the corrected two-sided p-value of their difference."""
 
     name: str
-    first: Figure
-    second: Figure
+    first: Metric
+    second: Metric
     p_value: float
 
 
-def list_figures(run: StoredRun) -> tuple[pd.DataFrame, list[Figure]]:
-    """The drawn cases of a campaign, and its figures: success by requirement, answers, completion, and magnitudes."""
-    frame = read_sampling_design(run.configuration).draw(run.frame)
-    figures: dict[str, Figure] = {}
-    metrics = dict.fromkeys([primary_metric(frame, run.requirements)])
-    for asked in run.requirements:
-        name, metric, bound = str(asked.get("id", "?")), str(asked.get("metric", "")), asked.get("bound")
+def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
+    """Return the random cases of a campaign and its metrics (success by requirement, answers, completion, errors)."""
+    frame = read_sampling_design(run.configuration).exclude_nominal_case(run.frame)
+    metrics: dict[str, Metric] = {}
+    error_columns = dict.fromkeys([primary_metric(frame, run.requirements)])
+    for requirement in run.requirements:
+        name, metric = str(requirement.get("id", "?")), str(requirement.get("metric", ""))
+        bound = requirement.get("bound")
         is_bounded = isinstance(bound, int | float)
         if metric not in frame or not (is_bounded or rates.is_flag(frame, metric)):
             continue
         try:
-            chosen = rates.members(frame, str(asked.get("population", "all")))
+            population = rates.members(frame, str(requirement.get("population", "all")))
         except ValueError:
             continue
-        limit, scale = (float(x) if isinstance(x, int | float) else math.nan for x in (bound, asked.get("scale", 1)))
+        numbers_or_none = (bound, requirement.get("scale", 1))
+        limit, scale = (float(x) if isinstance(x, int | float) else math.nan for x in numbers_or_none)
         success = success_mask(frame, metric, limit, scale)
-        figures[name] = Figure(name, True, np.where(chosen, success.astype(np.float64), np.nan))
+        metrics[name] = Metric(name, True, np.where(population, success.astype(np.float64), np.nan))
         if is_bounded:
-            metrics[metric] = None
-    for measured in filter(None, metrics):
-        magnitude = np.abs(numbers(frame, measured))
-        figures[measured] = Figure(label(measured), False, np.where(np.isfinite(magnitude), magnitude, np.nan))
+            error_columns[metric] = None
+    for column in filter(None, error_columns):
+        magnitude = np.abs(numbers(frame, column))
+        metrics[column] = Metric(label(column), False, np.where(np.isfinite(magnitude), magnitude, np.nan))
     if rates.is_flag(frame, "answered"):
-        figures["answered"] = Figure("answered", True, rates.members(frame, "valid").astype(np.float64))
-    figures["came to an end"] = Figure("came to an end", True, rates.members(frame, "completed").astype(np.float64))
-    return frame, list(figures.values())
+        metrics["answered"] = Metric("answered", True, rates.members(frame, "valid").astype(np.float64))
+    metrics["came to an end"] = Metric("came to an end", True, rates.members(frame, "completed").astype(np.float64))
+    return frame, list(metrics.values())
 
 
-def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[Contrast]]:
-    """Whether the campaigns' cases are pairs, and the contrasts of the figures that both have."""
-    frames, of_each = zip(*(list_figures(run) for run in (first, second)), strict=True)
+def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[MetricComparison]]:
+    """Return whether the campaigns' cases are pairs, and the comparisons of the metrics that both have."""
+    frames, metrics = zip(*(list_metrics(run) for run in (first, second)), strict=True)
     paired = same_draws(first, second)
-    theirs = {figure.name: figure for figure in of_each[1]}
-    both = [(figure, theirs[figure.name]) for figure in of_each[0] if figure.name in theirs]
-    test = _paired_p if paired else partial(_unpaired_p, common=have_same_terrains(first, second))
-    p_values = holm([test(frames[0], mine, frames[1], other) for mine, other in both])
-    return paired, [Contrast(mine.name, mine, other, p) for (mine, other), p in zip(both, p_values, strict=True)]
+    second_metrics = {metric.name: metric for metric in metrics[1]}
+    metric_pairs = [(metric, second_metrics[metric.name]) for metric in metrics[0] if metric.name in second_metrics]
+    test = _paired_p_value if paired else partial(_unpaired_p_value, common=have_same_terrains(first, second))
+    p_values = holm([test(frames[0], a, frames[1], b) for a, b in metric_pairs])
+    return paired, [MetricComparison(a.name, a, b, p) for (a, b), p in zip(metric_pairs, p_values, strict=True)]
 
 
 def same_draws(first: StoredRun, second: StoredRun) -> bool:
@@ -289,66 +287,64 @@ def same_draws(first: StoredRun, second: StoredRun) -> bool:
 
 def have_same_terrains(first: StoredRun, second: StoredRun) -> bool:
     """Whether equal terrain numbers are the same terrain: all parameters but the algorithm's are equal."""
-    worlds = [
+    parameters = [
         {name: value for name, value in table(run.recorded("parameters")).items() if name != "algorithm"}
         for run in (first, second)
     ]
-    return worlds[0] == worlds[1] and first.recorded("scenario") == second.recorded("scenario")
+    return parameters[0] == parameters[1] and first.recorded("scenario") == second.recorded("scenario")
 
 
-def campaign_diff_grid(names: Sequence[str], found: Sequence[Contrast]) -> Grid:
-    """Table of the figures side by side."""
+def campaign_diff_grid(names: Sequence[str], comparisons: Sequence[MetricComparison]) -> Grid:
+    """Create a table with the metrics of both campaigns."""
     head = ["", *names, "p"]
-    return Grid(head, [[one.name, one.first.text, one.second.text, p_text(one.p_value)] for one in found])
+    return Grid(head, [[row.name, row.first.text, row.second.text, p_text(row.p_value)] for row in comparisons])
 
 
-def campaign_diff_data(found: Sequence[Contrast]) -> list[dict[str, Any]]:
-    """The contrasts as plain data: rate or median of each campaign with its cases; None for NaN."""
+def campaign_diff_data(comparisons: Sequence[MetricComparison]) -> list[dict[str, Any]]:
+    """Convert the comparisons to JSON data: rate or median of each campaign with its cases; None for NaN."""
 
-    def level(figure: Figure) -> dict[str, Any]:
-        cases = figure.known.size
-        return {"rate" if figure.larger_is_better else "median": figure.level if cases else None, "cases": cases}
+    def summarize(metric: Metric) -> dict[str, Any]:
+        key, cases = "rate" if metric.larger_is_better else "median", metric.finite_values.size
+        return {key: metric.summary_value if cases else None, "cases": cases}
 
     return [
-        {
-            "name": one.name,
-            "first": level(one.first),
-            "second": level(one.second),
-            "p": None if math.isnan(one.p_value) else one.p_value,
-        }
-        for one in found
+        {"name": row.name, "first": summarize(row.first), "second": summarize(row.second)}
+        | {"p": None if math.isnan(row.p_value) else row.p_value}
+        for row in comparisons
     ]
 
 
-def build_sample(frame: pd.DataFrame, figure: Figure) -> Sample:
-    """A figure with the stored terrain number of each case, which is comparable between campaigns."""
+def build_sample(frame: pd.DataFrame, metric: Metric) -> Sample:
+    """Create a sample of a metric with the stored terrain numbers, which are comparable between campaigns."""
     groups = rates.terrain_groups(frame)
     if groups is None:
-        return Sample(figure.values, np.zeros(figure.values.size, dtype=np.int64))
-    named = pd.to_numeric(frame["terrain"], errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
-    # cases of unknown or non-numeric terrain get their own negative number
-    alone = ~np.isfinite(named)
-    return Sample(figure.values, np.where(alone, -1.0 - groups, np.nan_to_num(named)).astype(np.int64))
+        return Sample(metric.values, np.zeros(metric.values.size, dtype=np.int64))
+    terrains = pd.to_numeric(frame["terrain"], errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
+    # each case of unknown or non-numeric terrain has its own negative number
+    is_unknown = ~np.isfinite(terrains)
+    return Sample(metric.values, np.where(is_unknown, -1.0 - groups, np.nan_to_num(terrains)).astype(np.int64))
 
 
-def _unpaired_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Figure, *, common: bool) -> float:
-    here, there = build_sample(first, mine), build_sample(second, other)
-    if not common:  # equal numbers are other terrains, so renumber them
-        if not here.terrains.size or not there.terrains.size:
+def _unpaired_p_value(
+    first: pd.DataFrame, first_metric: Metric, second: pd.DataFrame, second_metric: Metric, *, common: bool
+) -> float:
+    first_sample, second_sample = build_sample(first, first_metric), build_sample(second, second_metric)
+    if not common:  # equal numbers are different terrains, so renumber them
+        if not first_sample.terrains.size or not second_sample.terrains.size:
             return math.nan
-        apart = there.terrains + (1 + int(here.terrains.max()) - int(there.terrains.min()))
-        there = Sample(there.values, apart)
-    return difference_p(here, there)
+        renumbered = second_sample.terrains + (1 + int(first_sample.terrains.max()) - int(second_sample.terrains.min()))
+        second_sample = Sample(second_sample.values, renumbered)
+    return difference_p(first_sample, second_sample)
 
 
-def _paired_p(first: pd.DataFrame, mine: Figure, second: pd.DataFrame, other: Figure) -> float:
-    _, here, there = np.intersect1d(first["case"], second["case"], return_indices=True)
-    a, b = mine.values[here], other.values[there]
-    both = np.isfinite(a) & np.isfinite(b)
-    if not both.any():
+def _paired_p_value(first: pd.DataFrame, first_metric: Metric, second: pd.DataFrame, second_metric: Metric) -> float:
+    _, first_index, second_index = np.intersect1d(first["case"], second["case"], return_indices=True)
+    a, b = first_metric.values[first_index], second_metric.values[second_index]
+    finite = np.isfinite(a) & np.isfinite(b)
+    if not finite.any():
         return math.nan
     groups = rates.terrain_groups(first)
-    shared = None if groups is None else groups[here][both]
-    if mine.larger_is_better:
-        return compare_successes(a[both] > 0.5, b[both] > 0.5, shared)[2]
-    return compare_errors(b[both] - a[both], shared, CONFIDENCE)[3]
+    finite_groups = None if groups is None else groups[first_index][finite]
+    if first_metric.larger_is_better:
+        return compare_successes(a[finite] > 0.5, b[finite] > 0.5, finite_groups)[2]
+    return compare_errors(b[finite] - a[finite], finite_groups, CONFIDENCE)[3]

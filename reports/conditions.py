@@ -28,14 +28,14 @@ from marsyard.reports.wording import (
     split_unit,
 )
 
-#: Prefixes of the condition columns in the order of the page; the first column of each prefix counts.
+#: Prefixes of the condition columns in the order of the page; the first column with each prefix is used.
 CONDITIONS = (
     "altitude_1", "altitude_m", "attitude_rate_max", "off_nadir_max", "site", "terrain_kind", "relief", "rms_slope",
     "sun_elevation", "horizontal_speed", "camera", "rock_diameter", "slip_mean", "tilt_max", "pose_error_fraction",
 )  # fmt: skip
-#: A column with up to so many values, and so many cases per value on average, gets a row for each value.
-MAX_KINDS, CASES_PER_KIND = 12, 10
-#: Other columns of numbers are cut into at least two and at most so many bins of about so many cases.
+#: A column with at most `MAX_VALUES` values and `CASES_PER_VALUE` cases per value on average has a row for each value.
+MAX_VALUES, CASES_PER_VALUE = 12, 10
+#: Other columns of numbers have 2 to `MAX_BINS` bins of about `CASES_PER_BIN` cases.
 CASES_PER_BIN, MAX_BINS = 40, 5
 QUANTILE = 0.99
 
@@ -45,52 +45,54 @@ def conditions_section(subject: Subject) -> Section | None:
     frame, metric = subject.frame, subject.metric
     if metric is None or not rates.is_flag(frame, "answered"):
         return None
-    tables = {column: [_bin(frame[chosen], metric, name) for name, chosen in bins] for column, bins in cuts(frame)}
-    known = [one for part in _parts(frame, metric) if (one := terrain_spread(frame, part)) is not None]
-    if not tables and not known:
+    tables = {
+        c: [_summarize_bin(frame[mask], metric, name) for name, mask in bins] for c, bins in bin_conditions(frame)
+    }
+    terrain_rows = [row for part in _signed_parts(frame, metric) if (row := terrain_variance(frame, part)) is not None]
+    if not tables and not terrain_rows:
         return None
-    blocks = [Block(heading=f"By {label(column)}", grid=_grid(frame, metric, bins)) for column, bins in tables.items()]
-    if known:
-        head = ["", "Terrains", "SD within", "SD between", "Share of variance between", "p"]
+    blocks = [Block(heading=f"By {label(name)}", grid=_bin_grid(frame, metric, bins)) for name, bins in tables.items()]
+    if terrain_rows:
+        head = ["", "Terrains", "SD within", "SD between", "Fraction of variance between terrains", "p"]
         rows = []
-        for one in known:
-            deviations = [number(one["within_sd"]), number(one["between_sd"])]
-            texts = [label(one["part"]), f"{one['terrains']:,}", *deviations, percent(one["share"])]
-            rows.append([*texts, number(one["p_value"])])
-        blocks.append(Block(heading="By terrain", grid=Grid(head, rows), note=_SPREAD_NOTE))
+        for row in terrain_rows:
+            deviations = [number(row["within_sd"]), number(row["between_sd"])]
+            texts = [label(row["part"]), f"{row['terrains']:,}", *deviations, percent(row["share"])]
+            rows.append([*texts, number(row["p_value"])])
+        blocks.append(Block(heading="By terrain", grid=Grid(head, rows), note=_TERRAINS_NOTE))
     note = note_text("common.conditions", confidence=format_fraction(CONFIDENCE), quantile=format_fraction(QUANTILE))
     data: dict[str, Any] = {
-        column: [one | {"answered": asdict(one["answered"])} for one in bins] for column, bins in tables.items()
+        column: [row | {"answered": asdict(row["answered"])} for row in bins] for column, bins in tables.items()
     }
-    data["between_terrains"] = known
+    data["between_terrains"] = terrain_rows
     title = "Errors and answers by condition"
     return Section("conditions", "Conditions", title, [*blocks, Block(note=note)], data)
 
 
-def cuts(frame: pd.DataFrame) -> Iterator[tuple[str, list[tuple[str, Bool[np.ndarray, " n"]]]]]:
-    """Conditions that vary: column, and names and members of the bins."""
-    for start in CONDITIONS:
-        columns = [str(name) for name in frame.columns if name == start or str(name).startswith(f"{start}_")]
+def bin_conditions(frame: pd.DataFrame) -> Iterator[tuple[str, list[tuple[str, Bool[np.ndarray, " n"]]]]]:
+    """Yield the conditions that vary: column, and names and masks of the bins."""
+    for prefix in CONDITIONS:
+        columns = [str(name) for name in frame.columns if name == prefix or str(name).startswith(f"{prefix}_")]
         for column in columns[:1]:
-            kinds = frame[column].dropna().nunique()
-            if 2 <= kinds <= MAX_KINDS and len(frame) >= CASES_PER_KIND * kinds:
+            n_values = frame[column].dropna().nunique()
+            if 2 <= n_values <= MAX_VALUES and len(frame) >= CASES_PER_VALUE * n_values:
                 values = sorted(frame[column].dropna().unique(), key=lambda value: (isinstance(value, str), value))
-                chosen = [frame[column].eq(value).fillna(False).to_numpy(dtype=np.bool_) for value in values]
-                yield column, list(zip(map(plain_value, values), chosen, strict=True))
-            elif kinds > 2 and pd.api.types.is_numeric_dtype(frame[column].dtype):
-                measured = numbers(frame, column)
-                finite = measured[np.isfinite(measured)]
+                masks = [frame[column].eq(value).fillna(False).to_numpy(dtype=np.bool_) for value in values]
+                yield column, list(zip(map(plain_value, values), masks, strict=True))
+            elif n_values > 2 and pd.api.types.is_numeric_dtype(frame[column].dtype):
+                x = numbers(frame, column)
+                finite = x[np.isfinite(x)]
                 bins = int(np.clip(finite.size // CASES_PER_BIN, 2, MAX_BINS))
                 edges = np.unique(np.quantile(finite, np.linspace(0.0, 1.0, bins + 1)))
-                positions = np.where(np.isfinite(measured), np.digitize(measured, edges[1:-1]), -1)
+                positions = np.where(np.isfinite(x), np.digitize(x, edges[1:-1]), -1)
                 names = [f"{number(low)} to {number(high)}" for low, high in pairwise(edges.tolist())]
                 yield column, [(name, positions == k) for k, name in enumerate(names)]
 
 
-_SPREAD_NOTE = note_text("common.terrains")
+_TERRAINS_NOTE = note_text("common.terrains")
 
 
-def terrain_spread(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
+def terrain_variance(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
     """Analysis of variance of an error column with terrains as random effects; None without repeated terrains.
 
     Keys: `within_sd` of errors within a terrain, `between_sd` of the terrains' means, `share` of the variance between
@@ -121,42 +123,42 @@ def terrain_spread(frame: pd.DataFrame, part: str) -> dict[str, Any] | None:
     }
 
 
-def _bin(chosen: pd.DataFrame, metric: str, name: str) -> dict[str, Any]:
-    """Answers and errors of a bin: means and standard deviations of the signed parts, bound of the 99 % quantile."""
-    answered = rates.members(chosen, "valid")
-    valid = chosen[answered]
+def _summarize_bin(rows: pd.DataFrame, metric: str, name: str) -> dict[str, Any]:
+    """Summarize a bin: answers, mean and standard deviation of the signed errors, bound of the 99 % quantile."""
+    answered = rates.members(rows, "valid")
+    valid = rows[answered]
     magnitude, groups = np.abs(numbers(valid, metric)), rates.terrain_groups(valid)
     finite = np.isfinite(magnitude)
-    magnitude, shared = magnitude[finite], None if groups is None else groups[finite]
-    parts = [numbers(valid, part) for part in _parts(chosen, metric)]
+    magnitude, finite_groups = magnitude[finite], None if groups is None else groups[finite]
+    parts = [numbers(valid, part) for part in _signed_parts(rows, metric)]
     parts = [part[np.isfinite(part)] for part in parts]
     return {
         "name": name,
-        "answered": rates.fraction_of(answered, chosen),
+        "answered": rates.fraction_of(answered, rows),
         "means": [float(part.mean()) if part.size else float("nan") for part in parts],
         "sds": [float(part.std(ddof=1)) if part.size > 1 else float("nan") for part in parts],
-        "quantile_bound": quantile_bounds(magnitude, QUANTILE, CONFIDENCE, shared)[1],
+        "quantile_bound": quantile_bounds(magnitude, QUANTILE, CONFIDENCE, finite_groups)[1],
         "largest": float(magnitude.max()) if magnitude.size else float("nan"),
     }
 
 
-def _grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]]) -> Grid:
-    columns = _parts(frame, metric)
+def _bin_grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]]) -> Grid:
+    columns = _signed_parts(frame, metric)
     axes = [""] if columns == [metric] else [f" {split_unit(part)[0].rsplit('_', 1)[-1]}" for part in columns]
     unit = split_unit(metric)[1]
     head = ["", "Cases", "Answered", "Interval"]
-    head += [f"{what}{axis} ({unit})" for axis in axes for what in ("Mean", "SD")]
+    head += [f"{statistic}{axis} ({unit})" for axis in axes for statistic in ("Mean", "SD")]
     head += [f"{format_fraction(QUANTILE)} bound", "Largest"]
     rows = []
-    for one in bins:
-        of_parts = [number(value) for pair in zip(one["means"], one["sds"], strict=True) for value in pair]
-        share, bound = one["answered"], one["quantile_bound"]
-        ends = [number(bound) if np.isfinite(bound) else "n too small", number(one["largest"])]
-        interval = rates.range_text(*share.sound)
-        rows.append([one["name"], f"{share.n:,}", percent(share.share), interval, *of_parts, *ends])
+    for row in bins:
+        part_texts = [number(value) for pair in zip(row["means"], row["sds"], strict=True) for value in pair]
+        answered, bound = row["answered"], row["quantile_bound"]
+        last_texts = [number(bound) if np.isfinite(bound) else "too few cases", number(row["largest"])]
+        interval = rates.range_text(*answered.clustered_interval)
+        rows.append([row["name"], f"{answered.n:,}", percent(answered.share), interval, *part_texts, *last_texts])
     return Grid(head, rows)
 
 
-def _parts(frame: pd.DataFrame, metric: str) -> list[str]:
-    """The metric's signed parts; the metric itself if it has none."""
+def _signed_parts(frame: pd.DataFrame, metric: str) -> list[str]:
+    """Return the metric's signed parts; the metric itself if it has none."""
     return axis_columns(metric, [str(name) for name in frame.columns]) or [metric]

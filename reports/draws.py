@@ -21,23 +21,23 @@ from marsyard.reports.section import GRID, INK, LARGEST_VECTOR_SAMPLE, MUTED, RA
 from marsyard.reports.wording import count, rank_correlation, split_unit
 
 #: Size of a marginal, height of a heading, margin of the figure, inches; minimum number of marginals in a row.
-_WIDTH, _HEIGHT, _HEAD, _MARGIN, _MIN_IN_ROW = 3.0, 1.9, 0.45, 0.15, 4
+_WIDTH, _HEIGHT, _HEADING_HEIGHT, _MARGIN, _MIN_PER_ROW = 3.0, 1.9, 0.45, 0.15, 4
 #: Side of a pair's cell, inches, and maximum number of paired parameters.
-_SIDE, MAX_PAIRED = 0.95, 24
-_CENTRED: dict[str, Any] = {"ha": "center", "va": "center", "color": INK}
+_CELL_SIDE, MAX_PAIRED = 0.95, 24
+_CENTERED_TEXT: dict[str, Any] = {"ha": "center", "va": "center", "color": INK}
 #: Maximum number of labelled bars, and of bins.
-_MAX_NAMED, _BINS = 8, 24
+_MAX_LABELS, _BINS = 8, 24
 
 
 Values = Float[np.ndarray, " _"]
 
 
 @dataclass(frozen=True)
-class Drawn:
-    """Drawn values of one parameter.
+class ParameterSample:
+    """Sampled values of one parameter.
 
-    values: of each case
-    expected: quantiles of the distribution at evenly spaced probabilities; None if it changes between cases
+    values: value of each case
+    expected: quantiles of the distribution at evenly spaced probabilities; None if it differs between cases
     """
 
     path: str
@@ -52,53 +52,56 @@ class Drawn:
 
     @property
     def short_name(self) -> str:
-        """The end of its path without unit; with the index for an element of a list."""
+        """The last name of the path without unit; for an element of a list, with its index."""
         table, _, last = self.path.rpartition(".")
         return f"{table.rpartition('.')[2]}_{last}" if last.isdigit() else split_unit(last)[0]
 
     @property
-    def kinds(self) -> list[str] | None:
+    def categories(self) -> list[str] | None:
         """Distinct values in order; None for numbers."""
         if all(isinstance(value, int | float) and not isinstance(value, bool) for value in self.values):
             return None
-        return list(dict.fromkeys(_text(value) for value in [*(self.expected or ()), *self.values]))
+        return list(dict.fromkeys(_format_value(value) for value in [*(self.expected or ()), *self.values]))
 
     def numbers(self, values: Sequence[Any]) -> Values:
-        """Values as numbers, by index for other kinds."""
-        kinds = self.kinds
-        return np.array([float(value) if kinds is None else float(kinds.index(_text(value))) for value in values])
+        """Convert values to numbers; categories to their index."""
+        categories = self.categories
+        if categories is None:
+            return np.array([float(value) for value in values])
+        return np.array([float(categories.index(_format_value(value))) for value in values])
 
 
 @in_page_style
-def draws_figure(title: str, drawn: Sequence[Drawn]) -> Figure:
-    """Marginals of at least one parameter above, and below them all pairs of those that vary."""
-    varying = [one for one in drawn if len(set(one.numbers(one.values).tolist())) > 1][:MAX_PAIRED]
-    side = len(varying) * _SIDE if len(varying) > 1 else 0.0
-    width = max(min(len(drawn), _MIN_IN_ROW) * _WIDTH, side, 2.0 * _WIDTH)
-    in_row = min(len(drawn), int(width / _WIDTH))
-    rows = math.ceil(len(drawn) / in_row)
-    upper, lower = rows * _HEIGHT + _HEAD, side + _HEAD if side else 0.0
-    figure = Figure(figsize=(width + 2.0 * _MARGIN, upper + lower))
-    cases = count(len(drawn[0].values), "case")
-    _heading(figure, upper + lower, f"{title}: {cases} as drawn. Line: expected from the distribution")
-    for place, one in enumerate(drawn):
-        row, column = divmod(place, in_row)
-        box = (_MARGIN + column * width / in_row + 0.3, lower + (rows - 1 - row) * _HEIGHT + 0.45)
-        _marginal(_add_axes(figure, box, (width / in_row - 0.55, _HEIGHT - 0.85)), one)
+def draws_figure(title: str, samples: Sequence[ParameterSample]) -> Figure:
+    """Draw the marginal distributions of at least one parameter, and below them all pairs of parameters that vary."""
+    varying = [sample for sample in samples if len(set(sample.numbers(sample.values).tolist())) > 1][:MAX_PAIRED]
+    side = len(varying) * _CELL_SIDE if len(varying) > 1 else 0.0
+    width = max(min(len(samples), _MIN_PER_ROW) * _WIDTH, side, 2.0 * _WIDTH)
+    per_row = min(len(samples), int(width / _WIDTH))
+    rows = math.ceil(len(samples) / per_row)
+    upper_height, lower_height = rows * _HEIGHT + _HEADING_HEIGHT, side + _HEADING_HEIGHT if side else 0.0
+    figure = Figure(figsize=(width + 2.0 * _MARGIN, upper_height + lower_height))
+    cases = count(len(samples[0].values), "case")
+    heading = f"{title}: {cases} as sampled. Line: expected from the distribution"
+    _write_heading(figure, upper_height + lower_height, heading)
+    for index, sample in enumerate(samples):
+        row, column = divmod(index, per_row)
+        box = (_MARGIN + column * width / per_row + 0.3, lower_height + (rows - 1 - row) * _HEIGHT + 0.45)
+        _draw_marginal(_add_axes(figure, box, (width / per_row - 0.55, _HEIGHT - 0.85)), sample)
     if side:
-        _heading(figure, lower, "Pairs: below, one against the other; above, Spearman's rank correlation")
+        _write_heading(figure, lower_height, "Pairs. Lower left: values; upper right: Spearman's rank correlation")
         left = _MARGIN + 0.5 * (width - side)
-        _pairs(_add_axes(figure, (left, 0.5 * _MARGIN), (side, side)), varying)
+        _draw_pairs(_add_axes(figure, (left, 0.5 * _MARGIN), (side, side)), varying)
     return figure
 
 
 def _add_axes(figure: Figure, corner: tuple[float, float], size: tuple[float, float]) -> Axes:
-    """Axes at a position in inches, which is much faster than a layout engine for many panels."""
+    """Add axes at a position in inches; much faster than a layout engine for many panels."""
     width, height = figure.get_size_inches()
     return figure.add_axes((corner[0] / width, corner[1] / height, size[0] / width, size[1] / height))
 
 
-def _heading(figure: Figure, top: float, text: str) -> None:
+def _write_heading(figure: Figure, top: float, text: str) -> None:
     width, height = figure.get_size_inches()
     figure.text(_MARGIN / width, (top - 0.1) / height, text, fontsize=12, fontweight="bold", color=INK, va="top")
 
@@ -108,58 +111,59 @@ def save_figure(figure: Figure, path: Path) -> None:
     figure.savefig(path, dpi=RASTER_DPI, facecolor="white")
 
 
-def _marginal(axes: Axes, drawn: Drawn) -> None:
-    kinds, values = drawn.kinds, drawn.numbers(drawn.values)
-    expected = None if drawn.expected is None else drawn.numbers(drawn.expected)
-    known = values if expected is None else np.concatenate([values, expected])
-    levels = np.unique(known)
-    if kinds is not None or (levels.size <= 12 and np.all(levels == np.round(levels, 9))):
-        places = np.arange(levels.size)
-        axes.bar(places, [(values == level).sum() for level in levels], width=0.7, color=SERIES[0])
+def _draw_marginal(axes: Axes, sample: ParameterSample) -> None:
+    categories, values = sample.categories, sample.numbers(sample.values)
+    expected = None if sample.expected is None else sample.numbers(sample.expected)
+    union = values if expected is None else np.concatenate([values, expected])
+    levels = np.unique(union)
+    if categories is not None or (levels.size <= 12 and np.all(levels == np.round(levels, 9))):
+        positions = np.arange(levels.size)
+        axes.bar(positions, [(values == level).sum() for level in levels], width=0.7, color=SERIES[0])
         if expected is not None:
             heights = [(expected == level).mean() * values.size for level in levels]
-            axes.plot(places, heights, linestyle="none", marker="_", markersize=14, color=INK, markeredgewidth=1.6)
-        names = [f"{level:g}" for level in levels] if kinds is None else [kinds[int(level)] for level in levels]
-        if len(names) <= _MAX_NAMED:
-            axes.set_xticks(places, [name if len(name) <= 14 else f"{name[:13]}…" for name in names])
+            axes.plot(positions, heights, linestyle="none", marker="_", markersize=14, color=INK, markeredgewidth=1.6)
+        names = [f"{level:g}" if categories is None else categories[int(level)] for level in levels]
+        if len(names) <= _MAX_LABELS:
+            axes.set_xticks(positions, [name if len(name) <= 14 else f"{name[:13]}…" for name in names])
     else:
-        edges = np.linspace(known.min(), known.max(), min(_BINS, max(5, int(math.sqrt(values.size) * 1.5))) + 1)
+        edges = np.linspace(union.min(), union.max(), min(_BINS, max(5, int(math.sqrt(values.size) * 1.5))) + 1)
         axes.hist(values, bins=edges.tolist(), color=SERIES[0], alpha=0.85)
         if expected is not None:
             counts = np.histogram(expected, bins=edges)[0] * (values.size / expected.size)
             axes.stairs(counts, edges, color=INK, linewidth=1.4)
-    axes.set_title(drawn.name, fontsize=9)
+    axes.set_title(sample.name, fontsize=9)
     axes.set_ylim(0.0, None)
     axes.yaxis.set_major_locator(MaxNLocator(nbins=4, integer=True))
     axes.tick_params(labelsize=8)
 
 
-def _pairs(axes: Axes, drawn: Sequence[Drawn]) -> None:
+def _draw_pairs(axes: Axes, samples: Sequence[ParameterSample]) -> None:
     """Draw pairs of parameters: scatter in the lower left, rank correlations in the upper right."""
-    size = len(drawn)
-    numbers = [one.numbers(one.values) for one in drawn]
-    shares = [0.08 + 0.84 * (values - values.min()) / np.ptp(values) for values in numbers]
-    below = [(row, column) for row in range(size) for column in range(row)]
-    x = np.concatenate([column + shares[column] for row, column in below])
-    y = np.concatenate([row + 1.0 - shares[row] for row, column in below])
+    size = len(samples)
+    numbers = [sample.numbers(sample.values) for sample in samples]
+    scaled = [0.08 + 0.84 * (values - values.min()) / np.ptp(values) for values in numbers]
+    pairs = [(row, column) for row in range(size) for column in range(row)]
+    x = np.concatenate([column + scaled[column] for row, column in pairs])
+    y = np.concatenate([row + 1.0 - scaled[row] for row, column in pairs])
     marks: dict[str, Any] = {"s": 4.0, "color": SERIES[0], "alpha": 0.7, "linewidths": 0.0}
     axes.scatter(x, y, rasterized=x.size > LARGEST_VECTOR_SAMPLE, **marks)
-    cells = [Rectangle((column + 0.03, row + 0.03), 0.94, 0.94) for row, column in below]
+    cells = [Rectangle((column + 0.03, row + 0.03), 0.94, 0.94) for row, column in pairs]
     axes.add_collection(PatchCollection(cells, facecolor="none", edgecolor=GRID, linewidth=0.8))
-    for place, one in enumerate(drawn):
-        axes.text(place + 0.5, place + 0.5, one.short_name.replace("_", "\n"), fontsize=8, **_CENTRED)
-    for row, column in below:
+    for index, sample in enumerate(samples):
+        axes.text(index + 0.5, index + 0.5, sample.short_name.replace("_", "\n"), fontsize=8, **_CENTERED_TEXT)
+    for row, column in pairs:
         correlation = rank_correlation(numbers[row], numbers[column])
         if math.isnan(correlation):
             continue
-        # bold: beyond 3.3 / sqrt(n - 1), which is unlikely by chance
-        beyond = abs(correlation) > 3.3 / math.sqrt(max(numbers[0].size - 1, 1))
+        # bold: above 3.3 / sqrt(n - 1), which is unlikely by chance
+        is_significant = abs(correlation) > 3.3 / math.sqrt(max(numbers[0].size - 1, 1))
         text = f"{correlation + 0.0:+.2f}".replace("-", "−") if abs(correlation) >= 0.005 else "0.00"
-        style = _CENTRED | {"fontweight": "bold" if beyond else "normal", "color": SERIES[1] if beyond else MUTED}
+        weight, color = ("bold", SERIES[1]) if is_significant else ("normal", MUTED)
+        style = _CENTERED_TEXT | {"fontweight": weight, "color": color}
         axes.text(row + 0.5, column + 0.5, text, fontsize=8, **style)
     axes.set(xlim=(0, size), ylim=(size, 0))
     axes.set_axis_off()
 
 
-def _text(value: Any) -> str:
+def _format_value(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value, default=str)

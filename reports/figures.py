@@ -16,7 +16,7 @@ from matplotlib.patches import Circle, Ellipse
 from matplotlib.ticker import LogFormatter, MaxNLocator, PercentFormatter
 
 from marsyard.reports import section
-from marsyard.reports.rates import ENGINE_FAILURES, PooledRate, Share
+from marsyard.reports.rates import ENGINE_FAILURES, CaseFraction, PooledRate
 from marsyard.reports.section import BARS, INK, MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.statistics.samples import error_ellipse
 from marsyard.reports.tables import answered_outcomes, outcome_counts
@@ -30,50 +30,50 @@ from marsyard.reports.wording import (
     plain_value,
     split_unit,
 )
-from marsyard.reports.wording import count as counted
+from marsyard.reports.wording import count as count_text
 
 #: Probability of the ellipse about the errors.
 ELLIPSE = 0.95
-#: Errors beyond this many times the bound are counted beyond the axis, so that they do not hide the others.
+#: Maximum error on the axis in multiples of the bound; larger errors are counted, not drawn to scale.
 _MAX_BOUNDS = 3.0
-#: If a larger fraction of the errors lies beyond the axis, the axis ends at this quantile of the errors.
-_MAX_BEYOND, _EDGE_QUANTILE = 0.25, 0.95
-#: Cases of a point of a conditional curve, and minimum and maximum number of points.
+#: If a larger fraction of the errors would lie beyond the axis, the axis ends at this quantile of the errors.
+_MAX_FRACTION_BEYOND, _EDGE_QUANTILE = 0.25, 0.95
+#: Number of cases per point of a conditional curve, and minimum and maximum number of points.
 _CASES_PER_POINT, _MIN_POINTS, _MAX_POINTS = 25, 4, 16
-_BELOW: Mapping[str, Any] = {"loc": "upper center", "ncols": 2, "handletextpad": 0.2}
+_LEGEND_BELOW: Mapping[str, Any] = {"loc": "upper center", "ncols": 2, "handletextpad": 0.2}
 
 
 @dataclass(frozen=True)
 class Category:
-    """Cases of one kind: name, mask, colour and marker."""
+    """A category of cases: name, mask, colour and marker."""
 
     name: str
-    chosen: Bool[np.ndarray, " n"]
+    mask: Bool[np.ndarray, " n"]
     colour: str
     marker: str
 
 
 def categories(frame: pd.DataFrame, metric: str, bound: float | None) -> list[Category]:
-    """Kinds of points: by a column of few values, else within and beyond the bound."""
+    """Divide the cases into categories: by a column of few values, else within and beyond the bound."""
     column = category_column(frame)
     if column is not None:
         values = sorted(frame[column].dropna().unique(), key=lambda value: (isinstance(value, str), value))
-        of_each = [(f"{label(column)} {plain_value(value)}", frame[column].eq(value).fillna(False)) for value in values]
-        kinds = [(name, chosen.to_numpy(dtype=np.bool_)) for name, chosen in of_each]
+        names = [f"{label(column)} {plain_value(value)}" for value in values]
+        masks = [frame[column].eq(value).fillna(False).to_numpy(dtype=np.bool_) for value in values]
     elif bound is not None:
         magnitude = np.abs(numbers(frame, metric))
-        kinds = [("within the bound", magnitude <= bound), ("beyond the bound", magnitude > bound)]
-        kinds = [(name, chosen) for name, chosen in kinds if chosen.any()]
+        pairs = [("within the bound", magnitude <= bound), ("beyond the bound", magnitude > bound)]
+        names, masks = [name for name, mask in pairs if mask.any()], [mask for _, mask in pairs if mask.any()]
     else:
-        kinds = [("cases", np.ones(len(frame), dtype=np.bool_))]
-    return [Category(name, chosen, SERIES[k], MARKERS[k]) for k, (name, chosen) in enumerate(kinds)]
+        names, masks = ["cases"], [np.ones(len(frame), dtype=np.bool_)]
+    return [Category(name, masks[k], SERIES[k], MARKERS[k]) for k, name in enumerate(names)]
 
 
 @in_page_style
-def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, close: bool = False) -> Figure | None:
+def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, enlarged: bool = False) -> Figure | None:
     """Signed errors x against y with the requirement's circle (the paper's Fig. 10); None without both parts.
 
-    close: fit the axes to the errors, also if the circle then lies outside
+    enlarged: fit the axes to the errors, even if the circle lies outside them
     """
     parts = axis_columns(metric, [str(column) for column in frame.columns])[:2]
     if len(parts) < 2:
@@ -84,18 +84,18 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
         return None
     ellipse = error_ellipse(points, ELLIPSE)
     limit = 1.08 * float(np.abs(points[finite]).max()) or 1.0
-    if not close and bound is not None and bound > 0.0:
+    if not enlarged and bound is not None and bound > 0.0:
         inner_limit = 1.05 * axis_edge(np.abs(points[finite]).max(axis=1), bound)
         limit = min(limit, inner_limit) if limit > 1.15 * bound else 1.15 * bound
-    if close and ellipse is not None:
-        limit = max(limit, ellipse.reach)
+    if enlarged and ellipse is not None:
+        limit = max(limit, ellipse.half_extent)
     figure, axes = new_axes(5.0, 4.9)
     inside = (np.abs(points) <= limit).all(axis=1)
-    for kind in categories(frame, metric, bound):
-        x, y = points[kind.chosen & finite & inside].T
-        _draw_points(axes, x, y, kind)
-        x, y = np.clip(points[kind.chosen & finite & ~inside], -limit, limit).T
-        _draw_points(axes, x, y, kind, hollow=True)
+    for category in categories(frame, metric, bound):
+        x, y = points[category.mask & finite & inside].T
+        _draw_points(axes, x, y, category)
+        x, y = np.clip(points[category.mask & finite & ~inside], -limit, limit).T
+        _draw_points(axes, x, y, category, hollow=True)
     if (finite & ~inside).any():
         axes.plot([], [], "o", markerfacecolor="none", color=INK, label=f"{(finite & ~inside).sum():,} beyond the axes")
     if bound is not None:
@@ -111,12 +111,12 @@ def error_scatter(frame: pd.DataFrame, metric: str, bound: float | None, *, clos
     axes.axvline(0.0, color=MUTED, linewidth=0.8, zorder=1)
     axes.set(xlim=(-limit * 1.04, limit * 1.04), ylim=(-limit * 1.04, limit * 1.04), aspect="equal")
     axes.set(xlabel=label(parts[0]), ylabel=label(parts[1]))
-    axes.legend(bbox_to_anchor=(0.5, -0.14), **_BELOW)
+    axes.legend(bbox_to_anchor=(0.5, -0.14), **_LEGEND_BELOW)
     return figure
 
 
 def axis_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float:
-    """End of an axis of magnitudes: the maximum, limited to 1.1 to 3 times the bound.
+    """Compute the end of an axis of magnitudes: the maximum, limited to 1.1 to 3 times the bound.
 
     If more than a quarter of the magnitudes lie beyond 3 times the bound, it is their 95 % quantile.
     """
@@ -125,13 +125,13 @@ def axis_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float
     largest = float(magnitudes.max())
     if bound is None or bound <= 0.0:
         return largest or 1.0
-    if float(np.mean(magnitudes > _MAX_BOUNDS * bound)) > _MAX_BEYOND:
+    if float(np.mean(magnitudes > _MAX_BOUNDS * bound)) > _MAX_FRACTION_BEYOND:
         return float(np.quantile(magnitudes, _EDGE_QUANTILE, method="higher"))
     return min(max(largest, 1.1 * bound), _MAX_BOUNDS * bound)
 
 
 def needs_enlarged_figure(frame: pd.DataFrame, metric: str, bound: float | None) -> bool:
-    """Whether all errors are so small against the bound that a figure of their own extent is needed."""
+    """Whether all errors are so small relative to the bound that an enlarged figure is needed."""
     magnitude = np.abs(numbers(frame, metric))
     finite = magnitude[np.isfinite(magnitude)]
     return bound is not None and finite.size > 0 and 0.0 < float(finite.max()) < 0.6 * bound
@@ -139,22 +139,22 @@ def needs_enlarged_figure(frame: pd.DataFrame, metric: str, bound: float | None)
 
 @in_page_style
 def error_histogram(frame: pd.DataFrame, metric: str, bound: float | None) -> Figure | None:
-    """Histogram of error magnitudes, with a bar for those beyond the axis; None without errors."""
+    """Histogram of error magnitudes, with a bar for errors beyond the axis; None without errors."""
     magnitude, edge = _magnitudes(frame, metric, bound)
     if magnitude.size == 0:
         return None
     figure, axes = new_axes(5.0, 2.7)
-    drawn = magnitude[magnitude <= edge]
-    largest = float(drawn.max()) if drawn.size else edge
+    on_axis = magnitude[magnitude <= edge]
+    largest = float(on_axis.max()) if on_axis.size else edge
     bins = np.linspace(0.0, largest or 1.0, 1 + int(np.clip(2 * math.sqrt(magnitude.size), 6, 60)))
-    axes.hist(drawn, bins=list(bins), color=SERIES[0], alpha=0.85)
-    beyond = magnitude.size - drawn.size
+    axes.hist(on_axis, bins=list(bins), color=SERIES[0], alpha=0.85)
+    beyond = magnitude.size - on_axis.size
     axes.set(xlabel=magnitude_label(metric), ylabel="cases", xlim=(0.0, edge * 1.02))
     if beyond:  # a hatched bar beyond the axis
         axes.bar(1.11 * edge, beyond, width=0.07 * edge, color="none", edgecolor=SERIES[1], hatch="////")
         axes.axvline(1.04 * edge, color=MUTED, linewidth=0.8)
-        text, at = f"{beyond:,}\n> {edge:.3g}", (1.11 * edge, beyond)
-        _annotate(axes, text, at, (0, 2), ha="center", va="bottom", fontsize=8)
+        text, position = f"{beyond:,}\n> {edge:.3g}", (1.11 * edge, beyond)
+        _annotate(axes, text, position, (0, 2), ha="center", va="bottom", fontsize=8)
         axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= edge])
         axes.set_xlim(0.0, 1.18 * edge)
         axes.margins(y=0.25)
@@ -165,17 +165,17 @@ def error_histogram(frame: pd.DataFrame, metric: str, bound: float | None) -> Fi
 
 @in_page_style
 def error_distribution(frame: pd.DataFrame, metric: str, bound: float | None) -> Figure | None:
-    """Fraction of cases with an error up to each magnitude, and how many lie beyond; None where no case has one."""
+    """Fraction of cases with an error up to each magnitude, and the number beyond the axis; None without errors."""
     magnitude, edge = _magnitudes(frame, metric, bound)
     if magnitude.size == 0:
         return None
     figure, axes = new_axes(5.0, 2.7)
     ordered = np.sort(magnitude)
-    if ordered.size > 2000:  # the steps are finer than the line is wide
+    if ordered.size > 2000:  # more steps cannot be distinguished
         ordered = np.quantile(ordered, np.linspace(0.0, 1.0, 2000))
-    share = np.arange(1, ordered.size + 1) / ordered.size
+    fraction = np.arange(1, ordered.size + 1) / ordered.size
     steps = np.concatenate([[0.0], ordered, [max(edge, float(ordered[-1]))]])
-    axes.plot(steps, np.concatenate([[0.0], share, [1.0]]), drawstyle="steps-post", color=SERIES[0], linewidth=1.8)
+    axes.plot(steps, np.concatenate([[0.0], fraction, [1.0]]), drawstyle="steps-post", color=SERIES[0], linewidth=1.8)
     axes.set(xlabel=magnitude_label(metric), ylabel="fraction of cases with an error", xlim=(0.0, edge * 1.02))
     _bound_line(axes, metric, bound, 0.2)
     axes.set_ylim(0.0, 1.03)
@@ -184,61 +184,62 @@ def error_distribution(frame: pd.DataFrame, metric: str, bound: float | None) ->
 
 
 def note_beyond(axes: Axes, beyond: int) -> None:
-    """Write the number of cases beyond the axis at the right edge of a cumulative curve; nothing for none."""
+    """Write the number of cases beyond the axis at the right edge of a cumulative curve, if there are any."""
     if beyond:
-        text = f"{counted(beyond, 'case')} beyond →"
+        text = f"{count_text(beyond, 'case')} beyond →"
         axes.annotate(text, (0.985, 0.04), xycoords="axes fraction", ha="right", va="bottom", color=INK, fontsize=9)
 
 
 @in_page_style
 def error_scatter_against(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> Figure | None:
-    """Errors against a condition; None without numbers.
+    """Scatter of errors against a condition; None without numbers.
 
-    Cases without an error are ticks on the upper edge, errors beyond the axis hollow marks below it.
+    Cases without an error are ticks at the upper edge; errors beyond the axis are hollow markers below it.
     """
     x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
     finite = np.isfinite(x) & np.isfinite(magnitude)
-    silent = np.isfinite(x) & ~np.isfinite(magnitude)
-    if not (finite | silent).any():
+    unanswered = np.isfinite(x) & ~np.isfinite(magnitude)
+    if not (finite | unanswered).any():
         return None
     figure, axes = new_axes(4.2, 3.2)
     edge = _scatter_edge(magnitude[finite], bound)
     top = 1.12 * edge
-    kinds = categories(frame, metric, bound)
-    for kind in kinds:
-        inside, beyond = (kind.chosen & finite & which for which in (magnitude <= edge, magnitude > edge))
-        _draw_points(axes, x[inside], magnitude[inside], kind)
-        _draw_points(axes, x[beyond], np.full(beyond.sum(), 1.06 * edge), kind, hollow=True)
-    if len(kinds) > 1 and not axis_columns(metric, [str(name) for name in frame.columns]):
+    groups = categories(frame, metric, bound)
+    for group in groups:
+        inside, beyond = (group.mask & finite & on_scale for on_scale in (magnitude <= edge, magnitude > edge))
+        _draw_points(axes, x[inside], magnitude[inside], group)
+        _draw_points(axes, x[beyond], np.full(beyond.sum(), 1.06 * edge), group, hollow=True)
+    if len(groups) > 1 and not axis_columns(metric, [str(name) for name in frame.columns]):
         # otherwise the scatter figure has the legend
-        axes.legend(bbox_to_anchor=(0.5, -0.18), **_BELOW)
+        axes.legend(bbox_to_anchor=(0.5, -0.18), **_LEGEND_BELOW)
     bins = min(int(finite.sum()) // _CASES_PER_POINT, _MAX_POINTS)
     if bins >= _MIN_POINTS:  # median (solid) and 95 % quantile (dotted) of bins of equally many cases
-        of_x, limited = x[finite], np.minimum(magnitude[finite], 1.06 * edge)
-        parts = np.array_split(np.argsort(of_x, kind="stable"), bins)
-        middles = [float(np.median(of_x[part])) for part in parts]
+        finite_x, limited = x[finite], np.minimum(magnitude[finite], 1.06 * edge)
+        parts = np.array_split(np.argsort(finite_x, kind="stable"), bins)
+        centres = [float(np.median(finite_x[part])) for part in parts]
         for quantile, line in ((0.5, "-"), (0.95, ":")):
             values = [float(np.quantile(limited[part], quantile)) for part in parts]
-            axes.plot(middles, values, line, color=INK, zorder=4)
+            axes.plot(centres, values, line, color=INK, zorder=4)
     if bound is not None and bound <= top:
         axes.axhline(bound, color=REQUIREMENT, linewidth=1.4, linestyle="--", zorder=3)
-    raster = bool(silent.sum() > section.LARGEST_VECTOR_SAMPLE)
-    axes.plot(x[silent], np.full(silent.sum(), top), "|", color=INK, markersize=9, clip_on=False, rasterized=raster)
+    ticks: dict[str, Any] = {"color": INK, "markersize": 9, "clip_on": False}
+    ticks["rasterized"] = bool(unanswered.sum() > section.LARGEST_VECTOR_SAMPLE)
+    axes.plot(x[unanswered], np.full(unanswered.sum(), top), "|", **ticks)
     axes.set(xlabel=label(driver), ylabel=magnitude_label(metric), ylim=(0.0, top))
     axes.xaxis.set_major_locator(MaxNLocator(5))
     return figure
 
 
 def _scatter_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float:
-    """Largest magnitude drawn to scale; the axis includes a bound that is near."""
+    """Largest magnitude drawn to scale; the axis includes the bound if the errors approach it."""
     edge = axis_edge(magnitudes, bound)
     largest = float(magnitudes.max()) if magnitudes.size else 0.0
-    near = bound is not None and 1.12 * largest > 0.6 * bound
-    return edge if near or largest == 0.0 else largest
+    includes_bound = bound is not None and 1.12 * largest > 0.6 * bound
+    return edge if includes_bound or largest == 0.0 else largest
 
 
 def count_beyond_axis(frame: pd.DataFrame, metric: str, driver: str, bound: float | None) -> int:
-    """Number of hollow marks of `error_scatter_against`."""
+    """Count the hollow markers of `error_scatter_against`."""
     x, magnitude = numbers(frame, driver), np.abs(numbers(frame, metric))
     finite = magnitude[np.isfinite(x) & np.isfinite(magnitude)]
     return int((finite > _scatter_edge(finite, bound)).sum())
@@ -252,10 +253,10 @@ def outcome_bars(frame: pd.DataFrame) -> Figure | None:
         return None
     answered = answered_outcomes(frame)
     figure, axes = new_axes(6.4, 0.75 + 0.36 * len(counts))
-    for place, (name, count) in enumerate(counts):
+    for row, (name, count) in enumerate(counts):
         style = "crossed" if name in ENGINE_FAILURES else "full" if name in answered else "hatched"
-        axes.barh(place, count, height=0.66, **BARS[style])
-        _annotate(axes, f"{count:,}", (count, place), (4, 0), va="center")
+        axes.barh(row, count, height=0.66, **BARS[style])
+        _annotate(axes, f"{count:,}", (count, row), (4, 0), va="center")
     axes.set_yticks(range(len(counts)), [name for name, _ in counts])
     axes.set(xlabel="cases", xlim=(0.0, 1.12 * max(count for _, count in counts)))
     axes.invert_yaxis()
@@ -264,9 +265,9 @@ def outcome_bars(frame: pd.DataFrame) -> Figure | None:
     return figure
 
 
-def _annotate(axes: Axes, text: str, at: tuple[Any, Any], shift: tuple[int, int], **style: Any) -> None:
+def _annotate(axes: Axes, text: str, position: tuple[Any, Any], offset: tuple[int, int], **style: Any) -> None:
     style = {"fontsize": 9, **style}
-    axes.annotate(text, at, xytext=shift, textcoords="offset points", color=INK, **style)
+    axes.annotate(text, position, xytext=offset, textcoords="offset points", color=INK, **style)
 
 
 def _magnitudes(frame: pd.DataFrame, metric: str, bound: float | None) -> tuple[Float[np.ndarray, " known"], float]:
@@ -276,13 +277,13 @@ def _magnitudes(frame: pd.DataFrame, metric: str, bound: float | None) -> tuple[
 
 
 def _draw_points(
-    axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], kind: Category, *, hollow: bool = False
+    axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], category: Category, *, hollow: bool = False
 ) -> None:
     many = x.size > section.LARGEST_VECTOR_SAMPLE
     axes.plot(
-        x, y, linestyle="", marker=kind.marker, markersize=3.0 if many else 5.5, alpha=0.55 if many else 0.85,
-        markeredgewidth=1.0 if hollow else 0.0, markerfacecolor="none" if hollow else kind.colour, color=kind.colour,
-        label="_beyond" if hollow else kind.name, rasterized=many, zorder=2,
+        x, y, linestyle="", marker=category.marker, markersize=3.0 if many else 5.5, alpha=0.55 if many else 0.85,
+        markeredgewidth=1.0 if hollow else 0.0, markerfacecolor="none" if hollow else category.colour,
+        color=category.colour, label="_beyond" if hollow else category.name, rasterized=many, zorder=2,
     )  # fmt: skip
 
 
@@ -291,7 +292,7 @@ def _bound_line(axes: Axes, metric: str, bound: float | None, height: float) -> 
     if bound is None:
         return
     axes.axvline(bound, color=REQUIREMENT, linewidth=1.6, linestyle="--", zorder=3)
-    # the text is left of the line unless the line is too near to the y axis
+    # the text is left of the line unless the line is too close to the y axis
     left = bound > 0.3 * axes.get_xlim()[1]
     text, side = f"requirement {bound:g} {split_unit(metric)[1]}", "right" if left else "left"
     shift = (-5 if left else 5, 0)
@@ -308,61 +309,60 @@ def cumulative_figure(
     curves: Mapping[str, Values],
     labels: tuple[str, str],
     *,
-    falling: bool = False,
+    complementary: bool = False,
     bound: float | None = None,
     limits: Mapping[str, Sequence[float]] | None = None,
 ) -> Figure:
-    """Fraction of cases up to each value, or beyond it if `falling`; curves without values are left out.
+    """Fraction of cases up to each value, or above it if `complementary`; curves without values are omitted.
 
-    labels: of the x and the y axis
-    bound: a requirement; the x axis ends near it, and values beyond are counted
-    limits: further vertical lines by name
+    labels: labels of the x and y axes bound: a requirement; the x axis ends close to it, and values beyond the axis are
+    counted limits: positions of additional vertical lines by name
     """
     figure, axes = new_axes(6.4, 3.4)
-    every = np.concatenate([*curves.values()])
-    edge = None if bound is None else max(1.25 * bound, axis_edge(every, bound))
+    all_values = np.concatenate([*curves.values()])
+    edge = None if bound is None else max(1.25 * bound, axis_edge(all_values, bound))
     for (name, values), colour, line in zip(curves.items(), SERIES, _LINES * 2, strict=False):
         if values.size:
-            x, share = np.concatenate([[0.0], np.sort(values)]), np.arange(values.size + 1) / values.size
+            x, fraction = np.concatenate([[0.0], np.sort(values)]), np.arange(values.size + 1) / values.size
             if edge is not None:
-                x, share = np.append(x, max(edge, x[-1])), np.append(share, 1.0)
-            y = 1.0 - share if falling else share
+                x, fraction = np.append(x, max(edge, x[-1])), np.append(fraction, 1.0)
+            y = 1.0 - fraction if complementary else fraction
             axes.plot(x, y, drawstyle="steps-post", color=colour, linestyle=line, label=name)
-    for name, places in (limits or {}).items():
-        for number, place in enumerate(places):
+    for name, positions in (limits or {}).items():
+        for number, position in enumerate(positions):
             label = name if number == 0 else None
-            axes.axvline(place, color=REQUIREMENT, linewidth=0.9, linestyle="-.", label=label)
+            axes.axvline(position, color=REQUIREMENT, linewidth=0.9, linestyle="-.", label=label)
     axes.set(xlabel=labels[0], ylabel=labels[1], ylim=(0.0, 1.03))
     axes.set_xlim(left=0.0)
     if bound is None or edge is None:
-        axes.legend(loc="upper right" if falling else "lower right")
+        axes.legend(loc="upper right" if complementary else "lower right")
         return figure
     axes.axvline(bound, color=REQUIREMENT, linewidth=1.5, linestyle="--")
     axes.set_xlim(0.0, 1.02 * edge)
-    note_beyond(axes, int((every > edge).sum()))
+    note_beyond(axes, int((all_values > edge).sum()))
     axes.legend(**_BELOW_AXES)
     return figure
 
 
 @dataclass(frozen=True)
 class RateLine:
-    """Rates at values of a condition, and a paper's rates by value."""
+    """Rates at values of a condition, and the rates of a paper by value."""
 
     name: str
     x: Sequence[float]
-    rates: Sequence[Share | PooledRate]
+    rates: Sequence[CaseFraction | PooledRate]
     paper: Mapping[float, float] = field(default_factory=dict)
 
 
 def draw_rates(axes: Axes, lines: Sequence[RateLine], linestyle: str = "-") -> None:
-    """Draw rates with their intervals; rates of a paper are open marks."""
-    for place, line in enumerate(lines):
-        style: dict[str, Any] = {"color": SERIES[place % len(SERIES)], "marker": MARKERS[place % len(MARKERS)]}
-        shares = np.array([one.share for one in line.rates])
-        bounds = np.array([[one.lower, one.upper] for one in line.rates]).reshape(-1, 2)
-        spread = np.abs(np.nan_to_num(bounds - shares[:, None])).T
+    """Draw rates with their intervals; rates of a paper are open markers."""
+    for index, line in enumerate(lines):
+        style: dict[str, Any] = {"color": SERIES[index % len(SERIES)], "marker": MARKERS[index % len(MARKERS)]}
+        fractions = np.array([rate.share for rate in line.rates])
+        bounds = np.array([[rate.lower, rate.upper] for rate in line.rates]).reshape(-1, 2)
+        error_bars = np.abs(np.nan_to_num(bounds - fractions[:, None])).T
         bars: dict[str, Any] = {"capsize": 2.5, "elinewidth": 0.9, "markersize": 5.0, "linestyle": linestyle}
-        axes.errorbar(line.x, shares, spread, label=line.name or None, **bars, **style)
+        axes.errorbar(line.x, fractions, error_bars, label=line.name or None, **bars, **style)
         if line.paper:
             name = f"{line.name}, paper" if len(lines) > 1 else "paper"
             hollow: dict[str, Any] = {"markersize": 10, "markerfacecolor": "none", "markeredgewidth": 1.5}
@@ -384,18 +384,18 @@ def rate_figure(lines: Sequence[RateLine], labels: tuple[str, str], limit: tuple
 
 
 @in_page_style
-def stacked_bars(names: Sequence[str], shares: Mapping[str, tuple[str, Sequence[float]]], xlabel: str) -> Figure:
-    """A bar of percentages for each name; `shares` has a style of `BARS` and the percentages by outcome."""
+def stacked_bars(names: Sequence[str], percentages: Mapping[str, tuple[str, Sequence[float]]], xlabel: str) -> Figure:
+    """A bar of percentages for each name; `percentages` contains a style of `BARS` and the values by outcome."""
     figure, axes = new_axes(7.4, 1.0 + 0.27 * len(names))
-    places, left = np.arange(len(names)), np.zeros(len(names))
-    for name, (style, values) in shares.items():
-        axes.barh(places, values, left=left, height=0.7, label=name, **BARS[style])
+    positions, left = np.arange(len(names)), np.zeros(len(names))
+    for name, (style, values) in percentages.items():
+        axes.barh(positions, values, left=left, height=0.7, label=name, **BARS[style])
         left = left + np.asarray(values)
-    axes.set_yticks(places, list(names))
+    axes.set_yticks(positions, list(names))
     axes.set(xlabel=xlabel, xlim=(0.0, 100.0))
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(shares))
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(percentages))
     return figure
 
 
@@ -416,7 +416,7 @@ def scatter_panels(panels: Mapping[tuple[str, str], tuple[Points, Points]], *, l
         axes.plot(*medians, "o-", color=SERIES[0], markersize=4.5)
         if logarithmic:
             axes.set_yscale("log")
-            # the page's style does not typeset powers of ten
+            # the page's style does not support superscripts of powers of ten
             axes.yaxis.set_major_formatter(LogFormatter())
             axes.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
         if y == rows[-1]:

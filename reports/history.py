@@ -1,4 +1,4 @@
-"""History of nightly runs in an SQLite file, detection of changed figures, and the page `nightly.md`."""
+"""History of nightly runs in an SQLite file, detection of changed metrics, and the page `nightly.md`."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from marsyard.reports.wording import count, format_fraction, number, percent
 
 #: Version of the tables, as `PRAGMA user_version`.
 SCHEMA = 1
-#: Maximum number of earlier nights that a night is compared with.
+#: Maximum number of earlier nights in the comparison of a night.
 WINDOW = 30
-#: Maximum number of stored cases of a figure and night.
+#: Maximum number of stored cases per metric and night.
 MAX_CASES = 10_000
 
 RUNNING, FINISHED, INTERRUPTED = "running", "finished", "interrupted"
@@ -32,7 +32,7 @@ _TABLES = Path(__file__).parent / "templates" / "history.sql"
 
 @dataclass(frozen=True)
 class NightCampaign:
-    """Result of a campaign in a night; `definition` identifies the campaign's contents."""
+    """Result of a campaign in a night; `definition` is the hash of the campaign's definition."""
 
     name: str
     definition: str
@@ -44,7 +44,7 @@ class NightCampaign:
 
 @dataclass(frozen=True)
 class NightFigure:
-    """One figure of a campaign in a night: rate or error, its level, and its cases."""
+    """One metric of a campaign in a night: its name, whether it is a rate, rate or median error, and its cases."""
 
     figure: str
     rate: bool
@@ -64,25 +64,25 @@ class Night:
 
 
 class History:
-    """The history as a context manager, with atomic writes; a missing file is created.
+    """The history as a context manager with atomic writes; a missing file is created.
 
-    Raises StoreError if the file cannot be opened, is no history, or has another version.
+    Raises StoreError if the file cannot be opened, is not a history, or has another version.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        fresh = not path.exists()
+        is_new = not path.exists()
         try:
             self._connection = sqlite3.connect(path, isolation_level=None)
             self._connection.execute("PRAGMA synchronous = FULL")
             version = self._connection.execute("PRAGMA user_version").fetchone()[0]
-            if fresh or (version == 0 and not self._connection.execute("SELECT * FROM sqlite_master").fetchall()):
+            if is_new or (version == 0 and not self._connection.execute("SELECT * FROM sqlite_master").fetchall()):
                 tables = f"PRAGMA user_version = {SCHEMA}; {_TABLES.read_text(encoding='utf-8')}"
                 self._connection.executescript(f"BEGIN; {tables} COMMIT;")
             elif version != SCHEMA:
                 raise StoreError(f"{path} has schema {version}; this version of Marsyard reads {SCHEMA}")
         except sqlite3.Error as error:
-            raise StoreError(f"{path} is no history of nights: {error}") from error
+            raise StoreError(f"{path} is not a history of nights: {error}") from error
 
     def __enter__(self) -> History:
         return self
@@ -102,23 +102,23 @@ class History:
 
     def add(self, night: int, campaign: NightCampaign, figures: Sequence[NightFigure]) -> None:
         """Store the result of a campaign in a night."""
-        one, rows = campaign, []
+        rows, head = [], (campaign.name, campaign.definition, campaign.directory)
         for figure in figures:
             values, terrains = figure.sample.values[:MAX_CASES], figure.sample.terrains[:MAX_CASES]
-            packed = values.astype("<f4").tobytes(), terrains.astype("<i8").tobytes()
-            rows.append((night, one.name, figure.figure, figure.rate, figure.level, *packed))
+            blobs = values.astype("<f4").tobytes(), terrains.astype("<i8").tobytes()
+            rows.append((night, campaign.name, figure.figure, figure.rate, figure.level, *blobs))
         with self._transaction():
             self._connection.execute(
                 "INSERT INTO campaigns VALUES (?, ?, ?, ?, ?, ?, ?)",
-                (night, one.name, one.definition, one.directory, one.verdict, one.exit_code, one.sentence),
+                (night, *head, campaign.verdict, campaign.exit_code, campaign.sentence),
             )
             self._connection.executemany("INSERT INTO figures VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
 
     def finish(self, night: int, state: str, changes: Sequence[tuple[str, str, float, bool]] = ()) -> None:
-        """End a night with its changes: campaign, figure, corrected p, whether it is a regression."""
+        """End a night with its changes: campaign, metric, corrected p-value, whether it is a regression."""
         with self._transaction():
             self._connection.executemany(
-                "INSERT INTO changes VALUES (?, ?, ?, ?, ?)", [(night, *one) for one in changes]
+                "INSERT INTO changes VALUES (?, ?, ?, ?, ?)", [(night, *change) for change in changes]
             )
             self._connection.execute(
                 "UPDATE nights SET state = ?, finished_utc = ? WHERE night = ?", (state, utc_now(), night)
@@ -138,7 +138,7 @@ class History:
         return [NightCampaign(*row) for row in rows]
 
     def figures(self, night: int, campaign: str) -> list[NightFigure]:
-        """A campaign's figures in a night."""
+        """A campaign's metrics in a night."""
         rows = self._connection.execute(
             "SELECT figure, rate, level, amounts, terrains FROM figures WHERE night = ? AND campaign = ? "
             "ORDER BY rowid",
@@ -149,8 +149,8 @@ class History:
             for name, rate, level, values, terrains in rows
         ]
 
-    def before(self, night: int, campaign: NightCampaign, figure: str) -> list[Sample]:
-        """A figure in earlier finished nights of the same campaign, the latest first, back to its last change."""
+    def earlier_samples(self, night: int, campaign: NightCampaign, figure: str) -> list[Sample]:
+        """A metric in earlier finished nights of the same campaign, the latest first, back to its last change."""
         rows = self._connection.execute(
             """
             SELECT f.amounts, f.terrains FROM figures f
@@ -189,22 +189,20 @@ def _unpack(values: bytes, terrains: bytes) -> Sample:
     return Sample(np.frombuffer(values, "<f4").astype(np.float64), np.frombuffer(terrains, "<i8").astype(np.int64))
 
 
-#: Maximum probability of any reported change in a night without changes.
+#: Maximum probability of at least one false alarm in a night without changes.
 FALSE_ALARMS = 0.01
-#: Significance level of changes; the other half is for nights that follow a false alarm.
-_LEVEL = 0.5 * FALSE_ALARMS
-#: Expected number of permutations beyond a change at the significance level.
-_RESOLVED = 10
+#: Significance level of changes; the other half is for the nights after a false alarm.
+_SIGNIFICANCE = 0.5 * FALSE_ALARMS
+#: Expected number of permutations that exceed a change at the significance level.
+_MIN_EXCEEDANCES = 10
 
 
 @dataclass(frozen=True)
 class Change:
-    """A changed figure.
+    """A changed metric.
 
-    rate: whether it is a rate of successes, where more is better, or an error
-    before, now: rate or median in the earlier nights and tonight
-    p_value: corrected for the number of figures compared tonight
-    nights: number of earlier nights
+    rate: whether it is a success rate (larger is better); else an error before, now: rate or median in the earlier
+    nights and tonight p_value: corrected for the number of metrics compared tonight nights: number of earlier nights
     """
 
     campaign: str
@@ -223,96 +221,95 @@ class Change:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A figure of tonight with its samples in earlier nights."""
+    """A metric of tonight with its samples in earlier nights."""
 
     campaign: str
     figure: NightFigure
     before: Sequence[Sample]
 
 
-def changes(comparisons: Sequence[Comparison]) -> list[Change]:
-    """The changed figures of a night, with a family-wise rate of false alarms of at most `FALSE_ALARMS`."""
+def find_changes(comparisons: Sequence[Comparison]) -> list[Change]:
+    """Find the changed metrics of a night, with a family-wise false alarm rate of at most `FALSE_ALARMS`."""
     pooled: list[Sample | None] = []
-    for one in comparisons:
-        parts = ([getattr(sample, part) for sample in one.before] for part in ("values", "terrains"))
-        pooled.append(Sample(*map(np.concatenate, parts)) if one.before else None)
-    permutations = math.ceil(_RESOLVED * len(comparisons) / _LEVEL)
+    for comparison in comparisons:
+        parts = ([getattr(sample, part) for sample in comparison.before] for part in ("values", "terrains"))
+        pooled.append(Sample(*map(np.concatenate, parts)) if comparison.before else None)
+    permutations = math.ceil(_MIN_EXCEEDANCES * len(comparisons) / _SIGNIFICANCE)
     p_values = holm(
         [
-            math.nan if before is None else difference_p(one.figure.sample, before, permutations)
-            for one, before in zip(comparisons, pooled, strict=True)
+            math.nan if earlier is None else difference_p(comparison.figure.sample, earlier, permutations)
+            for comparison, earlier in zip(comparisons, pooled, strict=True)
         ]
     )
     return [
         Change(
-            campaign=one.campaign,
-            figure=one.figure.figure,
-            rate=one.figure.rate,
-            before=quality_level(before, one.figure.rate),
-            now=quality_level(one.figure.sample, one.figure.rate),
+            campaign=comparison.campaign,
+            figure=comparison.figure.figure,
+            rate=comparison.figure.rate,
+            before=summary_value(earlier, comparison.figure.rate),
+            now=summary_value(comparison.figure.sample, comparison.figure.rate),
             p_value=p,
-            nights=len(one.before),
+            nights=len(comparison.before),
         )
-        for one, before, p in zip(comparisons, pooled, p_values, strict=True)
-        if before is not None and p <= _LEVEL
+        for comparison, earlier, p in zip(comparisons, pooled, p_values, strict=True)
+        if earlier is not None and p <= _SIGNIFICANCE
     ]
 
 
-def compare_night(history: History, night: int) -> list[Comparison]:
-    """Every figure of a night with its samples in earlier nights."""
+def list_comparisons(history: History, night: int) -> list[Comparison]:
+    """List every metric of a night with its samples in earlier nights."""
     return [
-        Comparison(campaign.name, figure, history.before(night, campaign, figure.figure))
+        Comparison(campaign.name, figure, history.earlier_samples(night, campaign, figure.figure))
         for campaign in history.campaigns(night)
         for figure in history.figures(night, campaign.name)
     ]
 
 
-def quality_level(sample: Sample, rate: bool) -> float:
-    """The rate or the median; NaN for no cases."""
-    known = sample.known().values
-    if known.size == 0:
+def summary_value(sample: Sample, rate: bool) -> float:
+    """Compute the rate or the median; NaN for no cases."""
+    values = sample.finite_cases().values
+    if values.size == 0:
         return math.nan
-    return float(known.mean() if rate else np.median(known))
+    return float(values.mean() if rate else np.median(values))
 
 
 def night_text(
-    night: Night, earlier: Sequence[Night], campaigns: Sequence[NightCampaign], found: Sequence[Change], compared: int
+    night: Night, earlier: Sequence[Night], campaigns: Sequence[NightCampaign], changes: Sequence[Change], compared: int
 ) -> str:
-    """The night's page in Markdown.
+    """Format the night's page in Markdown.
 
-    earlier: previous nights, the latest first
-    found, compared: changed figures, and how many were compared
+    earlier: previous nights, the latest first changes, compared: changed metrics, and number of compared metrics
     """
-    worse = [one for one in found if one.worse]
-    better = [one for one in found if not one.worse]
-    counts = Counter(one.verdict for one in campaigns)
-    headline, end = night.state.upper(), f"{night.state}: its figures are kept aside"
+    regressions = [change for change in changes if change.worse]
+    improvements = [change for change in changes if not change.worse]
+    counts = Counter(campaign.verdict for campaign in campaigns)
+    headline, end = night.state.upper(), f"{night.state}: its metrics are excluded from comparisons"
     if night.state == FINISHED:
         verdicts = ", ".join(f"{cases} {word}" for word, cases in counts.items())
-        headline = verdicts + (f", {count(len(worse), 'regression')}" if worse else "")
+        headline = verdicts + (f", {count(len(regressions), 'regression')}" if regressions else "")
         end = f"ended {night.finished_utc}"
     lines = [f"# Night {night.night}: {headline}", ""]
     lines.append(f"Begun {night.started_utc}, {end}; commit {night.git_commit or 'not known'}.")
-    broken = list(takewhile(lambda one: one.state != FINISHED, earlier))
-    lines += [""] * bool(broken)
-    lines += [f"Night {one.night}, begun {one.started_utc}, was {one.state}." for one in broken]
+    unfinished = list(takewhile(lambda night: night.state != FINISHED, earlier))
+    lines += [""] * bool(unfinished)
+    lines += [f"Night {night.night}, begun {night.started_utc}, was {night.state}." for night in unfinished]
     lines += ["", "| Campaign | Verdict | |", "|---|---|---|"]
-    lines += [f"| {_cell(one.name)} | {_cell(one.verdict)} | {_cell(one.sentence)} |" for one in campaigns]
-    for title, some in (("Regressions", worse), ("Improvements", better)):
-        if some:
+    lines += [f"| {_escape(run.name)} | {_escape(run.verdict)} | {_escape(run.sentence)} |" for run in campaigns]
+    for title, group in (("Regressions", regressions), ("Improvements", improvements)):
+        if group:
             lines += ["", f"## {title}", ""]
-        for one in some:
-            show = percent if one.rate else number
-            figures = f"{show(one.before)} in {count(one.nights, 'night')} before, {show(one.now)} now"
-            lines.append(f"- **{_cell(one.campaign)}: {_cell(one.figure)}**: {figures} (p = {one.p_value:.1g})")
+        for change in group:
+            before, now = ((percent if change.rate else number)(value) for value in (change.before, change.now))
+            values = f"{before} in {count(change.nights, 'earlier night')}, {now} now (p = {change.p_value:.1g})"
+            lines.append(f"- **{_escape(change.campaign)}: {_escape(change.figure)}**: {values}")
     text = (
-        f"{count(compared, 'figure')} compared with the nights before; the chance of any false alarm is at most "
-        f"{format_fraction(FALSE_ALARMS)}.{'' if found else ' None has changed.'}"
+        f"{count(compared, 'metric')} compared with earlier nights; the probability of a false alarm is at most "
+        f"{format_fraction(FALSE_ALARMS)}.{'' if changes else ' No metric has changed.'}"
     )
-    lines += ["", text if compared else "No figure has a history to be compared with yet.", ""]
+    lines += ["", text if compared else "No metric has a history for a comparison yet.", ""]
     return "\n".join(lines)
 
 
-def _cell(text: str) -> str:
+def _escape(text: str) -> str:
     marks = {letter: f"&#{ord(letter)};" for letter in "&<>|"} | {letter: f"\\{letter}" for letter in "\\`*_[]#"}
     return "".join(marks.get(letter, letter) for letter in " ".join(text.split()))

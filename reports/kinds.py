@@ -1,7 +1,7 @@
-"""Kinds of report sections as data: a `SectionDeclaration` of parts, each of which draws blocks and their numbers.
+"""Kinds of report sections as data: a `SectionDeclaration` of parts, each of which creates blocks and their numbers.
 
-Parts: `RateTable`, `RateByCondition`, `OutcomesBySize`, `Distribution`, `Statistics`, `Quantiles`, `Scatter`, `MadeBy`.
-`marsyard.reports.papers.PaperFacts` is a section of its own. Example: `docs/reports.md`.
+Parts: `RateTable`, `RateByCondition`, `OutcomesBySize`, `Distribution`, `Statistics`, `Quantiles`, `Scatter`, and
+`CustomBlocks`. `marsyard.reports.papers.PaperFacts` is a separate section. Example: `docs/reports.md`.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from jaxtyping import Bool, Float
 
 from marsyard.reports import rates
 from marsyard.reports.figures import RateLine, cumulative_figure, rate_figure, scatter_panels, stacked_bars
-from marsyard.reports.rates import CONFIDENCE, PooledRate, Share, known, varies
-from marsyard.reports.section import Block, Grid, Section, Subject, plate
-from marsyard.reports.statistics.drivers import MIN_CASES, driver
+from marsyard.reports.rates import CONFIDENCE, CaseFraction, PooledRate, finite_values, varies
+from marsyard.reports.section import Block, Grid, Section, Subject, svg_figure
+from marsyard.reports.statistics.drivers import MIN_CASES, estimate_driver
 from marsyard.reports.tables import error_summaries, statistics_grid
 from marsyard.reports.wording import NOTHING, coefficient, format_fraction, label, number, numbers, percent
 
 Rows = pd.DataFrame
-Drawn = tuple[Sequence[Block], Mapping[str, Any]]
-RateOf = Callable[[Rows], Share | PooledRate]
-#: Number of bins of a condition with equally many cases, and the minimum number of cases of one.
+BlocksAndData = tuple[Sequence[Block], Mapping[str, Any]]
+RateOf = Callable[[Rows], CaseFraction | PooledRate]
+#: Number of bins of a condition with equally many cases, and the minimum number of cases of a bin.
 _BINS, _MIN_IN_BIN = 5, 4
-#: Maximum number of values of a condition that are shown one by one.
+#: Maximum number of values of a condition with a row each.
 _MAX_VALUES = 24
 
 
@@ -36,17 +36,16 @@ _MAX_VALUES = 24
 class Part(Protocol):
     """A part of a declared section."""
 
-    def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
-        """Blocks of the page and their numbers; `key` prefixes identifiers of figures. No blocks: nothing to show."""
+    def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
+        """Create blocks of the page and their numbers; `key` prefixes the figures' identifiers."""
 
 
 @dataclass(frozen=True)
 class SectionDeclaration:
     """A section declared by its parts; call it with a `Subject` to make the section.
 
-    requires: columns that must exist and have a value
-    rows: rows of the section, chosen or extended; None for no section
-    note: text below all parts
+    requires: columns that must exist and contain a value rows: function that selects or extends the rows of the
+    section; None for no section note: text below all parts
     """
 
     key: str
@@ -58,15 +57,15 @@ class SectionDeclaration:
     note: str = ""
 
     def __call__(self, subject: Subject) -> Section | None:
-        """The section; None if the rows lack required columns, or no part has blocks."""
+        """Create the section; None if required columns are missing or no part has blocks."""
         frame = self.rows(subject)
         if frame is None or any(name not in frame or frame[name].isna().all() for name in self.requires):
             return None
         blocks: list[Block] = []
         data: dict[str, Any] = {}
-        for place, part in enumerate(self.parts):
-            shown, values = part.draw(frame, subject, f"{self.key.replace('-', '')}{place}")
-            blocks += shown
+        for index, part in enumerate(self.parts):
+            part_blocks, values = part.draw(frame, subject, f"{self.key.replace('-', '')}{index}")
+            blocks += part_blocks
             data |= values
         if not blocks:
             return None
@@ -75,19 +74,19 @@ class SectionDeclaration:
 
 
 @dataclass(frozen=True)
-class MadeBy:
-    """A part that a function makes."""
+class CustomBlocks:
+    """A part whose blocks are created by a function."""
 
-    function: Callable[[Rows, Subject, str], Drawn]
+    function: Callable[[Rows, Subject, str], BlocksAndData]
 
-    def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
+    def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
         """Call the function."""
         return self.function(frame, subject, key)
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A column of numbers with its name for readers (by default the column in words) and a scale."""
+    """A column of numbers with its name for readers (default: the column in words) and a scale."""
 
     column: str
     name: str = ""
@@ -104,12 +103,12 @@ class Quantity:
 
 
 def flag_rate(name: str, *among: str, wanted: bool = True) -> RateOf:
-    """Fraction of rows whose flag is as wanted, among the rows with all of the other flags."""
+    """Fraction of rows whose flag equals `wanted`, among the rows where all flags of `among` are true."""
 
-    def rate(frame: Rows) -> Share:
-        every = np.ones(len(frame), dtype=np.bool_)
-        chosen = frame[np.logical_and.reduce([every, *(rates.flag(frame, one) for one in among)])]
-        return rates.fraction_of(rates.flag(chosen, name) == wanted, chosen)
+    def rate(frame: Rows) -> CaseFraction:
+        all_rows = np.ones(len(frame), dtype=np.bool_)
+        selected = frame[np.logical_and.reduce([all_rows, *(rates.flag(frame, other) for other in among)])]
+        return rates.fraction_of(rates.flag(selected, name) == wanted, selected)
 
     return rate
 
@@ -121,99 +120,99 @@ def pooled_fraction(hits: str, of: str) -> RateOf:
 
 @dataclass(frozen=True)
 class Rate:
-    """A rate of rows: key in `report.json`, name for readers, function, and whether figures draw it."""
+    """A rate of rows: key in `report.json`, name for readers, function, and whether figures show it."""
 
     key: str
     name: str
     of: RateOf
-    drawn: bool = True
+    in_figure: bool = True
 
 
 @dataclass(frozen=True)
 class RateTable:
     """A table of rates with their intervals.
 
-    rates: declared, or made from the rows
-    shared: whether the intervals allow for cases that share terrains
+    rates: declared rates, or a function that computes them from the rows
+    shared: whether the intervals allow for cases on shared terrains
     """
 
-    rates: Sequence[Rate] | Callable[[Rows], Mapping[str, Share]]
+    rates: Sequence[Rate] | Callable[[Rows], Mapping[str, CaseFraction]]
     cases: str = "Cases"
     heading: str = ""
     note: str = ""
     data: str = "rates"
     shared: bool = True
 
-    def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
-        """The rates that have cases."""
-        rates_by_name = self.rates(frame) if callable(self.rates) else {one.name: one.of(frame) for one in self.rates}
+    def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
+        """Create a table of the rates that have cases."""
+        rates_by_name = self.rates(frame) if callable(self.rates) else {r.name: r.of(frame) for r in self.rates}
         rows = [
-            [name, rates.fraction_text(one), rates.interval_text(one, shared=self.shared)]
-            for name, one in rates_by_name.items()
-            if isinstance(one, Share) and one.n
+            [name, rates.fraction_text(rate), rates.interval_text(rate, shared=self.shared)]
+            for name, rate in rates_by_name.items()
+            if isinstance(rate, CaseFraction) and rate.n
         ]
         grid = Grid(["", self.cases, f"{format_fraction(CONFIDENCE)} interval"], rows)
         blocks = [Block(heading=self.heading, grid=grid, note=self.note)] if rows else []
-        return blocks, {self.data: {name: asdict(one) for name, one in rates_by_name.items()}}
+        return blocks, {self.data: {name: asdict(rate) for name, rate in rates_by_name.items()}}
 
 
 @dataclass(frozen=True)
 class RateByCondition:
     """Rates against a condition, as a table and as curves.
 
-    by: the condition: single values, or bins of equally many cases if it has many
-    cases, ylabel, text, note, caption: heading of the table's cases, label of the figure's axis, and texts
-    limit: name of a vertical line, and its position by campaign
-    data: key of the list in `report.json`
+    by: the condition: single values, or bins of equally many cases for many values cases, ylabel, text, note, caption:
+    heading of the table's cases, label of the figure's axis, and texts limit: name of a vertical line, and its position
+    by campaign data: key of the list in `report.json`
     """
 
     by: Quantity
     rates: Sequence[Rate]
     cases: str = "Cases"
-    ylabel: str = "share of cases"
+    ylabel: str = "fraction of cases"
     text: str = ""
     note: str = ""
     caption: str = ""
     limit: tuple[str, Callable[[Subject], float]] | None = None
     data: str = "by_condition"
 
-    def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
-        """The table and the curves; nothing if the condition does not vary."""
+    def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
+        """Create the table and the curves; nothing if the condition does not vary."""
         if not varies(frame, self.by.column):
             return [], {}
         values = self.by.values(frame)
         records = []
-        for chosen in condition_bins(values, _MAX_VALUES):
-            of_bin = {one.key: one.of(frame[chosen]) for one in self.rates}
-            records.append((float(np.median(values[chosen])), int(chosen.sum()), of_bin))
+        for mask in condition_bins(values, _MAX_VALUES):
+            bin_rates = {rate.key: rate.of(frame[mask]) for rate in self.rates}
+            records.append((float(np.median(values[mask])), int(mask.sum()), bin_rates))
         limit = None if self.limit is None else (self.limit[0], self.limit[1](subject))
         x = [value for value, _, _ in records]
-        lines = [RateLine(one.name.lower(), x, [r[one.key] for _, _, r in records]) for one in self.rates if one.drawn]
+        curves = [rate for rate in self.rates if rate.in_figure]
+        lines = [RateLine(rate.name.lower(), x, [record[2][rate.key] for record in records]) for rate in curves]
         figure = rate_figure(lines, (self.by.title, self.ylabel), limit)
         rows = []
-        for value, n, of_bin in records:
-            texts = [
-                rates.fraction_text(one) if isinstance(one, Share) else rates.rate_text(one) for one in of_bin.values()
-            ]
-            rows.append([f"{value:.4g}", f"{n:,}", *texts])
-        grid = Grid([self.by.title, self.cases, *(one.name for one in self.rates)], rows)
+        for value, n, bin_rates in records:
+            rows.append([f"{value:.4g}", f"{n:,}", *map(_format_rate, bin_rates.values())])
+        grid = Grid([self.by.title, self.cases, *(rate.name for rate in self.rates)], rows)
+        bins = [({self.by.column: x, "n": n}, bin_rates) for x, n, bin_rates in records]
         data: dict[str, Any] = {
-            self.data: [
-                {self.by.column: x, "n": n, **{k: asdict(r) for k, r in of_bin.items()}} for x, n, of_bin in records
-            ]
+            self.data: [head | {k: asdict(r) for k, r in bin_rates.items()} for head, bin_rates in bins]
         }
         if limit is not None:
             data["limit"] = limit[1]
-        block = Block(text=self.text, plates=[plate(figure, key, self.caption or self.by.title)])
+        block = Block(text=self.text, figures=[svg_figure(figure, key, self.caption or self.by.title)])
         return [block, Block(grid=grid, note=self.note)], data
 
 
+def _format_rate(rate: CaseFraction | PooledRate) -> str:
+    return rates.fraction_text(rate) if isinstance(rate, CaseFraction) else rates.rate_text(rate)
+
+
 def condition_bins(values: Float[np.ndarray, " n"], max_values: int = _BINS) -> list[Bool[np.ndarray, " n"]]:
-    """Masks of single values if they are few, else of bins of equally many cases; NaN is in none."""
+    """Masks of the single values if they are few, else of bins of equally many cases; no mask contains NaN."""
     finite = np.isfinite(values)
-    kinds = np.unique(values[finite])
-    if kinds.size <= max_values:
-        return [values == kind for kind in kinds]
+    distinct = np.unique(values[finite])
+    if distinct.size <= max_values:
+        return [values == value for value in distinct]
     bins = max(1, min(_BINS, int(finite.sum()) // _MIN_IN_BIN))
     ranks = np.full(values.size, -1)
     ranks[finite] = np.argsort(np.argsort(values[finite], kind="stable"), kind="stable") * bins // int(finite.sum())
@@ -224,18 +223,17 @@ def condition_bins(values: Float[np.ndarray, " n"], max_values: int = _BINS) -> 
 class OutcomesBySize:
     """Outcomes of cases by a kind and its size (a fault and its severity): a table and stacked bars.
 
-    outcomes: masks of the rows by key of `report.json`, in the order of the bars; the last has an interval
-    styles: name for readers and style of `marsyard.reports.section.BARS` by outcome
-    cases: heading of the rows
-    wording: kind and size in words; no size is empty
-    further: further columns: heading, key of `report.json`, value of the rows, and its text
+    outcomes: masks of the rows by key of `report.json`, in the order of the bars; the last has an interval styles: name
+    for readers and style of `marsyard.reports.section.BARS` by outcome cases: heading of the rows wording: kind and
+    size in words; an unknown size is empty extra_columns: heading, key of `report.json`, value of the rows, and its
+    text
     """
 
     outcomes: Callable[[Rows, Subject], Mapping[str, Bool[np.ndarray, " n"]]]
     styles: Mapping[str, tuple[str, str]]
     cases: str
     wording: Callable[[str, float], tuple[str, str]]
-    further: Sequence[tuple[str, str, Callable[[Rows], Any], Callable[[Any], str]]] = ()
+    extra_columns: Sequence[tuple[str, str, Callable[[Rows], Any], Callable[[Any], str]]] = ()
     kind: str = "fault"
     size: str = "fault_size"
     none: str = "none"
@@ -243,45 +241,45 @@ class OutcomesBySize:
     caption: str = ""
 
     def records(self, frame: Rows, subject: Subject) -> list[dict[str, Any]]:
-        """Counts of each kind and size, cases without a fault first."""
+        """Count the outcomes of each kind and size; cases without a fault come first."""
         records = []
-        for kind, size, chosen in rates.by_size(frame, self.kind, self.size, self.none):
-            ended = self.outcomes(chosen, subject)
-            worst = rates.fraction_of(ended[[*self.styles][-1]], chosen)
-            counts = {name: int(mask.sum()) for name, mask in ended.items()}
-            values = {name: value(chosen) for _, name, value, _ in self.further}
+        for kind, size, rows in rates.group_by_size(frame, self.kind, self.size, self.none):
+            masks = self.outcomes(rows, subject)
+            last = rates.fraction_of(masks[[*self.styles][-1]], rows)
+            counts = {name: int(mask.sum()) for name, mask in masks.items()}
+            values = {name: value(rows) for _, name, value, _ in self.extra_columns}
             key = f"{[*self.styles][-1]}_share"
-            records.append({self.kind: kind, "size": size, "n": len(chosen), **counts, key: worst, **values})
+            records.append({self.kind: kind, "size": size, "n": len(rows), **counts, key: last, **values})
         return records
 
-    def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
-        """The table and the bars; nothing if no row has a fault."""
+    def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
+        """Create the table and the bars; nothing if no row has a fault."""
         if self.kind not in frame:
             return [], {}
         records = self.records(frame, subject)
-        if all(one[self.kind] == self.none for one in records):
+        if all(record[self.kind] == self.none for record in records):
             return [], {}
-        words = [self.wording(one[self.kind], one["size"]) for one in records]
-        worst = [*self.styles][-1]
+        texts = [self.wording(record[self.kind], record["size"]) for record in records]
+        last = [*self.styles][-1]
         head = ["Fault", "Size", self.cases, *(name.capitalize() for name, _ in self.styles.values())]
-        head += [f"{self.styles[worst][0].capitalize()}, interval", *(heading for heading, *_ in self.further)]
+        head += [f"{self.styles[last][0].capitalize()}, interval", *(heading for heading, *_ in self.extra_columns)]
         rows = [
             [
-                *(name, size or NOTHING, f"{one['n']:,}"),
-                *(f"{one[kind]:,} ({percent(one[kind] / one['n'])})" for kind in self.styles),
-                rates.interval_text(one[f"{worst}_share"]),
-                *(text(one[name]) for _, name, _, text in self.further),
+                *(name, size or NOTHING, f"{record['n']:,}"),
+                *(f"{record[kind]:,} ({percent(record[kind] / record['n'])})" for kind in self.styles),
+                rates.interval_text(record[f"{last}_share"]),
+                *(text(record[name]) for _, name, _, text in self.extra_columns),
             ]
-            for one, (name, size) in zip(records, words, strict=True)
+            for record, (name, size) in zip(records, texts, strict=True)
         ]
-        shares = {
-            name: (style, [100.0 * one[kind] / one["n"] for one in records])
+        percentages = {
+            name: (style, [100.0 * record[kind] / record["n"] for record in records])
             for kind, (name, style) in self.styles.items()
         }
-        figure = stacked_bars([" ".join(pair).strip() for pair in words], shares, f"% of {self.cases.lower()}")
+        figure = stacked_bars([" ".join(pair).strip() for pair in texts], percentages, f"% of {self.cases.lower()}")
         caption = self.caption or " ".join(f"{style.capitalize()}: {name}." for name, style in self.styles.values())
-        data = [{**one, f"{worst}_share": asdict(one[f"{worst}_share"])} for one in records]
-        return [Block(plates=[plate(figure, key, caption)]), Block(grid=Grid(head, rows), note=self.note)], {
+        data = [{**record, f"{last}_share": asdict(record[f"{last}_share"])} for record in records]
+        return [Block(figures=[svg_figure(figure, key, caption)]), Block(grid=Grid(head, rows), note=self.note)], {
             "rows": data
         }
 
@@ -294,22 +292,23 @@ class Distribution:
     labels: tuple[str, str]
     caption: str
     heading: str = ""
-    falling: bool = False
+    complementary: bool = False
     bound: float | None = None
     limits: Mapping[str, Sequence[float]] = field(default_factory=dict)
     table: Callable[[Mapping[str, Float[np.ndarray, " n"]]], Grid] | None = None
 
-    def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
-        """The curves and their table; nothing if no curve has a value."""
+    def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
+        """Create the curves and their table; nothing if no curve has a value."""
         if callable(self.curves):
             curves = self.curves(frame)
         else:
-            curves = {one.title: known(frame, one.column, one.scale) for one in self.curves}
+            curves = {quantity.title: finite_values(frame, quantity.column, quantity.scale) for quantity in self.curves}
         if not any(values.size for values in curves.values()):
             return [], {}
-        figure = cumulative_figure(curves, self.labels, falling=self.falling, bound=self.bound, limits=self.limits)
+        style: dict[str, Any] = {"complementary": self.complementary, "bound": self.bound, "limits": self.limits}
+        figure = cumulative_figure(curves, self.labels, **style)
         grid = None if self.table is None else self.table(curves)
-        return [Block(heading=self.heading, plates=[plate(figure, key, self.caption)], grid=grid)], {}
+        return [Block(heading=self.heading, figures=[svg_figure(figure, key, self.caption)], grid=grid)], {}
 
 
 @dataclass(frozen=True)
@@ -319,9 +318,9 @@ class Statistics:
     column: str
     heading: str = ""
 
-    def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
-        """The table."""
-        data = {name: asdict(one) for name, one in error_summaries(frame, self.column)}
+    def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
+        """Create the table."""
+        data = {name: asdict(summary) for name, summary in error_summaries(frame, self.column)}
         return [Block(heading=self.heading, grid=statistics_grid(frame, self.column))], data
 
 
@@ -335,13 +334,13 @@ class Quantiles:
     note: str = ""
     data: str = ""
 
-    def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
-        """The quantities that the rows hold; nothing if they hold none."""
+    def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
+        """Create a table of the quantities in the rows; nothing if there are none."""
         rows = []
-        for one in self.quantities:
-            values = known(frame, one.column, one.scale)
+        for quantity in self.quantities:
+            values = finite_values(frame, quantity.column, quantity.scale)
             if values.size:
-                rows.append([one.title, *(number(float(q)) for q in np.quantile(values, [*self.columns.values()]))])
+                rows.append([quantity.title, *map(number, np.quantile(values, [*self.columns.values()]).tolist())])
         block = Block(heading=self.heading, grid=Grid(["", *self.columns], rows), note=self.note)
         return ([block], {self.data: len(frame)} if self.data else {}) if rows else ([], {})
 
@@ -357,50 +356,50 @@ class Scatter:
     logarithmic: bool = False
 
     def effects(self, frame: Rows) -> list[dict[str, Any]]:
-        """Effects of every condition that varies on every response.
+        """Compute the effect of every condition that varies on every response.
 
         Keys: `driver`, `error`, Spearman's `rank_correlation` with its interval, `centres` and `medians` of the bins.
         """
         effects, groups = [], rates.terrain_groups(frame)
-        for one in (one for one in self.x if varies(frame, one.column)):
+        for condition in (condition for condition in self.x if varies(frame, condition.column)):
             for response in self.y:
-                x, y = one.values(frame), response.values(frame)
+                x, y = condition.values(frame), response.values(frame)
                 bins = condition_bins(np.where(np.isfinite(y), x, np.nan))
-                centres, medians = ([float(np.median(values[chosen])) for chosen in bins] for values in (x, y))
-                ranks = driver(x, y, groups, CONFIDENCE)
-                of_ranks = (math.nan,) * 3 if ranks is None else (ranks.correlation, ranks.lower, ranks.upper)
-                effect: dict[str, Any] = {"driver": one.title, "error": response.title}
-                effect |= zip(("rank_correlation", "lower", "upper"), of_ranks, strict=True)
+                centres, medians = ([float(np.median(values[mask])) for mask in bins] for values in (x, y))
+                ranks = estimate_driver(x, y, groups, CONFIDENCE)
+                rank_values = (math.nan,) * 3 if ranks is None else (ranks.correlation, ranks.lower, ranks.upper)
+                effect: dict[str, Any] = {"driver": condition.title, "error": response.title}
+                effect |= zip(("rank_correlation", "lower", "upper"), rank_values, strict=True)
                 effects.append(effect | {"centres": centres, "medians": medians})
         return effects
 
-    def draw(self, frame: Rows, subject: Subject, key: str) -> Drawn:
-        """The panels and the rank correlations; nothing if no condition varies."""
+    def draw(self, frame: Rows, subject: Subject, key: str) -> BlocksAndData:
+        """Create the panels and the rank correlations; nothing if no condition varies."""
         effects = self.effects(frame)
         if not effects:
             return [], {}
-        columns = {one.title: one.values(frame) for one in (*self.x, *self.y)}
+        columns = {quantity.title: quantity.values(frame) for quantity in (*self.x, *self.y)}
         panels = {
-            (one["driver"], one["error"]): (
-                (columns[one["driver"]], columns[one["error"]]),
-                (one["centres"], one["medians"]),
+            (effect["driver"], effect["error"]): (
+                (columns[effect["driver"]], columns[effect["error"]]),
+                (effect["centres"], effect["medians"]),
             )
-            for one in effects
+            for effect in effects
         }
         texts: dict[str, list[str]] = {}
-        for one in effects:
-            texts.setdefault(one["driver"], []).append(correlation_text(one))
-        head = ["Rank correlation", *(one.title for one in self.y)]
+        for effect in effects:
+            texts.setdefault(effect["driver"], []).append(correlation_text(effect))
+        head = ["Rank correlation", *(response.title for response in self.y)]
         grid = Grid(head, [[name, *cells] for name, cells in texts.items()])
         figure = scatter_panels(panels, logarithmic=self.logarithmic)
         note = (
             f"Intervals at {format_fraction(CONFIDENCE)} confidence; a dash below {MIN_CASES} cases or for constants."
         )
-        plates = [plate(figure, key, self.caption, wide=len(effects) > 1)]
-        return [Block(heading=self.heading, plates=plates, grid=grid, note=note)], {"effects": effects}
+        svg_figures = [svg_figure(figure, key, self.caption, wide=len(effects) > 1)]
+        return [Block(heading=self.heading, figures=svg_figures, grid=grid, note=note)], {"effects": effects}
 
 
 def correlation_text(effect: Mapping[str, Any]) -> str:
-    """A rank correlation with its interval; a dash for NaN."""
+    """Format a rank correlation with its interval; a dash for NaN."""
     value, lower, upper = (coefficient(effect[key]) for key in ("rank_correlation", "lower", "upper"))
     return NOTHING if math.isnan(effect["rank_correlation"]) else f"{value} ({lower} to {upper})"

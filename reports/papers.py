@@ -1,4 +1,4 @@
-"""Numbers of papers, from one TOML file each, next to ours."""
+"""Comparison of a campaign with the numbers of a paper, which are read from a TOML file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from marsyard.reports.kinds import Part, Rows
-from marsyard.reports.rates import all_flags, flag_fraction, fraction_text, known, spread_text
+from marsyard.reports.rates import all_flags, finite_values, flag_fraction, fraction_text, spread_text
 from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.wording import NOTHING
 
@@ -26,43 +26,43 @@ def read_paper(path: Path) -> Mapping[str, Any]:
 
 @dataclass(frozen=True)
 class PaperFacts:
-    """A paper's numbers of single runs next to ours: `[[facts]]` of its TOML file.
+    """A paper's numbers of single runs next to those of Marsyard: `[[facts]]` of its TOML file.
 
     Keys: `campaign` (that repeats the run), `title`, `source`, `note`, and `rows`. Keys of a row: `name` (with its
     unit), `paper` (text, a dash by default), `column`, and optionally `statistic` (``spread``, the median with minimum
     and maximum, or ``rate``), `among` (flags that choose rows), `scale`, `digits`, and `magnitude` (drop signs).
 
-    further: additional parts by campaign
+    extra_parts: additional parts by campaign
     """
 
     path: Path
-    further: Mapping[str, Part] = field(default_factory=dict)
+    extra_parts: Mapping[str, Part] = field(default_factory=dict)
 
     def __call__(self, subject: Subject) -> Section | None:
-        """The section; None if the paper has no run of the campaign's name."""
-        facts = {one["campaign"]: one for one in read_paper(self.path)["facts"]}.get(subject.run.name)
+        """Create the section; None if the paper's file has no run with the campaign's name."""
+        facts = {fact["campaign"]: fact for fact in read_paper(self.path)["facts"]}.get(subject.run.name)
         if facts is None or not any(row["column"] in subject.frame for row in facts["rows"]):
             return None
         data: dict[str, Any] = {
-            row["name"]: {"paper": row.get("paper", NOTHING), "ours": format_own_value(subject.frame, row)}
+            row["name"]: {"paper": row.get("paper", NOTHING), "ours": format_simulated_value(subject.frame, row)}
             for row in facts["rows"]
         }
-        grid = Grid(["", "Paper", "Ours"], [[name, *one.values()] for name, one in data.items()])
+        grid = Grid(["", "Paper", "Ours"], [[name, *fact.values()] for name, fact in data.items()])
         blocks = [Block(grid=grid, note=f"{_MEDIANS} {facts.get('note', '')}".strip())]
-        if subject.run.name in self.further:
-            shown, numbers_too = self.further[subject.run.name].draw(subject.frame, subject, "paper")
-            blocks += shown
-            data |= numbers_too
+        if subject.run.name in self.extra_parts:
+            extra_blocks, extra_data = self.extra_parts[subject.run.name].draw(subject.frame, subject, "paper")
+            blocks += extra_blocks
+            data |= extra_data
         return Section("paper", "Paper comparison", facts["title"], blocks, data)
 
 
-_MEDIANS = "Ours: median over all cases, minimum to maximum in brackets. A dash: not stated by the paper."
+_MEDIANS = "Ours: median over all cases, minimum to maximum in brackets. A dash: not in the paper."
 
 
-def format_own_value(frame: Rows, row: Mapping[str, Any]) -> str:
-    """Our value of a paper's quantity."""
-    chosen, column = frame[all_flags(frame, *row.get("among", ()))], row["column"]
+def format_simulated_value(frame: Rows, row: Mapping[str, Any]) -> str:
+    """Format Marsyard's value of a paper's quantity."""
+    rows, column = frame[all_flags(frame, *row.get("among", ()))], row["column"]
     if row.get("statistic") == "rate":
-        return fraction_text(flag_fraction(chosen, column)) if column in chosen else NOTHING
-    values = known(chosen, column, row.get("scale", 1.0))
+        return fraction_text(flag_fraction(rows, column)) if column in rows else NOTHING
+    values = finite_values(rows, column, row.get("scale", 1.0))
     return spread_text(np.abs(values) if row.get("magnitude") else values, row.get("digits"))

@@ -1,6 +1,6 @@
-"""Presentation of a system: its report sections, and which cases are shown with their pictures.
+"""Presentation of a system: its report sections, and the cases whose images are on the report's page.
 
-`marsyard.scenarios.systems.System.report` names it; reports find systems in `marsyard.scenarios.systems`.
+`marsyard.scenarios.systems.System.report` is its import path; reports find systems in `marsyard.scenarios.systems`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Products = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class TableRow:
-    """A row of a case's table, and whether its item succeeded."""
+    """A row of a case's table, and whether the item in it succeeded."""
 
     values: Sequence[str]
     succeeded: bool
@@ -37,10 +37,10 @@ class TableRow:
 
 @dataclass(frozen=True)
 class CaseView:
-    """View of a case on the page: facts, figures and a table; `legend` replaces the legend of its kind."""
+    """View of a case on the page: facts, figures and a table; `legend` replaces the legend of the case's kind."""
 
     facts: Sequence[tuple[str, str]]
-    plates: Sequence[SvgFigure]
+    figures: Sequence[SvgFigure]
     head: Sequence[str]
     rows: Sequence[TableRow]
     legend: str | None = None
@@ -48,9 +48,9 @@ class CaseView:
 
 @dataclass(frozen=True)
 class CaseKind:
-    """Functions that draw cases of one kind from their products.
+    """Functions that draw the cases of one kind from their products.
 
-    view: view for the page; its text argument prefixes identifiers of figures
+    view: create the view for the page; the text argument prefixes the identifiers of figures
     write: write the figures into a folder and return the paths; raises OSError if they cannot be written
     """
 
@@ -64,8 +64,8 @@ class CaseKind:
 class Presentation:
     """Report sections and case figures of a system.
 
-    cases: kinds of case; the first that matches the products draws a case
-    sections, first: sections after and before those of every campaign; makers return None for rows of other systems
+    cases: kinds of case; the first kind that matches the products is used
+    sections, first: sections after and in front of those of every campaign; None for rows of other systems
     """
 
     cases: Sequence[CaseKind] = ()
@@ -75,31 +75,31 @@ class Presentation:
 
 @cache
 def presentations() -> tuple[Presentation, ...]:
-    """The presentations of all systems in the order of the registry; an unusable one is left out with a warning."""
+    """Import the presentations of all systems in the order of the registry; omit an unusable one with a warning."""
     selected: list[Presentation] = []
     for system in systems():
         if not system.report:
             continue
-        stated = f"the report '{system.report}' of system '{system.name}'"
+        description = f"the report '{system.report}' of system '{system.name}'"
         try:
             presentation = import_object(system.report)
         except ImportError as error:
-            _warn(f"{stated} cannot be imported: {error}")
+            _warn(f"{description} cannot be imported: {error}")
             continue
         if isinstance(presentation, Presentation):
             selected.append(presentation)
         else:
-            kind = type(presentation).__name__
-            _warn(f"{stated} is a {kind}; allowed: a marsyard.reports.presentation.Presentation")
+            type_name = type(presentation).__name__
+            _warn(f"{description} is a {type_name}; allowed: a marsyard.reports.presentation.Presentation")
     return tuple(selected)
 
 
 def _warn(reason: str) -> None:
-    warnings.warn(f"{reason}; its sections and pictures are left out", stacklevel=3)
+    warnings.warn(f"{reason}; its sections and images are omitted", stacklevel=3)
 
 
 def case_kind(products: Products) -> CaseKind | None:
-    """The kind of case of these products; None if no system recognizes them."""
+    """Find the kind of case of these products; None if no system recognizes them."""
     kinds = (kind for presentation in presentations() for kind in presentation.cases)
     return next((kind for kind in kinds if kind.is_case(products)), None)
 
@@ -113,7 +113,7 @@ def save_figures(directory: Path, figures: Mapping[str, Figure], dpi: int = 110)
 
 
 def numeric_product(value: object) -> Float[np.ndarray, "..."] | None:
-    """A product as float64; None if it is not numeric."""
+    """Convert a product to float64; None if it is not numeric."""
     if value is None:
         return None
     try:
@@ -122,39 +122,39 @@ def numeric_product(value: object) -> Float[np.ndarray, "..."] | None:
         return None
 
 
-def plane(value: object) -> Float[np.ndarray, "_ _"] | None:
-    """A non-empty product of two dimensions; None otherwise."""
+def to_matrix(value: object) -> Float[np.ndarray, "_ _"] | None:
+    """Convert a product to a non-empty array of two dimensions; None if it is not one."""
     values = numeric_product(value)
     return values if values is not None and values.ndim == 2 and values.size else None
 
 
 def check_shape(value: object, *shape: int | None) -> Float[np.ndarray, "..."] | None:
-    """A product of a shape, where None is any length; None otherwise."""
+    """Convert a product to an array of a shape, where None is any length; None if it has another shape."""
     values = numeric_product(value)
     if values is None or values.ndim != len(shape):
         return None
-    fits = all(wanted in (None, length) for wanted, length in zip(shape, values.shape, strict=True))
-    return values if fits else None
+    is_valid = all(expected in (None, length) for expected, length in zip(shape, values.shape, strict=True))
+    return values if is_valid else None
 
 
 def read_arrays(
     products: Products, shapes: Mapping[str, tuple[int | None, ...]], *, finite: bool = False
 ) -> list[Float[np.ndarray, "..."]] | None:
-    """Products by name and shape, optionally finite; None if one of them is something else."""
+    """Read products by name and shape, optionally finite; None if one of them is missing or invalid."""
     arrays = [check_shape(products.get(name), *shape) for name, shape in shapes.items()]
-    valid = [one for one in arrays if one is not None and (not finite or np.isfinite(one).all())]
+    valid = [array for array in arrays if array is not None and (not finite or np.isfinite(array).all())]
     return valid if len(valid) == len(shapes) else None
 
 
-#: Cases of each kind (largest errors, no answer, random); the pictures of one take about half a megabyte of a page.
-CASES_OF_A_KIND = 2
-#: Fixed seeds of the random choice: the same files give the same cases.
+#: Number of cases of each kind (largest errors, no answer, random); the images of a case need half a megabyte.
+CASES_PER_KIND = 2
+#: Fixed seeds of the random selection, for reproducible reports.
 _GALLERY_SEED, _NOTABLE_SEED = 20260301, 20260302
 
 
 @dataclass(frozen=True)
-class ShownCase:
-    """A kept case with its outcome, its view and its legend."""
+class ShowcaseView:
+    """A stored case with its outcome, its view and its legend."""
 
     case: int
     outcome: str
@@ -162,63 +162,65 @@ class ShownCase:
     legend: str
 
 
-def shown_cases(run: StoredRun) -> list[ShownCase]:
-    """The kept cases of the page that a system can draw, as far as their products were kept."""
-    return [shown for case in gallery_cases(run) if (shown := shown_case(run, case)) is not None]
+def showcase_views(run: StoredRun) -> list[ShowcaseView]:
+    """Create the views of the cases on the page; cases that no system can draw are omitted."""
+    return [view for case in gallery_cases(run) if (view := showcase_view(run, case)) is not None]
 
 
 def gallery_cases(run: StoredRun) -> list[int]:
-    """Kept cases in the order of the page: the one chosen for the report, largest errors, no answer, random ones."""
-    kept = list(run.showcases)
+    """List the cases of the page: the one selected for the report, then largest errors, no answer, and random cases."""
+    stored_cases = list(run.showcases)
     metric = primary_metric(run.frame, run.requirements)
-    if len(kept) <= 1 or metric is None or "case" not in run.whole:
-        return kept[: 3 * CASES_OF_A_KIND]
-    by_error, silent = _by_error(run.whole[run.whole["case"].isin(kept)], metric)
-    unanswered = [case for case in kept if case in silent]
-    return _pick(kept[:1], by_error, unanswered, np.random.default_rng(_GALLERY_SEED).permutation(kept).tolist())
+    if len(stored_cases) <= 1 or metric is None or "case" not in run.all_cases:
+        return stored_cases[: 3 * CASES_PER_KIND]
+    by_error, without_error = _sort_by_error(run.all_cases[run.all_cases["case"].isin(stored_cases)], metric)
+    unanswered = [case for case in stored_cases if case in without_error]
+    random_order = np.random.default_rng(_GALLERY_SEED).permutation(stored_cases)
+    return _select_cases(stored_cases[:1], by_error, unanswered, random_order.tolist())
 
 
 def notable_cases(run: StoredRun) -> list[int]:
-    """Completed cases: the largest errors, the first without one, and others at random."""
-    rows = run.whole[members(run.whole, "completed")]
+    """List completed cases: the largest errors, the first cases without an error, and random cases."""
+    rows = run.all_cases[members(run.all_cases, "completed")]
     metric = primary_metric(run.frame, run.requirements)
     if "case" not in rows or metric is None:
         return []
-    by_error, silent = _by_error(rows, metric)
+    by_error, without_error = _sort_by_error(rows, metric)
     cases = rows["case"].to_numpy(dtype=np.int64)
-    return _pick([], by_error, silent, cases[np.random.default_rng(_NOTABLE_SEED).permutation(cases.size)].tolist())
+    random_order = np.random.default_rng(_NOTABLE_SEED).permutation(cases.size)
+    return _select_cases([], by_error, without_error, cases[random_order].tolist())
 
 
-def _by_error(rows: pd.DataFrame, metric: str) -> tuple[list[int], list[int]]:
-    """Cases with an error, largest first, and cases without one."""
-    cases, sizes = rows["case"].to_numpy(dtype=np.int64), np.abs(numbers(rows, metric))
-    finite = np.isfinite(sizes)
-    return cases[finite][np.argsort(-sizes[finite], kind="stable")].tolist(), cases[~finite].tolist()
+def _sort_by_error(rows: pd.DataFrame, metric: str) -> tuple[list[int], list[int]]:
+    """List cases with an error, largest first, and cases without an error."""
+    cases, magnitudes = rows["case"].to_numpy(dtype=np.int64), np.abs(numbers(rows, metric))
+    finite = np.isfinite(magnitudes)
+    return cases[finite][np.argsort(-magnitudes[finite], kind="stable")].tolist(), cases[~finite].tolist()
 
 
-def _pick(first: list[int], *kinds: list[int]) -> list[int]:
+def _select_cases(first: list[int], *kinds: list[int]) -> list[int]:
     """The first cases, then up to `CASES_OF_A_KIND` further ones of each kind."""
-    chosen = list(first)
+    selected = list(first)
     for kind in kinds:
-        chosen += [case for case in dict.fromkeys(kind) if case not in chosen][:CASES_OF_A_KIND]
-    return chosen
+        selected += [case for case in dict.fromkeys(kind) if case not in selected][:CASES_PER_KIND]
+    return selected
 
 
-def shown_case(run: StoredRun, case: int) -> ShownCase | None:
-    """A kept case with its view; None if no system recognizes its products."""
+def showcase_view(run: StoredRun, case: int) -> ShowcaseView | None:
+    """Create the view of a stored case; None if no system recognizes its products."""
     products = run.products(case)
     kind = case_kind(products)
     if kind is None:
         return None
     view = kind.view(products, f"case{case}")
-    rows = run.whole
+    rows = run.all_cases
     outcomes = rows.loc[rows["case"] == case, "outcome"] if {"case", "outcome"} <= {*rows} else pd.Series(dtype=object)
     outcome = str(outcomes.iloc[0]) if len(outcomes) else NOTHING
-    return ShownCase(case, outcome, view, kind.legend if view.legend is None else view.legend)
+    return ShowcaseView(case, outcome, view, kind.legend if view.legend is None else view.legend)
 
 
 def write_case_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    """Write a case's figures into a folder; returns their paths, none if no system recognizes the products.
+    """Write a case's figures into a folder; returns their paths, or no path if no system recognizes the products.
 
     Raises OSError if they cannot be written.
     """

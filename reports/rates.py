@@ -1,4 +1,4 @@
-"""Populations of stored rows, and rates and numbers of them with intervals and texts."""
+"""Populations of stored rows; their rates and numbers with intervals, and texts of these."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 
-from marsyard.campaigns.errors import UNFINISHED
+from marsyard.campaigns import errors
 from marsyard.reports.statistics.proportions import Interval, clustered_evidence, proportion_interval
 from marsyard.reports.wording import NOTHING, number, numbers, percent
 
 #: Outcomes of cases that the engine could not finish.
-ENGINE_FAILURES = UNFINISHED
+ENGINE_FAILURES = errors.ENGINE_FAILURES
 
 
 def success_mask(frame: pd.DataFrame, metric: str, bound: float, scale: float = 1.0) -> Bool[np.ndarray, " n"]:
@@ -41,21 +41,19 @@ def members(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
 def members_and_unknown(
     frame: pd.DataFrame, parts: Sequence[str]
 ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Members of the intersection of populations, and members of unknown membership."""
-    chosen, unknown = np.ones(len(frame), dtype=np.bool_), np.zeros(len(frame), dtype=np.bool_)
+    """Masks of the members of the intersection of populations, and of members of unknown membership."""
+    member, unknown = np.ones(len(frame), dtype=np.bool_), np.zeros(len(frame), dtype=np.bool_)
     for part in parts:
         if part == "completed":
-            chosen &= ~engine_failed(frame)
+            member &= ~engine_failed(frame)
         elif part != "all":
             column = "answered" if part == "valid" else part
             if not is_flag(frame, column):
-                raise ValueError(
-                    f"the rows have no column '{column}' of true and false, by which a population is known"
-                )
+                raise ValueError(f"the rows have no column '{column}' of true and false, which defines a population")
             missing = frame[column].isna().to_numpy(dtype=np.bool_)
-            chosen &= flag(frame, column) | missing
+            member &= flag(frame, column) | missing
             unknown |= missing
-    return chosen, chosen & unknown
+    return member, member & unknown
 
 
 def is_flag(frame: pd.DataFrame, column: str) -> bool:
@@ -64,42 +62,42 @@ def is_flag(frame: pd.DataFrame, column: str) -> bool:
 
 
 def engine_failed(frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
-    """Cases that the engine could not finish."""
+    """Mask of the cases that the engine could not finish."""
     if "outcome" not in frame:
         return np.zeros(len(frame), dtype=np.bool_)
     return frame["outcome"].isin(ENGINE_FAILURES).to_numpy(dtype=np.bool_)
 
 
 def members_if_answered(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
-    """Members of a population, and unfinished cases that a valid answer would make members."""
-    others = [part for part in population.split(" and ") if part not in ("valid", "completed")]
-    return np.asarray(members(frame, population) | (members_and_unknown(frame, others)[0] & engine_failed(frame)))
+    """Mask of the members of a population, and of unfinished cases that would be members with a valid answer."""
+    flags = [part for part in population.split(" and ") if part not in ("valid", "completed")]
+    return np.asarray(members(frame, population) | (members_and_unknown(frame, flags)[0] & engine_failed(frame)))
 
 
-def terrain_groups(chosen: pd.DataFrame) -> Int[np.ndarray, " n"] | None:
+def terrain_groups(frame: pd.DataFrame) -> Int[np.ndarray, " n"] | None:
     """Terrain index of each case from 0; None if unknown for all. A case of unknown terrain has its own index."""
-    if "terrain" not in chosen or bool(chosen["terrain"].isna().all()):
+    if "terrain" not in frame or bool(frame["terrain"].isna().all()):
         return None
-    codes, terrain_names = pd.factorize(chosen["terrain"])
+    codes, terrain_names = pd.factorize(frame["terrain"])
     groups = np.array(codes, dtype=np.int64)
-    alone = groups < 0
-    groups[alone] = len(terrain_names) + np.arange(int(alone.sum()))
+    is_unknown = groups < 0
+    groups[is_unknown] = len(terrain_names) + np.arange(int(is_unknown.sum()))
     return groups
 
 
 #: Confidence of the two-sided intervals.
 CONFIDENCE = 0.9
-_RESAMPLES = 1000
-#: The same rows give the same page.
+_N_RESAMPLES = 1000
+#: Fixed seed of the bootstrap, for reproducible reports.
 _SEED = 2005
 
 
 @dataclass(frozen=True)
-class Share:
+class CaseFraction:
     """A fraction of cases with its two-sided intervals at `CONFIDENCE`; NaN for no cases.
 
     lower, upper: Clopper-Pearson interval for independent cases
-    shared_lower, shared_upper: interval that allows for shared terrains; None where no terrain is shared
+    shared_lower, shared_upper: interval that allows for shared terrains; None if no terrain is shared
     """
 
     n: int
@@ -111,27 +109,27 @@ class Share:
     shared_upper: float | None = None
 
     @property
-    def sound(self) -> tuple[float, float]:
+    def clustered_interval(self) -> tuple[float, float]:
         """The interval that allows for shared terrains."""
         if self.shared_lower is None or self.shared_upper is None:
             return self.lower, self.upper
         return self.shared_lower, self.shared_upper
 
 
-def fraction_of(hit: Bool[np.ndarray, " n"], frame: pd.DataFrame) -> Share:
-    """The fraction of the cases of `frame` that `hit` marks."""
+def fraction_of(hit: Bool[np.ndarray, " n"], frame: pd.DataFrame) -> CaseFraction:
+    """Return the fraction of the cases of `frame` that `hit` marks."""
     n, hits = hit.size, int(hit.sum())
     if n == 0:
-        return Share(0, 0, math.nan, 0.0, 1.0)
-    groups, shared = terrain_groups(frame), None
+        return CaseFraction(0, 0, math.nan, 0.0, 1.0)
+    groups, clustered = terrain_groups(frame), None
     if groups is not None and int(groups.max()) + 1 < n:
         evidence = clustered_evidence(hit, groups, 0.5 * (1.0 + CONFIDENCE))
-        shared = evidence.lower, evidence.upper
-    return Share(n, hits, hits / n, *proportion_interval(hits, n, CONFIDENCE), *(shared or (None, None)))
+        clustered = evidence.lower, evidence.upper
+    return CaseFraction(n, hits, hits / n, *proportion_interval(hits, n, CONFIDENCE), *(clustered or (None, None)))
 
 
-def flag_fraction(frame: pd.DataFrame, name: str, *, wanted: bool = True) -> Share:
-    """The fraction of rows whose flag is as wanted."""
+def flag_fraction(frame: pd.DataFrame, name: str, *, wanted: bool = True) -> CaseFraction:
+    """Return the fraction of rows whose flag equals `wanted`."""
     return fraction_of(frame[name].eq(wanted).fillna(False).to_numpy(dtype=np.bool_), frame)
 
 
@@ -139,9 +137,8 @@ def flag_fraction(frame: pd.DataFrame, name: str, *, wanted: bool = True) -> Sha
 class PooledRate:
     """A fraction of items counted in every case, pooled over cases; items within a case are correlated.
 
-    hits, of: counted items, and all
-    lower, upper: by bootstrap over cases, or over shared terrains; NaN if no case has a hit
-    flights, flights_hit: cases with items, and with a hit
+    hits, of: number of counted items, and of all items lower, upper: bootstrap interval over cases, or over shared
+    terrains; NaN if no case has a hit flights, flights_hit: number of cases with items, and with a hit
     """
 
     hits: int
@@ -154,28 +151,28 @@ class PooledRate:
 
 
 def pooled_rate(frame: pd.DataFrame, hits: str, of: str) -> PooledRate:
-    """Pooled fraction of two columns of counts; missing hits count as 0."""
-    top, bottom = (np.nan_to_num(numbers(frame, name)) for name in (hits, of))
-    asked = bottom > 0
-    cases, cases_hit = int(asked.sum()), int((asked & (top > 0)).sum())
-    total = int(bottom.sum())
+    """Pool the fraction of two columns of counts over the cases; missing hits count as 0."""
+    hit_counts, item_counts = (np.nan_to_num(numbers(frame, name)) for name in (hits, of))
+    has_items = item_counts > 0
+    cases, cases_hit = int(has_items.sum()), int((has_items & (hit_counts > 0)).sum())
+    total = int(item_counts.sum())
     if total == 0:
         return PooledRate(0, 0, math.nan, math.nan, math.nan, 0, 0)
     lower = upper = math.nan
     if cases_hit and cases > 1:
-        groups = terrain_groups(frame[asked])
-        drawn = np.arange(cases) if groups is None or int(groups.max()) < 1 else groups
-        weights = bootstrap_weights(drawn, np.random.default_rng(_SEED))[1:]
-        sums = weights @ bottom[asked]
-        lower, upper = percentile_interval((weights @ top[asked])[sums > 0] / sums[sums > 0])
-    return PooledRate(int(top.sum()), total, float(top.sum() / total), lower, upper, cases, cases_hit)
+        groups = terrain_groups(frame[has_items])
+        clusters = np.arange(cases) if groups is None or int(groups.max()) < 1 else groups
+        weights = bootstrap_weights(clusters, np.random.default_rng(_SEED))[1:]
+        sums = weights @ item_counts[has_items]
+        lower, upper = percentile_interval((weights @ hit_counts[has_items])[sums > 0] / sums[sums > 0])
+    return PooledRate(int(hit_counts.sum()), total, float(hit_counts.sum() / total), lower, upper, cases, cases_hit)
 
 
 def bootstrap_weights(groups: np.ndarray, rng: np.random.Generator) -> Float[np.ndarray, "resamples n"]:
-    """Multiplicity of each case if whole groups are drawn with replacement; the first row is the sample itself."""
+    """Multiplicity of each case if entire groups are drawn with replacement; the first row is the sample itself."""
     count = int(groups.max()) + 1
-    drawn = rng.multinomial(count, np.full(count, 1.0 / count), size=_RESAMPLES)
-    return np.concatenate([np.ones((1, groups.size)), drawn[:, groups]]).astype(np.float64)
+    multiplicities = rng.multinomial(count, np.full(count, 1.0 / count), size=_N_RESAMPLES)
+    return np.concatenate([np.ones((1, groups.size)), multiplicities[:, groups]]).astype(np.float64)
 
 
 def percentile_interval(resampled: Float[np.ndarray, " b"]) -> Interval:
@@ -185,19 +182,19 @@ def percentile_interval(resampled: Float[np.ndarray, " b"]) -> Interval:
 
 
 def flag(frame: pd.DataFrame, name: str) -> Bool[np.ndarray, " n"]:
-    """A column of true and false; missing values are false."""
+    """Mask of the true values of a column; missing values are false."""
     if not is_flag(frame, name):
         return np.zeros(len(frame), dtype=np.bool_)
     return np.asarray(frame[name].eq(True).fillna(False).to_numpy(dtype=np.bool_))
 
 
 def all_flags(frame: pd.DataFrame, *names: str) -> Bool[np.ndarray, " n"]:
-    """Mask of the rows with all flags that exist as columns."""
-    chosen = [flag(frame, name) for name in names if is_flag(frame, name)]
-    return np.asarray(np.logical_and.reduce([np.ones(len(frame), dtype=np.bool_), *chosen]))
+    """Mask of the rows where all flags that exist as columns are true."""
+    masks = [flag(frame, name) for name in names if is_flag(frame, name)]
+    return np.asarray(np.logical_and.reduce([np.ones(len(frame), dtype=np.bool_), *masks]))
 
 
-def known(frame: pd.DataFrame, column: str, scale: float = 1.0) -> Float[np.ndarray, " n"]:
+def finite_values(frame: pd.DataFrame, column: str, scale: float = 1.0) -> Float[np.ndarray, " n"]:
     """Finite numbers of a column, scaled."""
     values = numbers(frame, column)
     return np.asarray(scale * values[np.isfinite(values)])
@@ -205,7 +202,7 @@ def known(frame: pd.DataFrame, column: str, scale: float = 1.0) -> Float[np.ndar
 
 def varies(frame: pd.DataFrame, name: str) -> bool:
     """Whether a column of numbers has more than one value."""
-    values = known(frame, name)
+    values = finite_values(frame, name)
     return values.size > 1 and bool(np.ptp(values) > 0.0)
 
 
@@ -215,48 +212,49 @@ def rms(values: Float[np.ndarray, " n"]) -> float:
 
 
 def quantile(values: Float[np.ndarray, " n"], probability: float) -> float:
-    """A quantile; NaN for no values."""
+    """Quantile; NaN for no values."""
     return float(np.quantile(values, probability)) if values.size else math.nan
 
 
-def by_size(frame: pd.DataFrame, column: str, size: str, first: str) -> Iterator[tuple[str, float, pd.DataFrame]]:
-    """Rows by kind and size in order; the kind named `first` comes first."""
+def group_by_size(frame: pd.DataFrame, column: str, size: str, first: str) -> Iterator[tuple[str, float, pd.DataFrame]]:
+    """Group rows by kind and size in order; the kind named `first` comes first."""
     sizes = numbers(frame, size)
     for kind in sorted(frame[column].dropna().unique(), key=lambda name: (name != first, str(name))):
         of_kind = frame[column].eq(kind).fillna(False).to_numpy(dtype=np.bool_)
         for value in np.unique(sizes[of_kind]):
-            same = np.isnan(sizes) if np.isnan(value) else sizes == value
-            yield str(kind), float(value), frame[of_kind & same]
+            same_size = np.isnan(sizes) if np.isnan(value) else sizes == value
+            yield str(kind), float(value), frame[of_kind & same_size]
 
 
-def fraction_text(share: Share) -> str:
-    """Hits, cases and share: ``19 of 20: 95.00 %``."""
-    return f"{share.hits:,} of {share.n:,}: {percent(share.share)}" if share.n else NOTHING
+def fraction_text(fraction: CaseFraction) -> str:
+    """Format hits, cases and fraction: ``19 of 20: 95.00 %``."""
+    return f"{fraction.hits:,} of {fraction.n:,}: {percent(fraction.share)}" if fraction.n else NOTHING
 
 
-def interval_text(share: Share, *, shared: bool = False) -> str:
-    """Interval of a share for independent cases, or allowing for `shared` terrains."""
-    if not share.n:
+def interval_text(fraction: CaseFraction, *, shared: bool = False) -> str:
+    """Format the interval of a fraction for independent cases, or allowing for `shared` terrains."""
+    if not fraction.n:
         return NOTHING
-    return range_text(*share.sound) if shared else range_text(share.lower, share.upper)
+    return range_text(*fraction.clustered_interval) if shared else range_text(fraction.lower, fraction.upper)
 
 
 def range_text(lower: float, upper: float) -> str:
-    """Two bounds of a fraction."""
+    """Format two bounds of a fraction."""
     return f"{percent(lower)} to {percent(upper)}"
 
 
-def rate_text(one: PooledRate) -> str:
-    """A rate with its interval: ``2.0 % (1.1 % to 3.2 %)``."""
-    if one.of == 0:
+def rate_text(rate: PooledRate) -> str:
+    """Format a rate with its interval: ``2.0 % (1.1 % to 3.2 %)``."""
+    if rate.of == 0:
         return NOTHING
-    return percent(one.share) if math.isnan(one.lower) else f"{percent(one.share)} ({range_text(one.lower, one.upper)})"
+    text = percent(rate.share)
+    return text if math.isnan(rate.lower) else f"{text} ({range_text(rate.lower, rate.upper)})"
 
 
 def spread_text(values: Float[np.ndarray, " n"], digits: int | None = None) -> str:
-    """Median, and minimum to maximum in brackets; one number for equal values, a dash for none."""
+    """Format the median, and minimum to maximum in brackets; one number for equal values, a dash for no values."""
     if values.size == 0:
         return NOTHING
-    low, middle, high = (float(one) for one in (values.min(), np.median(values), values.max()))
-    texts = [number(one) if digits is None else f"{one:.{digits}f}".replace("-", "−") for one in (middle, low, high)]
+    low, median, high = (float(value) for value in (values.min(), np.median(values), values.max()))
+    texts = [number(x) if digits is None else f"{x:.{digits}f}".replace("-", "−") for x in (median, low, high)]
     return texts[0] if texts[1] == texts[2] else f"{texts[0]} ({texts[1]} to {texts[2]})"

@@ -1,4 +1,4 @@
-"""Sampling design of a stored campaign: only independent random draws allow probability statements."""
+"""Sampling design of a stored campaign: only independent random samples allow probability statements."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from marsyard.reports.statistics.proportions import planned_looks, spent_fractio
 from marsyard.reports.stored import table
 from marsyard.reports.wording import count, format_fraction
 
-#: The design of cases that are drawn independently.
+#: Design with independent random cases.
 RANDOM = "random"
 
 
@@ -25,35 +25,33 @@ class TerrainSupply:
     """The terrains that a campaign's cases can use.
 
     key: parameter that sets their number: size of the bank, or dispersion of the terrain's number
-    in_turn: whether cases use them in turn; otherwise drawn with replacement
+    in_turn: whether the cases use the terrains in turn; otherwise terrains are drawn at random with replacement
     """
 
     terrains: int
     key: str
     in_turn: bool = False
 
-    def advice(self, fewest: int, probability: float, confidence: float) -> str:
-        """Why further cases cannot help, and the change that does; `fewest` terrains are needed."""
+    def advice(self, needed: int, probability: float, confidence: float) -> str:
+        """Explain why additional cases cannot help, and which change does; `needed` terrains are required."""
         level = f"{format_fraction(probability)} at {format_fraction(confidence)} confidence"
-        has = f"The campaign draws from {count(self.terrains, 'terrain')} ({self.key} = {self.terrains}); {level}"
-        has = f"{has} takes at least {count(fewest, 'terrain')}"
+        text = f"The campaign draws from {count(self.terrains, 'terrain')} ({self.key} = {self.terrains}); {level}"
+        text = f"{text} needs at least {count(needed, 'terrain')}"
         if not self.key.endswith(".bank"):
-            return f"{has}: widen the range of {self.key}, and the bank, and run the campaign again."
+            return f"{text}: widen the range of {self.key}, and the bank, and run the campaign again."
         # random draws from ten times as many terrains rarely repeat: 1.1 cases per terrain suffice
-        bank, cases = (fewest, fewest) if self.in_turn else (10 * fewest, math.ceil(1.1 * fewest))
-        return f"{has}: run the campaign again with --set {self.key}={bank} -n {cases}."
+        bank, cases = (needed, needed) if self.in_turn else (10 * needed, math.ceil(1.1 * needed))
+        return f"{text}: run the campaign again with --set {self.key}={bank} -n {cases}."
 
 
 @dataclass(frozen=True)
 class SamplingDesign:
     """The sampling design of a campaign.
 
-    design: `random`, `latin-hypercube` or `sobol`
-    grids: paths of the parameters that were swept as a grid
-    nominal: whether case 0 is the nominal one, without draws
-    max_cases: cases of the last look of a sequential campaign; else None
-    first_look: cases at the first verdict if cases were appended since; else None
-    terrains: the terrains that the cases draw from; None if unknown
+    design: `random`, `latin-hypercube` or `sobol` grids: paths of the parameters that were swept as a grid nominal:
+    whether case 0 is the nominal one, without draws max_cases: number of cases at the last look (planned evaluation) of
+    a sequential campaign; else None first_look: number of cases at the first verdict if cases were appended after it;
+    else None terrains: the terrains that the cases draw from; None if unknown
     """
 
     design: str = RANDOM
@@ -65,7 +63,7 @@ class SamplingDesign:
 
     @property
     def independent(self) -> bool:
-        """Whether the cases, the nominal one aside, are independent random draws."""
+        """Whether the cases, except the nominal one, are independent random samples."""
         return self.design == RANDOM and not self.grids
 
     @property
@@ -75,71 +73,69 @@ class SamplingDesign:
 
     @property
     def no_probability(self) -> str:
-        """Why the cases allow no probability statement; empty if they do."""
+        """Explain why the cases allow no probability statement; empty if they allow one."""
         if self.independent:
             return ""
-        changes = [] if self.design == RANDOM else ['set design.kind = "random"']
-        remedy = " and ".join([*changes, *(f"give '{path}' a distribution that is drawn" for path in self.grids)])
+        steps = [] if self.design == RANDOM else ['set design.kind = "random"']
+        remedy = " and ".join([*steps, *(f"give '{path}' a random distribution" for path in self.grids)])
         return (
             f"No probability statement: the design is {describe_design(self.design, self.grids, nominal=False)}, and "
-            f"only independent random draws carry one. {remedy[:1].upper()}{remedy[1:]}, and run it again."
+            f"only independent random samples allow one. {remedy[:1].upper()}{remedy[1:]}, and run it again."
         )
 
     def risk_share(self, cases: int) -> float:
-        """Fraction of the risk that a look at so many cases may spend."""
+        """Fraction of the risk that a look at `cases` cases may spend."""
         return 1.0 if self.max_cases is None else spent_fraction(planned_looks(self.max_cases), cases)
 
-    def mask_first_look(self, frame: pd.DataFrame, chosen: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
-        """Mask of the chosen rows of an earlier first look; None at the first look."""
+    def mask_first_look(self, frame: pd.DataFrame, selected: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
+        """Mask of the rows of `selected` that an earlier first look used; None at the first look."""
         if self.first_look is None or self.max_cases is not None or "case" not in frame:
             return None
         if not bool((frame["case"] >= self.first_look).any()):
             return None
-        return np.asarray(chosen["case"] < self.first_look, dtype=np.bool_)
+        return np.asarray(selected["case"] < self.first_look, dtype=np.bool_)
 
-    def draw(self, frame: pd.DataFrame) -> pd.DataFrame:
-        """The rows without the nominal case."""
-        if not self.nominal or "case" not in frame:
-            return frame
-        return frame[frame["case"] != 0].reset_index(drop=True)
+    def exclude_nominal_case(self, frame: pd.DataFrame) -> pd.DataFrame:
+        """Return the rows without the nominal case."""
+        return frame if not self.nominal or "case" not in frame else frame[frame["case"] != 0].reset_index(drop=True)
 
 
-#: Independent random draws, the default design.
+#: Independent random samples, the default design.
 INDEPENDENT = SamplingDesign()
 
 
 def read_sampling_design(configuration: Mapping[str, Any]) -> SamplingDesign:
-    """Read the sampling design from a configuration; invalid values count as missing."""
+    """Read the sampling design from a configuration; invalid values are treated as missing."""
     design = table(configuration.get("design"))
     dispersions = table(configuration.get("dispersions"))
-    grids = tuple(str(path) for path, one in dispersions.items() if table(one).get("distribution") == "grid")
+    grids = tuple(str(path) for path, value in dispersions.items() if table(value).get("distribution") == "grid")
     limit = configuration.get("max_cases")
     max_cases = limit if isinstance(limit, int) and not isinstance(limit, bool) and limit > 0 else None
-    first = configuration.get("cases") if configuration.get("appended") else None
+    first_look = configuration.get("cases") if configuration.get("appended") else None
     return SamplingDesign(
         str(design.get("kind") or RANDOM),
         grids,
         design.get("nominal") is True,
         max_cases,
-        first if isinstance(first, int) else None,
-        terrain_supply(configuration),
+        first_look if isinstance(first_look, int) else None,
+        read_terrain_supply(configuration),
     )
 
 
-def terrain_supply(configuration: Mapping[str, Any]) -> TerrainSupply | None:
-    """Read the terrains from a configuration; None if unknown."""
+def read_terrain_supply(configuration: Mapping[str, Any]) -> TerrainSupply | None:
+    """Read the available terrains from a configuration; None if unknown."""
     parameters, dispersions = table(configuration.get("parameters")), table(configuration.get("dispersions"))
     for name in ("location", "world"):
         bank = table(parameters.get(name)).get("bank")
         if not isinstance(bank, int):
             continue
         path = f"{name}.terrain"
-        drawn = table(dispersions.get(path))
-        if not drawn:
+        dispersion = table(dispersions.get(path))
+        if not dispersion:
             return TerrainSupply(1, path)
-        in_turn = drawn.get("distribution") == "in-turn"
-        low, high = drawn.get("low"), drawn.get("high")
-        if isinstance(low, int) and isinstance(high, int) and high - low + 1 < bank:
-            return TerrainSupply(high - low + 1, f'dispersions."{path}"', in_turn)
+        in_turn = dispersion.get("distribution") == "in-turn"
+        first, last = dispersion.get("low"), dispersion.get("high")
+        if isinstance(first, int) and isinstance(last, int) and last - first + 1 < bank:
+            return TerrainSupply(last - first + 1, f'dispersions."{path}"', in_turn)
         return TerrainSupply(bank, f"{name}.bank", in_turn)
     return None

@@ -1,4 +1,4 @@
-"""Building blocks of report sections: tables, figures with captions, blocks, and SVG in the style of the page."""
+"""Building blocks of report sections: tables, figures with captions, blocks, and SVG in the page's style."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from marsyard.reports.stored import StoredRun
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Colours that figures are drawn with, and the page's colours that replace them.
+#: Colours of the figures as drawn, and the page's colours that replace them.
 INK, MUTED, GRID = "#10161d", "#5a6672", "#d3d9e0"
 _THEME = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--line)"}
 
-#: Colours and markers of categories, after Okabe & Ito's palette for colour-blind readers, in tones with a contrast of
-#: 3:1 on the light and on the dark page; colour is never the only distinction.
+#: Colours and markers of categories, from Okabe & Ito's palette for colour-blind readers, in tones with a contrast of
+#: 3:1 on the light and the dark page; colour is never the only distinction.
 SERIES = ("#2f83d6", "#cf6a14", "#1c9a76", "#b262b2", "#9c7f12", "#78838f")
 MARKERS = ("o", "^", "s", "D", "v", "P")
 REQUIREMENT = "#d0392f"
@@ -45,9 +45,9 @@ BARS: Mapping[str, Mapping[str, Any]] = {
     "crossed": {"color": "none", "edgecolor": REQUIREMENT, "hatch": "xxxx"},
 }
 
-#: More points than this are drawn as pixels instead of vectors, to keep pages small.
+#: Maximum number of points drawn as vectors; more points are drawn as pixels, to keep pages small.
 LARGEST_VECTOR_SAMPLE = 800
-#: Dots per inch of parts drawn as pixels: twice the size on a screen.
+#: Dots per inch of parts drawn as pixels: twice the resolution of a screen.
 RASTER_DPI = 160
 
 _STYLE_FILE = Path(__file__).parent / "templates" / "page.mplstyle"
@@ -66,23 +66,23 @@ def in_page_style(draw: Callable[P, R]) -> Callable[P, R]:
 
 
 @contextmanager
-def _page_style(**further: str) -> Iterator[None]:
-    """The page's style; warnings about letters that the font lacks are ignored."""
-    with mpl.style.context(["default", _STYLE, further]), warnings.catch_warnings():
+def _page_style(**settings: str) -> Iterator[None]:
+    """Use the page's style; ignore warnings about characters that are missing from the font."""
+    with mpl.style.context(["default", _STYLE, settings]), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
 
 
 def new_axes(width: float, height: float) -> tuple[Figure, Axes]:
-    """A figure with one pair of axes, size in inches; call it in the page's style."""
+    """Create a figure with one pair of axes, size in inches; call it in the page's style."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.add_subplot()
 
 
 def svg_markup(figure: Figure, key: str, description: str) -> str:
-    """The figure as an SVG element of a page; its texts must have been set through matplotlib, which escapes them.
+    """Convert a figure to an SVG element of a page; its texts must be set through matplotlib, which escapes them.
 
-    key: letters and digits, unique on the page, as prefix of the identifiers inside
+    key: letters and digits, unique on the page; prefix of the identifiers in the SVG
     description: text for readers who cannot see the figure
     """
     buffer = io.StringIO()
@@ -92,15 +92,15 @@ def svg_markup(figure: Figure, key: str, description: str) -> str:
     markup = buffer.getvalue()
     body = markup[markup.index("<svg") :]
     view_box = re.search(r'viewBox="[^"]*"', body)
-    inner = re.sub(r' id="([^"]*)"', rf' id="{key}-\1"', body[body.index(">") + 1 :])
-    inner = re.sub(r'(href="|url\()#', rf"\1#{key}-", inner)
-    for stand_in, colour in _THEME.items():
-        inner = inner.replace(stand_in, colour)
+    content = re.sub(r' id="([^"]*)"', rf' id="{key}-\1"', body[body.index(">") + 1 :])
+    content = re.sub(r'(href="|url\()#', rf"\1#{key}-", content)
+    for drawn_colour, page_colour in _THEME.items():
+        content = content.replace(drawn_colour, page_colour)
     head = (
         f'<svg role="img" aria-label="{escape(description, quote=True)}" {view_box[0] if view_box else ""} '
         'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">'
     )
-    return head + inner.strip()
+    return head + content.strip()
 
 
 def show_picture(axes: Axes, picture: Float[np.ndarray, "_ _"]) -> None:
@@ -131,7 +131,7 @@ def _hide_frame(axes: Axes) -> None:
 
 @in_page_style
 def draw_pictures(pictures: Sequence[Float[np.ndarray, "_ _"]]) -> Figure:
-    """Numbered pictures in a row, as delivered: for a case whose algorithm left no details to draw."""
+    """Draw numbered pictures in a row, as delivered: for a case whose algorithm provides no details to draw."""
     rows, columns = pictures[0].shape
     height = 12.0 / len(pictures) * rows / columns + 0.35
     figure = Figure(figsize=(12.0, height), layout="constrained")
@@ -146,7 +146,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Grid:
-    """A table of texts, and the number of rows left out."""
+    """A table of texts, and the number of omitted rows."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -154,7 +154,7 @@ class Grid:
 
 
 def build_grid(records: Iterable[T], columns: Mapping[str, Callable[[T], str]]) -> Grid:
-    """A table of records; `columns` maps headings to functions that make the texts."""
+    """Create a table of records; `columns` maps headings to functions that format a record."""
     return Grid([*columns], [[text(record) for text in columns.values()] for record in records])
 
 
@@ -167,9 +167,9 @@ class SvgFigure:
     wide: bool = False
 
 
-def plate(figure: Figure, key: str, caption: str, *, wide: bool = False) -> SvgFigure:
-    """A figure with its caption; `key` is as in `svg_markup`."""
-    # matplotlib escapes the texts inside, svg_markup the description
+def svg_figure(figure: Figure, key: str, caption: str, *, wide: bool = False) -> SvgFigure:
+    """Convert a figure to SVG with its caption; `key` is as in `svg_markup`."""
+    # matplotlib escapes the texts of the figure, svg_markup the description
     return SvgFigure(Markup(svg_markup(figure, key, caption)), caption, wide)  # noqa: S704
 
 
@@ -183,22 +183,22 @@ class Subject:
 
     @property
     def frame(self) -> pd.DataFrame:
-        """The rows of all cases, or of the first of very many."""
+        """The rows of all cases, or of the first cases of a large campaign (see `StoredRun`)."""
         return self.run.frame
 
     @property
-    def whole(self) -> pd.DataFrame:
-        """The rows of all cases; of very many, only some columns."""
-        return self.run.whole
+    def all_cases(self) -> pd.DataFrame:
+        """The rows of all cases; of a large campaign, only some columns."""
+        return self.run.all_cases
 
 
 @dataclass(frozen=True)
 class Block:
-    """A block of a section: heading, text, figures, table, note, as far as they are given."""
+    """A block of a section: heading, text, figures, table, note; all are optional."""
 
     heading: str = ""
     text: str = ""
-    plates: Sequence[SvgFigure] = ()
+    figures: Sequence[SvgFigure] = ()
     grid: Grid | None = None
     note: str = ""
 
@@ -207,9 +207,8 @@ class Block:
 class Section:
     """A section of the page.
 
-    key: its anchor and its key in `report.json`: letters, digits and hyphens
-    name: its entry in the page's menu
-    data: its numbers, for `report.json`
+    key: its anchor and its key in `report.json`: letters, digits and hyphens name: its entry in the page's menu data:
+    its numbers, for `report.json`
     """
 
     key: str

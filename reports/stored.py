@@ -1,4 +1,4 @@
-"""Read a campaign's folder: rows, record, and products of kept cases."""
+"""Read a campaign's folder: rows, record, and products of stored cases."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 
 import pandas as pd
 
-from marsyard.campaigns.definition.configuration import stored_columns_now, stored_configuration_now
+from marsyard.campaigns.definition.configuration import find_renamed_columns, update_stored_configuration
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products
 from marsyard.reports.wording import axis_columns, driver_columns, primary_metric
 
-#: Maximum number of cases of which all columns are read; of more cases, all columns of the first ones are read.
-LARGEST_WHOLE, FIRST_CASES = 50_000, 20_000
+#: Maximum number of cases with all columns in memory; of more cases, all columns of the first `FIRST_CASES` are read.
+MAX_FULL_CASES, FIRST_CASES = 50_000, 20_000
 
 TABLE_FILE = "cases.parquet"
 RECORD_FILE = "campaign.json"
@@ -26,22 +26,21 @@ RECORD_FILE = "campaign.json"
 class StoredRun:
     """Contents of a campaign's folder.
 
-    frame: rows in the order of the cases; of very many, the first ones
-    whole: all cases; of very many, only the columns of verdicts, outcomes and errors
-    record: `campaign.json`; empty if it cannot be read
-    showcases: kept cases, the one chosen for the report first
+    frame: rows in the order of the cases; of more than `MAX_FULL_CASES` cases, the first ones all_cases: rows of all
+    cases; of more than `MAX_FULL_CASES`, only the columns of verdicts, outcomes and errors record: `campaign.json`;
+    empty if it cannot be read showcases: cases with stored products, the one selected for the report first
     """
 
     directory: Path
     frame: pd.DataFrame
-    whole: pd.DataFrame
+    all_cases: pd.DataFrame
     record: Mapping[str, Any]
     showcases: tuple[int, ...]
 
     @property
     def sampled_from(self) -> int | None:
-        """Number of all cases if `frame` holds only the first ones; else None."""
-        return len(self.whole) if len(self.whole) > len(self.frame) else None
+        """Number of all cases if `frame` contains only the first ones; else None."""
+        return len(self.all_cases) if len(self.all_cases) > len(self.frame) else None
 
     @property
     def configuration(self) -> Mapping[str, Any]:
@@ -85,7 +84,7 @@ class StoredRun:
         return value
 
     def products(self, case: int) -> dict[str, Any]:
-        """The products of a kept case; empty if they cannot be read."""
+        """The products of a case; empty if they cannot be read."""
         try:
             return load_products(self.directory / "cases" / str(case))
         except (StoreError, AttributeError, TypeError):
@@ -96,50 +95,50 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
     """Read a campaign's folder; `requirements` replace the campaign's own. Raises StoreError without rows."""
     path = directory / TABLE_FILE
     if not path.is_file():
-        raise StoreError(f"{directory} holds no {TABLE_FILE}; a report needs the rows of a campaign")
+        raise StoreError(f"{directory} contains no {TABLE_FILE}; a report needs the rows of a campaign")
     try:
         record = dict(table(json.loads((directory / RECORD_FILE).read_text(encoding="utf-8"))))
     except (OSError, ValueError):
         record = {}
     configuration = table(record.get("configuration"))
-    record["configuration"] = configuration = stored_configuration_now(configuration) if configuration else {}
+    record["configuration"] = configuration = update_stored_configuration(configuration) if configuration else {}
     record["requirements"] = configuration.get("requirements", record.get("requirements"))
     if requirements is not None:
         record["requirements"] = list(requirements)
     try:
-        frame, total = _frames(path, record)
+        rows, all_rows = _read_rows(path, record)
     except (OSError, ValueError) as error:
         raise StoreError(f"{path} cannot be read: {error}") from error
     try:
-        names = [entry.name for entry in (directory / "cases").iterdir() if (entry / "products.json").is_file()]
+        case_folders = [entry.name for entry in (directory / "cases").iterdir() if (entry / "products.json").is_file()]
     except OSError:
-        names = []
-    kept = sorted(int(name) for name in names if name.isascii() and name.isdigit())
-    kept.sort(key=lambda case: case != record.get("showcase"))
-    return StoredRun(directory, frame, total, record, tuple(kept))
+        case_folders = []
+    stored_cases = sorted(int(name) for name in case_folders if name.isascii() and name.isdigit())
+    stored_cases.sort(key=lambda case: case != record.get("showcase"))
+    return StoredRun(directory, rows, all_rows, record, tuple(stored_cases))
 
 
-def _frames(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Rows with all columns, and rows of all cases; the same unless there are very many."""
+def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Read the rows with all columns, and the rows of all cases; both are the same up to `MAX_FULL_CASES` cases."""
     import pyarrow.parquet as pq
 
     file = pq.ParquetFile(path)
-    stored = file.schema_arrow.names
-    renamed = stored_columns_now(stored, str(table(record.get("configuration")).get("scenario")))
-    if file.metadata.num_rows <= LARGEST_WHOLE:
-        frame = _sort_columns(pd.read_parquet(path).rename(columns=renamed))
+    stored_names = file.schema_arrow.names
+    new_names = find_renamed_columns(stored_names, str(table(record.get("configuration")).get("scenario")))
+    if file.metadata.num_rows <= MAX_FULL_CASES:
+        frame = _sort_columns(pd.read_parquet(path).rename(columns=new_names))
         return frame, frame
-    first = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas().rename(columns=renamed)
-    asked, names = record.get("requirements"), [renamed.get(name, name) for name in stored]
-    requirements = [one for one in asked if isinstance(one, Mapping)] if isinstance(asked, list) else []
-    wanted = {"case", "outcome", "answered", "terrain", "feasible_overlap", "error", "traceback"}
-    for one in requirements:
-        wanted.update(str(one.get("metric", "")).split(" + "), str(one.get("population", "")).split(" and "))
+    first = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas().rename(columns=new_names)
+    requirement_list, names = record.get("requirements"), [new_names.get(name, name) for name in stored_names]
+    requirements = [r for r in requirement_list if isinstance(r, Mapping)] if isinstance(requirement_list, list) else []
+    columns = {"case", "outcome", "answered", "terrain", "feasible_overlap", "error", "traceback"}
+    for r in requirements:
+        columns.update(str(r.get("metric", "")).split(" + "), str(r.get("population", "")).split(" and "))
     metric = primary_metric(first, requirements)
     if metric is not None:
-        wanted.update([metric, *axis_columns(metric, names), *driver_columns(first, metric, max_columns=3)])
-    whole = pd.read_parquet(path, columns=[name for name in stored if renamed.get(name, name) in wanted])
-    return _sort_columns(first), _sort_columns(whole.rename(columns=renamed))
+        columns.update([metric, *axis_columns(metric, names), *driver_columns(first, metric, max_columns=3)])
+    all_cases = pd.read_parquet(path, columns=[name for name in stored_names if new_names.get(name, name) in columns])
+    return _sort_columns(first), _sort_columns(all_cases.rename(columns=new_names))
 
 
 def _sort_columns(frame: pd.DataFrame) -> pd.DataFrame:
@@ -149,5 +148,5 @@ def _sort_columns(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def table(value: object) -> Mapping[str, Any]:
-    """The value if it is a table, else an empty table."""
+    """Return the value if it is a table, else an empty table."""
     return value if isinstance(value, Mapping) else {}

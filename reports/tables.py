@@ -35,7 +35,7 @@ _STYLES = {
 
 
 def verdict_table(verdicts: Sequence[Verdict]) -> Table:
-    """Requirements with verdicts and evidence, legible from 80 columns on."""
+    """Table of requirements with verdicts and evidence, for terminals of at least 80 columns."""
     table = Table(title="Verdict", box=box.SIMPLE_HEAD, expand=False, title_justify="left", caption_justify="left")
     table.add_column("Requirement", overflow="fold", ratio=None, min_width=18)
     table.add_column("Verdict", no_wrap=True)
@@ -53,10 +53,10 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
             NOTHING if verdict.further_cases is None else str(verdict.further_cases),
         )
     if not verdicts:
-        table.add_row(Text("none asked"), "", "", "", "", "")
+        table.add_row(Text("no requirement"), "", "", "", "", "")
     lines = []
     if any(not math.isnan(verdict.lower) for verdict in verdicts):
-        lines.append("Bounds: one-sided Clopper-Pearson at the stated confidence. Needed: more cases without failure.")
+        lines.append("Bounds: one-sided Clopper-Pearson at the required confidence. Needed: cases without failure.")
     if len(verdicts) > 1 and verdicts[0].note and len({verdict.note for verdict in verdicts}) == 1:
         lines.append(verdicts[0].note)
     else:
@@ -76,7 +76,7 @@ def outcome_counts(frame: pd.DataFrame) -> list[tuple[str, int]]:
 
 
 def answered_outcomes(frame: pd.DataFrame) -> set[str]:
-    """Outcomes of cases with an answer; VALID if rows do not hold `answered`."""
+    """Outcomes of cases with an answer; VALID if the rows have no column `answered`."""
     if "outcome" not in frame or not is_flag(frame, "answered"):
         return {"VALID"}
     return {str(name) for name in frame.loc[members(frame, "valid"), "outcome"].dropna().unique()}
@@ -111,7 +111,7 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
     ]
     for index, quantile in enumerate(summaries[0].quantiles):
         name = "median" if quantile.probability == 0.5 else f"{format_fraction(quantile.probability)} quantile"
-        of_each = [summary.quantiles[index] for summary in summaries]
-        rows.append([name, *(number(q.estimate) for q in of_each)])
-        rows.append([f"{name}, {confidence} bounds", *(interval(q.lower, q.upper) for q in of_each)])
+        quantiles = [summary.quantiles[index] for summary in summaries]
+        rows.append([name, *(number(q.estimate) for q in quantiles)])
+        rows.append([f"{name}, {confidence} bounds", *(interval(q.lower, q.upper) for q in quantiles)])
     return [*rows, ["largest magnitude", *(number(s.largest) for s in summaries)]]

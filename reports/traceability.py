@@ -20,12 +20,11 @@ from marsyard.reports.wording import count
 
 @dataclass(frozen=True)
 class Algorithm:
-    """An algorithm under test; text that the record lacks is empty.
+    """An algorithm of a campaign; text that is missing from the record is empty.
 
-    name: as in the campaign: a shipped name, `module:Class`, or a program
-    tested: whether it is under test, or only compared
-    path: its class as `module:name`, or its file
-    version: of its installed distribution, or its `version` attribute
+    name: as in the campaign: name of a built-in algorithm, `module:Class`, or a program tested: whether it is under
+    test; False if it is only compared path: its class as `module:name`, or its file version: of its installed
+    distribution, or its `version` attribute
     """
 
     name: str
@@ -42,15 +41,15 @@ class Algorithm:
 
     @property
     def options_text(self) -> str:
-        """The options as JSON; empty where there are none."""
+        """The options as JSON; empty for no options."""
         return json.dumps(self.options, ensure_ascii=False) if self.options else ""
 
 
 def tested_algorithms(record: Mapping[str, Any]) -> list[Algorithm]:
-    """Read the algorithms from a campaign's record, the algorithm under test first; old records give names alone."""
-    stored = record.get("algorithms")
-    entries = [table(one) for one in stored] if isinstance(stored, list) else []
-    items = [
+    """Read the algorithms from a campaign's record, the algorithm under test first; old records contain only names."""
+    stored_list = record.get("algorithms")
+    entries = [table(entry) for entry in stored_list] if isinstance(stored_list, list) else []
+    algorithms = [
         Algorithm(
             name=str(entry["spec"]),
             tested=entry.get("role") != "compared",
@@ -62,46 +61,46 @@ def tested_algorithms(record: Mapping[str, Any]) -> list[Algorithm]:
         for entry in entries
         if entry.get("spec")
     ]
-    if not items:
-        items = _named_algorithms(table(table(record.get("configuration")).get("parameters")))
-    return sorted(items, key=lambda one: not one.tested)
+    if not algorithms:
+        algorithms = _algorithms_from_parameters(table(table(record.get("configuration")).get("parameters")))
+    return sorted(algorithms, key=lambda algorithm: not algorithm.tested)
 
 
 def format_tested_algorithms(algorithms: Sequence[Algorithm]) -> str:
     """Names and versions of the algorithm under test."""
-    return ", ".join(one.title for one in algorithms if one.tested)
+    return ", ".join(algorithm.title for algorithm in algorithms if algorithm.tested)
 
 
-def _named_algorithms(parameters: Mapping[str, Any]) -> list[Algorithm]:
-    """The algorithms of the first table of parameters, at any depth, that has the key `algorithm`."""
-    chosen = parameters.get("algorithm")
-    if isinstance(chosen, str) and chosen:
+def _algorithms_from_parameters(parameters: Mapping[str, Any]) -> list[Algorithm]:
+    """Read the algorithms from the first table of parameters, at any depth, that has the key `algorithm`."""
+    tested = parameters.get("algorithm")
+    if isinstance(tested, str) and tested:
         compared = parameters.get("compared")
         names = compared if isinstance(compared, list) else []
-        return [Algorithm(chosen), *(Algorithm(str(name), tested=False) for name in names)]
-    inner = (_named_algorithms(value) for value in parameters.values() if isinstance(value, Mapping))
-    return next((found for found in inner if found), [])
+        return [Algorithm(tested), *(Algorithm(str(name), tested=False) for name in names)]
+    nested = (_algorithms_from_parameters(value) for value in parameters.values() if isinstance(value, Mapping))
+    return next((algorithms for algorithms in nested if algorithms), [])
 
 
-#: Verdicts that show a requirement neither met nor missed at its confidence.
+#: Verdicts of requirements that are neither met nor missed at their confidence.
 _SKIPPED = (Status.INSUFFICIENT, Status.MET_BY_RATE)
-#: What XML 1.0 cannot hold.
-_UNPRINTABLE = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+#: Characters that XML 1.0 does not allow.
+_INVALID_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def algorithm_cells(algorithms: Iterable[Algorithm]) -> dict[str, str]:
     """Columns of the matrix that identify the algorithm under test, joined by "; "."""
-    tested = [one for one in algorithms if one.tested]
+    tested = [algorithm for algorithm in algorithms if algorithm.tested]
     cells = {
-        "algorithm": [one.name for one in tested],
-        "algorithm_version": [one.version for one in tested],
-        "algorithm_options": [one.options_text for one in tested],
-        "algorithm_source": [one.source_hash for one in tested],
+        "algorithm": [algorithm.name for algorithm in tested],
+        "algorithm_version": [algorithm.version for algorithm in tested],
+        "algorithm_options": [algorithm.options_text for algorithm in tested],
+        "algorithm_source": [algorithm.source_hash for algorithm in tested],
     }
     return {column: "; ".join(value for value in values if value) for column, values in cells.items()}
 
 
-#: Columns of the matrix before and after those of the algorithm, and the properties of the verdict that they hold.
+#: Columns of the matrix in front of and after those of the algorithm, and the properties of the verdict in them.
 _REQUIREMENT = {"requirement": "requirement_id", "statement": "statement", "kind": "kind", "source": "source"}
 _EVIDENCE = {
     "verdict": "status", "metric": "metric", "bound": "bound", "population": "population", "probability": "probability",
@@ -118,11 +117,11 @@ def requirement_evidence(
     """Rows of the traceability matrix: the evidence of a campaign for each requirement."""
     cells = {"campaign": campaign, **algorithm_cells(algorithms)}
     rows = []
-    for one in verdicts:
-        evidence = {column: getattr(one, name) for column, name in _EVIDENCE.items()}
-        evidence["verdict"] = str(one.status)
-        evidence["metric"] = one.metric if one.scale == 1.0 else f"{one.scale:g} * ({one.metric})"
-        rows.append({column: getattr(one, name) for column, name in _REQUIREMENT.items()} | cells | evidence)
+    for verdict in verdicts:
+        evidence = {column: getattr(verdict, name) for column, name in _EVIDENCE.items()}
+        evidence["verdict"] = str(verdict.status)
+        evidence["metric"] = verdict.metric if verdict.scale == 1.0 else f"{verdict.scale:g} * ({verdict.metric})"
+        rows.append({column: getattr(verdict, name) for column, name in _REQUIREMENT.items()} | cells | evidence)
     return rows
 
 
@@ -139,23 +138,23 @@ def _cell(value: Any) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
     text = f"{value:.9g}" if isinstance(value, float) else str(value)
-    # the apostrophe keeps spreadsheets from reading a text as a formula
+    # the apostrophe prevents spreadsheets from reading a text as a formula
     return f"'{text}" if isinstance(value, str) and text[:1] in "=+-@\t\r" and text else text
 
 
 def junit_xml(
-    campaign: str, verdicts: Sequence[Verdict], whole: OverallVerdict, algorithms: Sequence[Algorithm] = ()
+    campaign: str, verdicts: Sequence[Verdict], overall: OverallVerdict, algorithms: Sequence[Algorithm] = ()
 ) -> str:
-    """JUnit's XML: a test for each requirement, and one for the completion of all cases.
+    """Format the verdicts as JUnit XML: a test for each requirement, and one for the completion of all cases.
 
-    FAIL is a failure; INSUFFICIENT and MET BY RATE are skipped. Properties of the suite name the algorithm under test.
+    FAIL is a failure; INSUFFICIENT and MET BY RATE are skipped. Properties of the suite: the tested algorithm.
     """
-    statuses = [one.status for one in verdicts]
+    statuses = [verdict.status for verdict in verdicts]
     suite = Xml.Element(
         "testsuite",
         name=_text(campaign),
         tests=str(len(verdicts) + 1),
-        failures=str(statuses.count(Status.FAIL) + bool(whole.crashed)),
+        failures=str(statuses.count(Status.FAIL) + bool(overall.crashed)),
         skipped=str(sum(status in _SKIPPED for status in statuses)),
     )
     cells = {name: value for name, value in algorithm_cells(algorithms).items() if value}
@@ -164,23 +163,24 @@ def junit_xml(
         for name, value in cells.items():
             Xml.SubElement(properties, "property", name=name, value=_text(value))
     tested = format_tested_algorithms(algorithms)
-    subject = f"Under test: {tested}. " if tested else ""
-    for one in verdicts:
-        case = Xml.SubElement(suite, "testcase", classname=_text(campaign), name=_text(one.requirement_id))
-        evidence = _text(
-            f"{one.failures} of {one.n} failed; at least {one.lower:.6g}, asked {one.probability:g}. {one.note}"
+    tested_text = f"Under test: {tested}. " if tested else ""
+    for verdict in verdicts:
+        test_case = Xml.SubElement(suite, "testcase", classname=_text(campaign), name=_text(verdict.requirement_id))
+        message = _text(
+            f"{verdict.failures} of {verdict.n} failed; at least {verdict.lower:.6g}, "
+            f"required {verdict.probability:g}. {verdict.note}"
         )
-        if one.status is Status.FAIL:
-            Xml.SubElement(case, "failure", message=evidence, type=str(one.status))
-        elif one.status in _SKIPPED:
-            Xml.SubElement(case, "skipped", message=f"{one.status}: {evidence}")
-        Xml.SubElement(case, "system-out").text = _text(f"{subject}{one.statement} {evidence}")
-    ended = Xml.SubElement(suite, "testcase", classname=_text(campaign), name="all cases end")
-    if whole.crashed:
-        Xml.SubElement(ended, "failure", message=f"{count(whole.crashed, 'case')} crashed", type="CRASHED")
+        if verdict.status is Status.FAIL:
+            Xml.SubElement(test_case, "failure", message=message, type=str(verdict.status))
+        elif verdict.status in _SKIPPED:
+            Xml.SubElement(test_case, "skipped", message=f"{verdict.status}: {message}")
+        Xml.SubElement(test_case, "system-out").text = _text(f"{tested_text}{verdict.statement} {message}")
+    completion = Xml.SubElement(suite, "testcase", classname=_text(campaign), name="all cases end")
+    if overall.crashed:
+        Xml.SubElement(completion, "failure", message=f"{count(overall.crashed, 'case')} crashed", type="CRASHED")
     Xml.indent(suite)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{Xml.tostring(suite, encoding="unicode")}\n'
 
 
 def _text(text: str) -> str:
-    return _UNPRINTABLE.sub("�", text)
+    return _INVALID_XML.sub("�", text)

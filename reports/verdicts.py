@@ -1,10 +1,10 @@
 """Verdicts on requirements: status, confidence and further evidence needed, from stored rows.
 
 A requirement asks that `|metric| <= bound`, or a true column, holds for a fraction of a population at a confidence. Its
-status follows from one-sided Clopper-Pearson bounds of the success rate. MET BY RATE: decided by the estimate, whose
-rate reaches the fraction, but not at the confidence. Cases on shared terrains get bounds that allow for correlation
-(`marsyard.reports.statistics.proportions`). Looks at appended cases keep their joint risk (`LaterLook` there); each
-planned look spends a fraction of the risk. Cases that are no independent random draws (Latin hypercube, Sobol, grids)
+status follows from one-sided Clopper-Pearson bounds of the success rate. MET BY RATE: decided by the estimate; the
+rate reaches the fraction, but not at the confidence. Bounds of cases on shared terrains allow for correlation
+(`marsyard.reports.statistics.proportions`). All looks at appended cases together keep the risk (`LaterLook`); each
+planned look spends a fraction of it. Cases that are not independent random samples (Latin hypercube, Sobol, grids)
 have neither bounds nor confidence: their rate decides only requirements that are decided by the estimate.
 """
 
@@ -32,12 +32,12 @@ from marsyard.reports.statistics.proportions import (
 )
 from marsyard.reports.wording import count, format_fraction, percent
 
-#: Value of a requirement's `decide_by` that has the rate seen compared with the probability.
+#: Value of a requirement's `decide_by`: compare the observed rate with the required probability.
 ESTIMATE = "estimate"
 
 
 class Status(StrEnum):
-    """What the evidence says of a requirement."""
+    """Result of evaluating a requirement."""
 
     PASS = "PASS"  # noqa: S105  (a verdict, not a password)
     MET_BY_RATE = "MET BY RATE"
@@ -47,16 +47,16 @@ class Status(StrEnum):
 
 @dataclass(frozen=True)
 class Verdict:
-    """One requirement with its verdict; NaN for a number that the requirement lacks.
+    """One requirement with its verdict; numbers that the requirement does not define are NaN.
 
     status: PASS if the lower bound reaches the probability, FAIL if the upper bound is below it, else INSUFFICIENT.
         Where the estimate decides and the bounds do not pass: FAIL if the rate is below the probability, else MET BY
         RATE, but INSUFFICIENT for fewer cases than `min_cases_for_rate`
-    failures: cases whose metric is missing, NaN or out of bound, unfinished cases, and those of unknown membership
-    estimate, lower, upper: success rate and its one-sided bounds; NaN for an empty population, bounds also for designs
-    further_cases: cases that pass the requirement if none fails, on new terrains where terrains are counted; or None
+    failures: cases whose metric is missing, NaN or out of bound, unfinished cases, and cases of unknown membership
+    estimate, lower, upper: success rate and its one-sided bounds; NaN for no cases, bounds also for other designs
+    further_cases: additional cases without failure that give PASS, on new terrains where terrains are counted; or None
     reason: why the requirement is not evaluated, or the verdict is withheld
-    advice: why more cases cannot help, and the change that does
+    advice: why more cases cannot help, and which change does
     accept_rate: whether MET BY RATE gives the exit status 0
     terrains: distinct terrains of the population; None if unknown
     clustered: evidence of shared terrains; None where no terrain is shared
@@ -106,7 +106,7 @@ class Verdict:
 
     @property
     def consumer_risk(self) -> float:
-        """Probability of evidence at least as good if the rate is just the one asked; NaN without bounds."""
+        """Probability of evidence at least as good if the true rate equals the required one; NaN without bounds."""
         if math.isnan(self.lower):
             return math.nan
         shared = self.clustered
@@ -121,7 +121,7 @@ class Verdict:
 
     @property
     def margin(self) -> float:
-        """Deciding bound, or estimate, less the rate asked; NaN without bounds."""
+        """Deciding bound or estimate, minus the required rate; NaN without bounds."""
         decisive = self.estimate if self.decide_by == ESTIMATE else self.lower
         return decisive - self.probability
 
@@ -130,41 +130,43 @@ class Verdict:
         """Limits of the verdict in words; may be empty."""
         if self.reason:
             return self.reason
-        return " ".join(part for part in (self._basis(), self._sharing(), self._look(), self.advice) if part)
+        texts = (self._decision_text(), self._terrain_text(), self._look_text(), self.advice)
+        return " ".join(text for text in texts if text)
 
-    def _basis(self) -> str:
+    def _decision_text(self) -> str:
         if self.decide_by != ESTIMATE or self.n == 0:
             return ""
-        at = f"at {format_fraction(self.confidence)} confidence"
+        confidence_text = f"at {format_fraction(self.confidence)} confidence"
         if self.status is Status.PASS:
-            return f"Decided by the rate; met {at} as well."
+            return f"Evaluated by observed rate; also met {confidence_text}."
         if self.status is Status.INSUFFICIENT:
-            return f"Decided by the rate, which takes {count(min_cases_for_rate(self.probability), 'case')} or more."
-        return f"Decided by the rate; {at} it would be {self.confident_status}."
+            min_cases = count(min_cases_for_rate(self.probability), "case")
+            return f"Evaluated by observed rate; this needs at least {min_cases}."
+        return f"Evaluated by observed rate; {confidence_text} the verdict would be {self.confident_status}."
 
-    def _sharing(self) -> str:
-        shared = self.clustered
-        if shared is None:
+    def _terrain_text(self) -> str:
+        evidence = self.clustered
+        if evidence is None:
             return ""
-        effect = f", design effect {shared.design_effect:.3g}"
-        if math.isnan(shared.design_effect):
-            worst = self.n / shared.effective_n
-            effect = f", the design effect taken for {worst:.3g}: too few failures, or terrains, to estimate it"
+        effect = f", design effect {evidence.design_effect:.3g}"
+        if math.isnan(evidence.design_effect):
+            assumed = self.n / evidence.effective_n
+            effect = f", the design effect assumed to be {assumed:.3g}: too few failures or terrains to estimate it"
         text = (
             f"{count(self.n, 'case')} share {count(self.terrains or 0, 'terrain')} and so are not independent; "
-            f"the bounds allow for that ({shared.method}, effective n {shared.effective_n:.4g}{effect})."
+            f"the bounds allow for that ({evidence.method}, effective n {evidence.effective_n:.4g}{effect})."
         )
         if self.plain_status is not None and self.plain_status is not self.status:
             text += f" Independent cases would show at least {percent(self.plain_lower)}: {self.plain_status}."
-        if shared.method is ClusterMethod.TERRAIN_COUNT and self.further_cases and self.decide_by != ESTIMATE:
+        if evidence.method is ClusterMethod.TERRAIN_COUNT and self.further_cases and self.decide_by != ESTIMATE:
             text += f" {count(self.further_cases, 'additional terrain')} without a failure would decide."
         return text
 
-    def _look(self) -> str:
+    def _look_text(self) -> str:
         if math.isnan(self.bounds_confidence) or self.bounds_confidence == self.upper_confidence == self.confidence:
             return ""
         lower, upper = (f"{100.0 * level:.4g} %" for level in (self.bounds_confidence, self.upper_confidence))
-        joint_note = f"so that all looks together keep {format_fraction(self.confidence)}"
+        joint_note = f"so that all evaluations together keep {format_fraction(self.confidence)}"
         if lower == upper:
             return f"The campaign is evaluated more than once: its bounds are at {lower} confidence, {joint_note}."
         return (
@@ -181,122 +183,124 @@ Groups = Int[np.ndarray, " n"]
 class Looks:
     """Earlier and planned looks at a campaign.
 
-    before: cases of an earlier first look; None at a first look
-    share: fraction of the risk that this look may spend; 1 where no looks were planned
+    in_first_look: mask of the cases of an earlier first look; None at a first look
+    risk_fraction: fraction of the risk that this look may spend; 1 where no looks were planned
     """
 
-    before: Success | None = None
-    share: float = 1.0
+    in_first_look: Success | None = None
+    risk_fraction: float = 1.0
 
 
 def add_bounds(verdict: Verdict, success: Success, groups: Groups | None, looks: Looks) -> tuple[Verdict, int]:
-    """Bounds of the success rate of at least one case, and the cases that pass the requirement if none fails.
+    """Add bounds of the success rate of at least one case; also return the additional cases without failure for PASS.
 
-    groups: terrains numbered from 0; None if unknown. Where terrains are counted, the further cases are whole terrains.
+    groups: terrains numbered from 0; None if unknown. Where terrains are counted, they replace the cases.
     """
     n, failures, probability, confidence = success.size, verdict.failures, verdict.probability, verdict.confidence
-    first = n if looks.before is None else int(looks.before.sum())
-    levels = _confidences(first, n, probability, confidence, looks)
+    first_n = n if looks.in_first_look is None else int(looks.in_first_look.sum())
+    levels = _confidences(first_n, n, probability, confidence, looks)
     lower = proportions.proportion_lower(n - failures, n, levels[0])
     upper = proportions.proportion_upper(n - failures, n, levels[1])
     verdict = replace(verdict, lower=lower, upper=upper, plain_lower=lower, plain_upper=upper)
     if groups is None or int(groups.max()) + 1 == n:
-        needed = _cases_needed(first, n, failures, probability, confidence, looks)
+        needed = _cases_needed(first_n, n, failures, probability, confidence, looks)
         return replace(verdict, bounds_confidence=levels[0], upper_confidence=levels[1]), needed - n
-    shared = clustered_evidence(success, groups, confidence)
-    before = np.ones(n, dtype=np.bool_) if looks.before is None else looks.before
-    if np.unique(groups[before]).size != first:  # independent cases that the first look was worth
-        first = math.floor(clustered_evidence(success[before], groups[before], confidence).effective_n)
-    levels = _confidences(first, shared.effective_n, probability, confidence, looks)
+    evidence = clustered_evidence(success, groups, confidence)
+    in_first_look = np.ones(n, dtype=np.bool_) if looks.in_first_look is None else looks.in_first_look
+    if np.unique(groups[in_first_look]).size != first_n:  # effective number of independent cases at the first look
+        first_n = math.floor(clustered_evidence(success[in_first_look], groups[in_first_look], confidence).effective_n)
+    levels = _confidences(first_n, evidence.effective_n, probability, confidence, looks)
     by_level = [clustered_evidence(success, groups, level) for level in levels]
-    shared = replace(by_level[0], upper=by_level[1].upper)
-    if shared.method is ClusterMethod.TERRAIN_COUNT:
-        # the tolerance keeps whole numbers whole
-        size, weight, failed = shared.terrains, 1.0, math.ceil(shared.terrains - shared.effective_successes - 1e-9)
+    evidence = replace(by_level[0], upper=by_level[1].upper)
+    if evidence.method is ClusterMethod.TERRAIN_COUNT:
+        # the tolerance keeps integers unchanged by rounding
+        size, weight = evidence.terrains, 1.0
+        failed = math.ceil(evidence.terrains - evidence.effective_successes - 1e-9)
     else:
-        weight = shared.effective_n / n
-        size, failed = math.floor(shared.effective_n), math.ceil(failures * weight)
-    needed = _cases_needed(first, size, failed, probability, confidence, looks)
-    verdict = replace(verdict, lower=shared.lower, upper=shared.upper, clustered=shared)
-    further = math.ceil((needed - size) / weight)
-    return replace(verdict, bounds_confidence=levels[0], upper_confidence=levels[1]), further
+        weight = evidence.effective_n / n
+        size, failed = math.floor(evidence.effective_n), math.ceil(failures * weight)
+    needed = _cases_needed(first_n, size, failed, probability, confidence, looks)
+    verdict = replace(verdict, lower=evidence.lower, upper=evidence.upper, clustered=evidence)
+    additional = math.ceil((needed - size) / weight)
+    return replace(verdict, bounds_confidence=levels[0], upper_confidence=levels[1]), additional
 
 
 def _confidences(
-    first: int, n: float | int, probability: float, confidence: float, looks: Looks
+    first_n: int, n: float | int, probability: float, confidence: float, looks: Looks
 ) -> tuple[float, float]:
     """Confidences of the lower and of the upper bound."""
-    if looks.before is None:
-        level = confidence_at(confidence, looks.share)
+    if looks.in_first_look is None:
+        level = confidence_at(confidence, looks.risk_fraction)
         return level, level
-    passing, failing = (LaterLook(p, 1.0 - confidence, first) for p in (1.0 - probability, probability))
+    passing, failing = (LaterLook(p, 1.0 - confidence, first_n) for p in (1.0 - probability, probability))
     return 1.0 - passing.risk_of_bound(n), 1.0 - failing.risk_of_bound(n)
 
 
-def _cases_needed(first: int, n: int, failures: int, probability: float, confidence: float, looks: Looks) -> int:
-    """Total of cases that pass the requirement without a further failure."""
-    if looks.share < 1.0:
-        return n + proportions.further_cases_needed(n, failures, probability, confidence_at(confidence, looks.share))
-    return LaterLook(1.0 - probability, 1.0 - confidence, first).cases_needed(n, failures)
+def _cases_needed(first_n: int, n: int, failures: int, probability: float, confidence: float, looks: Looks) -> int:
+    """Total number of cases that pass the requirement without an additional failure."""
+    if looks.risk_fraction < 1.0:
+        level = confidence_at(confidence, looks.risk_fraction)
+        return n + proportions.further_cases_needed(n, failures, probability, level)
+    return LaterLook(1.0 - probability, 1.0 - confidence, first_n).cases_needed(n, failures)
 
 
 def evaluate_requirements(
-    frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], how: SamplingDesign = INDEPENDENT
+    frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], sampling: SamplingDesign = INDEPENDENT
 ) -> list[Verdict]:
     """Evaluate every requirement on all rows of a campaign; missing columns or numbers give INSUFFICIENT, no exception.
 
-    how: the sampling design; without independent random draws, verdicts have no bounds
+    sampling: the sampling design; without independent random samples, verdicts have no bounds
     """
-    return [_evaluate(how.draw(frame), requirement, how) for requirement in requirements]
+    return [_evaluate(sampling.exclude_nominal_case(frame), requirement, sampling) for requirement in requirements]
 
 
-def _evaluate(frame: pd.DataFrame, requirement: Mapping[str, Any], how: SamplingDesign) -> Verdict:
+def _evaluate(frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: SamplingDesign) -> Verdict:
     verdict = _empty_verdict(requirement)
-    fault = _requirement_fault(frame, verdict)
+    fault = _describe_fault(frame, verdict)
     if fault:
         return replace(verdict, reason=fault)
     try:
-        chosen = frame[rates.members(frame, verdict.population)]
-        suspected = frame[rates.members_if_answered(frame, verdict.population)]
+        population = frame[rates.members(frame, verdict.population)]
+        population_and_unfinished = frame[rates.members_if_answered(frame, verdict.population)]
     except ValueError as error:
         text = str(error)
         return replace(verdict, reason=f"{text[:1].upper()}{text[1:]}.")
-    if chosen.empty:
+    if population.empty:
         needed = LaterLook(1.0 - verdict.probability, 1.0 - verdict.confidence, 0).cases_needed(0, 0)
         reason = f"No case belongs to the population '{verdict.population}'."
-        return replace(verdict, reason=reason, further_cases=needed if how.independent else None)
-    return _withhold(*(_decide(verdict, cases, how, frame) for cases in (chosen, suspected)))
+        return replace(verdict, reason=reason, further_cases=needed if sampling.independent else None)
+    return _withhold(*(_decide(verdict, cases, sampling, frame) for cases in (population, population_and_unfinished)))
 
 
-def _withhold(verdict: Verdict, suspected: Verdict) -> Verdict:
-    """Withhold a good verdict that unfinished cases, counted as failures, would change.
+def _withhold(verdict: Verdict, with_unfinished: Verdict) -> Verdict:
+    """Withhold a good verdict that changes if unfinished cases are counted as failures.
 
-    `valid` and `completed` leave unfinished cases out, so that a crash instead of a wrong answer could earn a PASS.
+    `valid` and `completed` exclude unfinished cases, so that a crash instead of a wrong answer could give a PASS.
     """
-    if verdict.status in (Status.FAIL, Status.INSUFFICIENT, suspected.status):
+    if verdict.status in (Status.FAIL, Status.INSUFFICIENT, with_unfinished.status):
         return verdict
-    lost = suspected.n - verdict.n
+    unfinished = with_unfinished.n - verdict.n
     reason = (
-        f"{count(lost, 'case')} did not come to an end and so {'belongs' if lost == 1 else 'belong'} to no population "
-        f"of answers; counted as failures they change the verdict {verdict.status}, which is withheld."
+        f"{count(unfinished, 'case')} did not finish and {'belongs' if unfinished == 1 else 'belong'} to no population "
+        f"of answers. Counted as failures they change the verdict {verdict.status}, which is withheld."
     )
     return replace(verdict, status=Status.INSUFFICIENT, reason=reason)
 
 
-def _decide(verdict: Verdict, chosen: pd.DataFrame, how: SamplingDesign, frame: pd.DataFrame) -> Verdict:
-    """The verdict by the members of its population, at least one, among all cases."""
-    _, unknown = rates.members_and_unknown(chosen, verdict.population.split(" and "))
-    success = np.asarray(rates.success_mask(chosen, verdict.metric, verdict.bound, verdict.scale) & ~unknown)
-    n, failures, groups = success.size, int((~success).sum()), rates.terrain_groups(chosen)
+def _decide(verdict: Verdict, population: pd.DataFrame, sampling: SamplingDesign, frame: pd.DataFrame) -> Verdict:
+    """Decide the verdict from `population`, the members of its population (at least one), and `frame`, all cases."""
+    _, unknown = rates.members_and_unknown(population, verdict.population.split(" and "))
+    success = np.asarray(rates.success_mask(population, verdict.metric, verdict.bound, verdict.scale) & ~unknown)
+    n, failures, groups = success.size, int((~success).sum()), rates.terrain_groups(population)
     rate, by_rate = (n - failures) / n, verdict.decide_by == ESTIMATE
-    terrains = None if groups is None else int(chosen["terrain"].nunique())
+    terrains = None if groups is None else int(population["terrain"].nunique())
     counted = replace(verdict, n=n, failures=failures, estimate=rate, terrains=terrains)
-    if not how.independent:
-        reason = f"Decided by the rate of these cases. {how.no_probability}" if by_rate else how.no_probability
+    if not sampling.independent:
+        reason = f"{'Decided by the rate of these cases. ' if by_rate else ''}{sampling.no_probability}"
         status = _status_by_rate(rate, n, verdict.probability) if by_rate else verdict.status
         return replace(counted, status=status, reason=reason)
-    looks = Looks(how.mask_first_look(frame, chosen), how.risk_share(len(frame)))
-    evaluated, further = add_bounds(counted, success, groups, looks)
+    looks = Looks(sampling.mask_first_look(frame, population), sampling.risk_share(len(frame)))
+    evaluated, additional = add_bounds(counted, success, groups, looks)
     status = evaluated.confident_status
     by_rate = by_rate and status is not Status.PASS
     if by_rate:
@@ -306,13 +310,13 @@ def _decide(verdict: Verdict, chosen: pd.DataFrame, how: SamplingDesign, frame: 
         return evaluated
     if by_rate:
         return replace(evaluated, further_cases=min_cases_for_rate(verdict.probability) - n)
-    # further cases, or the advice why these cannot help
-    shared, supply = evaluated.clustered, how.terrains
-    are_counted = shared is not None and shared.method is ClusterMethod.TERRAIN_COUNT
-    if not are_counted or supply is None or (terrains or 0) + further <= supply.terrains:
-        return replace(evaluated, further_cases=further)
-    fewest = proportions.minimum_sample_size(verdict.probability, verdict.confidence)
-    return replace(evaluated, advice=supply.advice(fewest, verdict.probability, verdict.confidence))
+    # additional cases, or the advice why these cannot help
+    evidence, terrain_supply = evaluated.clustered, sampling.terrains
+    counts_terrains = evidence is not None and evidence.method is ClusterMethod.TERRAIN_COUNT
+    if not counts_terrains or terrain_supply is None or (terrains or 0) + additional <= terrain_supply.terrains:
+        return replace(evaluated, further_cases=additional)
+    needed_terrains = proportions.minimum_sample_size(verdict.probability, verdict.confidence)
+    return replace(evaluated, advice=terrain_supply.advice(needed_terrains, verdict.probability, verdict.confidence))
 
 
 def _status_by_rate(rate: float, n: int, probability: float) -> Status:
@@ -328,14 +332,14 @@ def min_cases_for_rate(probability: float) -> int:
 
 
 def compare_bounds(lower: float, upper: float, probability: float) -> Status:
-    """Compare bounds of a success rate with the rate asked."""
+    """Compare bounds of a success rate with the required rate."""
     if lower >= probability:
         return Status.PASS
     return Status.FAIL if upper < probability else Status.INSUFFICIENT
 
 
-def _requirement_fault(frame: pd.DataFrame, verdict: Verdict) -> str:
-    """Why a requirement cannot be evaluated; empty if it can."""
+def _describe_fault(frame: pd.DataFrame, verdict: Verdict) -> str:
+    """Describe why a requirement cannot be evaluated; empty if it can."""
     for name in ("probability", "confidence"):
         value = getattr(verdict, name)
         if not 0.0 < value < 1.0:
@@ -344,15 +348,15 @@ def _requirement_fault(frame: pd.DataFrame, verdict: Verdict) -> str:
     if missing is not None:
         return f"The rows have no column '{missing}', which is the requirement's metric."
     if not math.isfinite(verdict.bound) and not rates.is_flag(frame, verdict.metric):
-        return "The requirement states no bound, and its metric is no column of true and false."
+        return "The requirement has no bound, and its metric is not a column of true and false."
     return ""
 
 
 def _empty_verdict(requirement: Mapping[str, Any]) -> Verdict:
-    """The requirement without evidence; a decision by rate is added to its statement."""
+    """Create the verdict without evidence; a decision by rate is added to the statement."""
     decide_by, statement = str(requirement.get("decide_by", "confidence")), str(requirement.get("statement", ""))
     if decide_by == ESTIMATE:
-        statement = f"{statement.rstrip('.')} (decided by rate).".lstrip()
+        statement = f"{statement.rstrip('.')} (evaluated by observed rate).".lstrip()
     return Verdict(
         requirement_id=str(requirement.get("id", "?")),
         statement=statement,

@@ -24,18 +24,20 @@ _ROUNDING = 1e-9
 _POPULATIONS = {"all": "all cases", "completed": "completed cases", "valid": "valid answers"}
 
 
-def requirement_text(asked: Any, metric: str) -> str:
-    """A requirement (of a campaign, or repeated by a verdict) in words, with the metric's name for readers."""
-    unbounded = asked.bound is None or math.isnan(asked.bound)
-    scaled = "" if asked.scale == 1.0 else f"{asked.scale:g} × "
-    what = metric if unbounded else f"{scaled}|{metric}| ≤ {asked.bound:g}"
-    confidence = f"{format_fraction(asked.confidence)} confidence"
-    how = f"decided by rate, bounds at {confidence}" if asked.decide_by == "estimate" else f"at {confidence}"
-    return f"{what} in at least {format_fraction(asked.probability)} of {population_text(asked.population)}, {how}"
+def requirement_text(requirement: Any, metric: str) -> str:
+    """Describe a requirement (of a campaign or of a verdict) in words; `metric` is the metric's name for readers."""
+    unbounded = requirement.bound is None or math.isnan(requirement.bound)
+    scaled = "" if requirement.scale == 1.0 else f"{requirement.scale:g} × "
+    condition = metric if unbounded else f"{scaled}|{metric}| ≤ {requirement.bound:g}"
+    confidence = f"{format_fraction(requirement.confidence)} confidence"
+    by_rate = requirement.decide_by == "estimate"
+    decision = f"evaluated by observed rate; bounds at {confidence}" if by_rate else f"at {confidence}"
+    population = population_text(requirement.population)
+    return f"{condition} in at least {format_fraction(requirement.probability)} of {population}, {decision}"
 
 
 def population_text(population: str) -> str:
-    """A population in words: ``valid answers``, ``cases with room``, ``valid answers with room``."""
+    """Describe a population: ``valid answers``, ``cases with feasible overlap``."""
     parts = population.split(" and ")
     base = next((_POPULATIONS[part] for part in parts if part in _POPULATIONS), "cases")
     flags = [part.removeprefix("with_").replace("_", " ") for part in parts if part not in _POPULATIONS]
@@ -43,7 +45,7 @@ def population_text(population: str) -> str:
 
 
 def number(value: float) -> str:
-    """A number with about three significant digits; a dash where there is none, 0 for what rounding errors left.
+    """Format a number with about three significant digits; a dash for NaN, 0 for rounding errors.
 
     >>> number(1.23456), number(123.456), number(0.0123456), number(9.09e-13)
     ('1.235', '123.5', '0.0123', '0.000')
@@ -53,13 +55,13 @@ def number(value: float) -> str:
     magnitude = abs(value) if abs(value) >= _ROUNDING else 0.0
     if magnitude != 0.0 and (magnitude >= 1e5 or magnitude < 1e-3):
         return f"{value:.2e}".replace("-", "−")
-    places = ((0.0, 3), (0.01, 5), (0.1, 4), (10.0, 3), (100.0, 2), (math.inf, 1))
-    digits = next(digits for below, digits in places if magnitude <= below)
+    digits_by_limit = ((0.0, 3), (0.01, 5), (0.1, 4), (10.0, 3), (100.0, 2), (math.inf, 1))
+    digits = next(digits for limit, digits in digits_by_limit if magnitude <= limit)
     return f"{value if magnitude else 0.0:.{digits}f}".replace("-", "−")
 
 
 def coefficient(value: float) -> str:
-    """A correlation, to three decimals; a dash where there is none.
+    """Format a correlation with three decimals; a dash for NaN.
 
     >>> coefficient(-0.25), coefficient(1e-5)
     ('−0.250', '0.000')
@@ -68,14 +70,14 @@ def coefficient(value: float) -> str:
 
 
 def p_text(value: float) -> str:
-    """A probability of a test; a dash for NaN."""
+    """Format the p-value of a test; a dash for NaN."""
     if math.isnan(value):
         return NOTHING
     return "< 0.001" if value < 0.001 else f"{value:.3f}"
 
 
 def interval(lower: float, upper: float) -> str:
-    """Two bounds; one alone, or a dash, where the sample is too small to give both."""
+    """Format two bounds; only the finite one, or a dash, if the sample is too small for both."""
     if math.isfinite(lower) and math.isfinite(upper):
         return f"{number(lower)} to {number(upper)}"
     if math.isfinite(lower):
@@ -84,9 +86,9 @@ def interval(lower: float, upper: float) -> str:
 
 
 def percent(fraction: float) -> str:
-    """A measured fraction in per cent, never rounded up to 100 nor down to 0; a dash for NaN.
+    """Format a measured fraction in per cent, never rounded up to 100 or down to 0; a dash for NaN.
 
-    Some shares exceed 1: wheels slip by more where they slide back.
+    Fractions can exceed 1: the slip of a wheel that slides back does.
     """
     if math.isnan(fraction):
         return NOTHING
@@ -102,17 +104,17 @@ def percent(fraction: float) -> str:
 
 
 def format_fraction(fraction: float) -> str:
-    """A given fraction in per cent, with all its digits."""
+    """Format a specified fraction in per cent, with all its digits."""
     return NOTHING if math.isnan(fraction) else f"{100.0 * fraction:.10g} %"
 
 
 def count(quantity: int, noun: str) -> str:
-    """A quantity with its noun: ``1 case``, ``24 cases``."""
+    """Format a quantity with its noun: ``1 case``, ``24 cases``."""
     return f"{quantity:,} {noun}{'' if quantity == 1 else 's'}"
 
 
 def plain_value(value: object) -> str:
-    """A stored value as text, whole numbers without a decimal point."""
+    """Format a stored value, integers without a decimal point."""
     return str(int(value)) if isinstance(value, float | np.floating) and value.is_integer() else str(value)
 
 
@@ -123,7 +125,7 @@ def _notes() -> Mapping[str, Mapping[str, str]]:
 
 
 def note_text(key: str, **values: object) -> str:
-    """A text of `templates/notes.toml` by ``table.key``, with its values."""
+    """Return a text of `templates/notes.toml` by ``table.key``, with its values filled in."""
     table, name = key.split(".")
     return _notes()[table][name].format(**values)
 
@@ -135,18 +137,18 @@ _UNITS = {
     "_k": "K",
 }  # fmt: skip
 _AXES = ("x", "y", "z")
-#: Columns that describe the run rather than the case.
-_BOOKKEEPING = re.compile(
+#: Columns that describe the run or results, not the conditions of the case.
+_NOT_A_CONDITION = re.compile(
     r"time|hash|^case$|^outcome$|^answered$|^error$|^traceback$|^gl_|^processor|version|host|^place_|estimated|_true_"
     r"|^firing_|^touchdown_|^room|^fault_size$|^update_\d|^(range|cross|worst)_error|^drift|^false_|^lost_"
     r"|\.|^algorithm$|^stderr$|^velocity_(?:nees|normalised|sd|correlation)"
 )
 #: Prefixes of the conditions that come first.
-_FIRST_DRIVERS = (
+_PREFERRED_DRIVERS = (
     "off_nadir_max", "attitude_rate_max", "altitude_1", "wind_speed", "horizontal_speed", "sun_elevation", "slip_mean",
     "pose_error_fraction", "rock_diameter", "disparity_error_goal",
 )  # fmt: skip
-_LARGEST_CATEGORY = 6
+_MAX_CATEGORIES = 6
 
 
 def split_unit(column: str) -> tuple[str, str]:
@@ -181,10 +183,10 @@ def axis_columns(metric: str, columns: Sequence[str]) -> list[str]:
 
 
 def primary_metric(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]]) -> str | None:
-    """The page's metric: that of the first requirement, else the first error column; None without one."""
-    asked = [str(requirement.get("metric", "")) for requirement in requirements]
-    errors = [str(column) for column in frame.columns if "error_" in str(column) and split_unit(str(column))[1]]
-    return next((name for name in [*asked, *errors] if name in frame and _is_number(frame, name)), None)
+    """Return the page's metric: that of the first requirement, else the first error column; None without one."""
+    required = [str(requirement.get("metric", "")) for requirement in requirements]
+    error_columns = [str(column) for column in frame.columns if "error_" in str(column) and split_unit(str(column))[1]]
+    return next((name for name in [*required, *error_columns] if name in frame and _is_number(frame, name)), None)
 
 
 def numbers(frame: pd.DataFrame, column: str) -> Float[np.ndarray, " n"]:
@@ -196,44 +198,42 @@ def numbers(frame: pd.DataFrame, column: str) -> Float[np.ndarray, " n"]:
 
 
 def driver_columns(frame: pd.DataFrame, metric: str, max_columns: int = 6) -> list[str]:
-    """Conditions that may drive a metric: fixed ones first, then by rank correlation."""
+    """Select conditions that may affect a metric: `_PREFERRED_DRIVERS` first, then by rank correlation."""
     names = [str(name) for name in frame.columns]
     excluded = {metric, *axis_columns(metric, names), "terrain"}
     candidates = [
         name
         for name in names
         if name not in excluded
-        and not _BOOKKEEPING.search(name)
+        and not _NOT_A_CONDITION.search(name)
         and _is_number(frame, name)
         and frame[name].nunique() > 1
     ]
-    first = [name for start in _FIRST_DRIVERS for name in candidates if name.startswith(start)]
+    preferred = [name for prefix in _PREFERRED_DRIVERS for name in candidates if name.startswith(prefix)]
     magnitude = np.abs(numbers(frame, metric))
-    rest = sorted(
-        (name for name in candidates if name not in first),
+    others = sorted(
+        (name for name in candidates if name not in preferred),
         key=lambda name: -abs(np.nan_to_num(rank_correlation(numbers(frame, name), magnitude))),
     )
-    return [*first, *rest][:max_columns]
+    return [*preferred, *others][:max_columns]
 
 
 def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> float:
-    """Spearman's rank correlation of the known pairs; NaN for fewer than four or for a constant."""
-    both = np.isfinite(x) & np.isfinite(y)
-    if both.sum() < 4:
+    """Spearman's rank correlation of the finite pairs; NaN for fewer than four pairs or for a constant."""
+    finite = np.isfinite(x) & np.isfinite(y)
+    if finite.sum() < 4:
         return float("nan")
-    ranks_x, ranks_y = (pd.Series(values[both]).rank().to_numpy() for values in (x, y))
-    if np.ptp(ranks_x) == 0 or np.ptp(ranks_y) == 0:
-        return float("nan")
-    return float(np.corrcoef(ranks_x, ranks_y)[0, 1])
+    ranks_x, ranks_y = (pd.Series(values[finite]).rank().to_numpy() for values in (x, y))
+    return float("nan") if np.ptp(ranks_x) == 0 or np.ptp(ranks_y) == 0 else float(np.corrcoef(ranks_x, ranks_y)[0, 1])
 
 
 def category_column(frame: pd.DataFrame) -> str | None:
-    """The column with a few kinds of cases (text, else terrains); None without one."""
-    kinds = {str(name): kind for name, kind in frame.dtypes.items() if not _BOOKKEEPING.search(str(name))}
+    """Return the column with few distinct values (text, else terrains); None without one."""
+    types = {str(name): dtype for name, dtype in frame.dtypes.items() if not _NOT_A_CONDITION.search(str(name))}
     is_text = (pd.api.types.is_string_dtype, pd.api.types.is_object_dtype)
-    names = [name for name, kind in kinds.items() if any(check(kind) for check in is_text)]
+    names = [name for name, dtype in types.items() if any(check(dtype) for check in is_text)]
     names += ["terrain"] if "terrain" in frame else []
-    return next((name for name in names if 2 <= frame[name].nunique() <= _LARGEST_CATEGORY), None)
+    return next((name for name in names if 2 <= frame[name].nunique() <= _MAX_CATEGORIES), None)
 
 
 def _words(name: str) -> str:
@@ -241,5 +241,5 @@ def _words(name: str) -> str:
 
 
 def _is_number(frame: pd.DataFrame, column: str) -> bool:
-    kind = frame[column].dtype
-    return pd.api.types.is_numeric_dtype(kind) and not pd.api.types.is_bool_dtype(kind)
+    dtype = frame[column].dtype
+    return pd.api.types.is_numeric_dtype(dtype) and not pd.api.types.is_bool_dtype(dtype)

@@ -1,7 +1,7 @@
-"""Run the algorithms of a case separately: a failure of one does not affect the others, nor do changes of its inputs.
+"""Run the algorithms of a case separately: one algorithm's failure or changed inputs do not affect the others.
 
-The first algorithm of a campaign is under test: its columns have no prefix. Those of the compared ones have their label
-as a prefix (`homography.velocity_error_m_s`), with their own `outcome`, `answered` and `error`.
+The first algorithm of a campaign is under test: its columns have no prefix. The columns of the compared algorithms have
+their label as a prefix (`homography.velocity_error_m_s`), with separate `outcome`, `answered` and `error`.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from marsyard.scenarios.estimators import Task, check_algorithms, labels
 from marsyard.scenarios.interface import CaseResult, Failure, Scalar, record_conditions
 
 Answer = TypeVar("Answer")
-Given = TypeVar("Given")
+Inputs = TypeVar("Inputs")
 
-#: Columns of the algorithm under test, and of a program's standard error.
+#: Columns of the algorithm under test, and of an external program's standard error.
 ALGORITHM, STDERR = "algorithm", "stderr"
 
 
@@ -50,38 +50,38 @@ class AlgorithmRun(Generic[Answer]):
         return self.failure.outcome if self.failure is not None else Fault.CRASHED.name
 
 
-class Handover(Generic[Given]):
-    """One algorithm's read-only copy `given` of its inputs: data classes, arrays and poses."""
+class InputCopy(Generic[Inputs]):
+    """Read-only copy `inputs` of the inputs of one algorithm: data classes, arrays and poses."""
 
-    def __init__(self, original: Given) -> None:
-        self.given = copy_inputs(original)
-        self._fingerprint = hash_inputs(self.given)
+    def __init__(self, original: Inputs) -> None:
+        self.inputs = copy_inputs(original)
+        self._fingerprint = hash_inputs(self.inputs)
 
     def check(self) -> None:
-        """Raise AlgorithmError (BAD_ANSWER) if the algorithm changed its copy, pictures included."""
-        if hash_inputs(self.given) != self._fingerprint:
+        """Raise AlgorithmError (BAD_ANSWER) if the algorithm changed its copy, images included."""
+        if hash_inputs(self.inputs) != self._fingerprint:
             raise AlgorithmError(
-                Fault.BAD_ANSWER, "it changed the measurements that it was given; allowed: to read them, or copies"
+                Fault.BAD_ANSWER, "it changed its measurements; allowed: reading them, and changing copies"
             )
 
 
-def copy_inputs(original: Given, *, writable: bool = False) -> Given:
+def copy_inputs(original: Inputs, *, writable: bool = False) -> Inputs:
     """Return a deep copy whose arrays are read-only, or writable to detect changes.
 
-    Rotations and transforms are immutable and not copied: a copy would be normalised again, with other last digits.
+    Rotations and transforms are immutable and not copied: a copy would be normalised again, with different last digits.
     """
-    poses = {id(part): part for part in _parts(original) if isinstance(part, Rotation | RigidTransform)}
-    copied = copy.deepcopy(original, dict(poses))
+    immutable = {id(part): part for part in _parts(original) if isinstance(part, Rotation | RigidTransform)}
+    copied = copy.deepcopy(original, dict(immutable))
     for part in _parts(copied):
         if isinstance(part, np.ndarray):
             part.flags.writeable = writable
     return copied
 
 
-def hash_inputs(value: Any, leave: tuple[str, ...] = ()) -> str:
-    """Compute the SHA-256 of all values in arrays, poses and data classes, without the fields in `leave`."""
+def hash_inputs(value: Any, excluded: tuple[str, ...] = ()) -> str:
+    """Compute the SHA-256 of all values in arrays, poses and data classes, without the fields in `excluded`."""
     digest = hashlib.sha256()
-    for part in _parts(value, leave):
+    for part in _parts(value, excluded):
         if isinstance(part, np.ndarray):
             digest.update(f"{part.dtype}{part.shape}".encode())
             digest.update(np.ascontiguousarray(part).data)
@@ -94,30 +94,30 @@ def hash_inputs(value: Any, leave: tuple[str, ...] = ()) -> str:
     return digest.hexdigest()
 
 
-def _parts(value: Any, leave: tuple[str, ...] = ()) -> Iterator[Any]:
+def _parts(value: Any, excluded: tuple[str, ...] = ()) -> Iterator[Any]:
     """Yield the arrays, poses and other values in data classes, lists and tuples, and the names of the types."""
     if is_dataclass(value) and not isinstance(value, type):
         yield type(value).__name__
         for field in fields(value):
-            if field.name not in leave:
-                yield from _parts(getattr(value, field.name), leave)
+            if field.name not in excluded:
+                yield from _parts(getattr(value, field.name), excluded)
     elif isinstance(value, list | tuple):
         yield len(value)
         for inner in value:
-            yield from _parts(inner, leave)
+            yield from _parts(inner, excluded)
     else:
         yield value
 
 
-def run_algorithm(ask: Callable[[], object], check: Callable[[object], Answer]) -> AlgorithmRun[Answer]:
+def run_algorithm(call: Callable[[], object], check: Callable[[object], Answer]) -> AlgorithmRun[Answer]:
     """Run an algorithm and validate its answer; all exceptions become failures of the algorithm."""
-    started = time.process_time()
+    start_s = time.process_time()
     try:
-        raw = ask()
-        elapsed_s = time.process_time() - started
+        raw = call()
+        elapsed_s = time.process_time() - start_s
         answer = check(raw)
     except Exception as error:
-        row: dict[str, Scalar] = {"estimation_time_s": time.process_time() - started}
+        row: dict[str, Scalar] = {"estimation_time_s": time.process_time() - start_s}
         if isinstance(error, AlgorithmError):
             row |= {STDERR: error.stderr} if error.stderr else {}
             return AlgorithmRun(None, Failure(error.fault.name, str(error), ""), row)
@@ -131,36 +131,36 @@ def run_algorithm(ask: Callable[[], object], check: Callable[[object], Answer]) 
 
 
 def run_algorithm_on_copy(
-    ask: Callable[[Given], object], check: Callable[[object], Answer], measurements: Given
+    call: Callable[[Inputs], object], check: Callable[[object], Answer], measurements: Inputs
 ) -> AlgorithmRun[Answer]:
-    """Run an algorithm on its own copy of the measurements, which it may not change; see `run_algorithm`."""
-    handover = Handover(measurements)
+    """Run an algorithm on a separate copy of the measurements, which it must not change; see `run_algorithm`."""
+    input_copy = InputCopy(measurements)
 
     def check_both(answer: object) -> Answer:
-        handover.check()
+        input_copy.check()
         return check(answer)
 
-    return run_algorithm(lambda: ask(handover.given), check_both)
+    return run_algorithm(lambda: call(input_copy.inputs), check_both)
 
 
-def answer_time_s(answer: object, taken_s: float) -> float:
-    """Return the computation time: the measured processor time; of a program, the wall-clock time that it reports."""
+def answer_time_s(answer: object, processor_s: float) -> float:
+    """Return the computation time: the processor time, or the wall-clock time that an external program reports."""
     details = getattr(answer, "details", None)
-    return details.time_s if isinstance(details, ProgramDetails) else taken_s
+    return details.time_s if isinstance(details, ProgramDetails) else processor_s
 
 
 def case_result(
     algorithms: Sequence[str], evaluate: Callable[[str], CaseResult], conditions: Mapping[str, Scalar]
 ) -> CaseResult:
-    """Record the conditions, score each algorithm by `evaluate` (the first is under test), and combine the results."""
+    """Record the conditions, score each algorithm (the first is under test) with `evaluate`, and combine the rows."""
     record_conditions(conditions)
     names = labels(algorithms)
-    first, *others = [evaluate(spec) for spec in algorithms]
+    first, *compared = [evaluate(spec) for spec in algorithms]
     row: dict[str, Scalar] = {ALGORITHM: names[0], **first.row, **conditions}
-    for name, other in zip(names[1:], others, strict=True):
-        own: dict[str, Scalar] = {"outcome": other.outcome, "answered": other.answered, **other.row}
-        own["error"] = "" if other.failure is None else other.failure.error
-        row |= {f"{name}.{column}": value for column, value in own.items()}
+    for name, result in zip(names[1:], compared, strict=True):
+        columns: dict[str, Scalar] = {"outcome": result.outcome, "answered": result.answered, **result.row}
+        columns["error"] = "" if result.failure is None else result.failure.error
+        row |= {f"{name}.{column}": value for column, value in columns.items()}
     return replace(first, row=row)
 
 
@@ -175,7 +175,7 @@ class AlgorithmSelection(BaseModel):
     compared: Annotated[
         tuple[str, ...], Field(description="further algorithms, run on the same cases and compared with the first")
     ] = ()
-    executable: Annotated[ExecutableLimits, Field(description="what an algorithm that is a program may use")] = (
+    executable: Annotated[ExecutableLimits, Field(description="limits of an algorithm that is an external program")] = (
         ExecutableLimits()
     )
 
@@ -199,5 +199,5 @@ class AlgorithmSelection(BaseModel):
     @model_validator(mode="after")
     def _check_distinct(self) -> AlgorithmSelection:
         if self.algorithm in self.compared:
-            raise ValueError(f"the algorithm '{self.algorithm}' is named twice")
+            raise ValueError(f"the algorithm '{self.algorithm}' is listed twice")
         return self

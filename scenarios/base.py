@@ -11,13 +11,13 @@ from pydantic import BaseModel
 
 from marsyard.scenarios.algorithm_run import AlgorithmRun
 from marsyard.scenarios.interface import CaseResult, Scalar
-from marsyard.scenarios.parts.named import SCORE, Kind
+from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.terrain import Site, TerrainBank, TerrainParameters
 
 ParametersType = TypeVar("ParametersType", bound=BaseModel)
 
-#: Loads terrain `number` of the bank of a site: site, terrain, seed of the bank, number.
+#: Loads a terrain: site, terrain parameters, seed of the bank, number of the terrain in the bank.
 LoadGround = Callable[[Site, TerrainParameters, int, int], SiteGround]
 
 
@@ -28,28 +28,28 @@ class BaseScenario(Generic[ParametersType]):
     parameters_type: type[ParametersType]
 
     def check_parameters(self, parameters: BaseModel) -> ParametersType:
-        """Return the parameters with their type. Raises TypeError for those of another scenario."""
+        """Return the parameters with their type. Raises TypeError for parameters of another scenario."""
         if not isinstance(parameters, self.parameters_type):
-            expected, given = self.parameters_type.__name__, type(parameters).__name__
-            raise TypeError(f"the scenario {self.name} takes {expected}, not {given}")
+            expected, actual = self.parameters_type.__name__, type(parameters).__name__
+            raise TypeError(f"the scenario {self.name} needs {expected}, not {actual}")
         return parameters
 
 
 class TerrainScenario(BaseScenario[ParametersType], ABC):
-    """A scenario whose shared inputs are terrains; keeps the most recently used grounds in memory.
+    """A scenario whose shared inputs are terrains; keeps the most recently used terrains in memory.
 
-    By default algorithms and scores are selected at the top level of the parameters.
+    By default, algorithms and scores are selected at the top level of the parameters.
     """
 
     algorithm_table: tuple[str, ...] = ()
-    part_keys: Mapping[str, Kind] = {"scores": SCORE}
+    part_keys: Mapping[str, PartKind] = {"scores": SCORE}
 
     def __init__(self, cached_grounds: int = 0) -> None:
         self.load_ground: LoadGround = lru_cache(maxsize=cached_grounds)(SiteGround.from_bank)
 
     @abstractmethod
     def input_terrain(self, p: ParametersType, shared_input: int) -> tuple[TerrainBank, int]:
-        """Return the bank of a shared input, and the number of its terrain there."""
+        """Return the bank of a shared input, and the number of the terrain in the bank."""
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Build one terrain into the cache on disk."""
@@ -57,14 +57,14 @@ class TerrainScenario(BaseScenario[ParametersType], ABC):
         bank.terrain(number)
 
     def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
-        """Return the bytes of a terrain that is not on disk."""
+        """Return the bytes of a terrain that is not yet on disk; 0 otherwise."""
         bank, number = self.input_terrain(self.check_parameters(parameters), shared_input)
         return bank.missing_bytes(number)
 
 
 def algorithm_result(
-    attempt: AlgorithmRun[Any], answered: bool, row: Mapping[str, Scalar], products: Mapping[str, Any]
+    run: AlgorithmRun[Any], answered: bool, row: Mapping[str, Scalar], products: Mapping[str, Any]
 ) -> CaseResult:
     """Combine an algorithm's answer or failure with its columns and products."""
-    outcome = attempt.outcome(lambda answer: str(answer.outcome.name))
-    return CaseResult(outcome, answered, row, products, attempt.failure)
+    outcome = run.outcome(lambda answer: str(answer.outcome.name))
+    return CaseResult(outcome, answered, row, products, run.failure)

@@ -1,4 +1,4 @@
-"""Columns of a case: conditions, provenance of the pictures, and the faults that a case may have."""
+"""Columns of a case: conditions, provenance of the images, and injected faults."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def attitude_rate_deg_s(state: State) -> float:
 
 
 def hash_images(pictures: Iterable[UInt16[np.ndarray, "rows columns"]]) -> str:
-    """Compute the SHA-256 of the counts of pictures."""
+    """Compute the SHA-256 of the counts of images."""
     return hashlib.sha256(b"".join(counts.tobytes() for counts in pictures)).hexdigest()
 
 
-def picture_columns(backend: Backend, image_hash: str) -> dict[str, Scalar]:
-    """Return the columns of pictures with this hash that a backend rendered."""
+def image_columns(backend: Backend, image_hash: str) -> dict[str, Scalar]:
+    """Return the provenance columns of images rendered by a backend."""
     return {
         "image_hash": image_hash,
         "gl_backend": backend,
@@ -56,18 +56,18 @@ Pictures = Sequence[UInt16[np.ndarray, "rows columns"]]
 
 
 class SizedFaults(Parameters):
-    """Sizes of the faults by name; a size of 0 is no fault."""
+    """Sizes of the faults by name; size 0 means no fault."""
 
     dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on the lens")] = 0
     bad_pixels: Annotated[
-        NonNegative, Field(le=0.5, description="share of pixels that are dead, and of those that are hot")
+        NonNegative, Field(le=0.5, description="fraction of dead pixels, and fraction of hot pixels")
     ] = 0.0
 
     @property
     def columns(self) -> dict[str, Scalar]:
-        """The fault and its size; "none" and 0 without a fault, "several" and NaN with more than one."""
-        present = [(name, float(size)) for name, size in self.model_dump().items() if size] or [("none", 0.0)]
-        name, size = present[0] if len(present) == 1 else ("several", float("nan"))
+        """The fault and its size; "none" and 0 without a fault, "several" and NaN with more than one fault."""
+        faults = [(name, float(size)) for name, size in self.model_dump().items() if size] or [("none", 0.0)]
+        name, size = faults[0] if len(faults) == 1 else ("several", float("nan"))
         return {"fault": name, "fault_size": size}
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
@@ -78,29 +78,29 @@ class SizedFaults(Parameters):
         }
 
 
-def faulty_detector(faults: SizedFaults, detector: DetectorParameters) -> DetectorParameters:
-    """Apply the faults to a detector."""
+def add_detector_faults(faults: SizedFaults, detector: DetectorParameters) -> DetectorParameters:
+    """Return a detector with the faults."""
     changes = {
-        table: getattr(detector, table).model_copy(update=dict(changed))
-        for table, changed in faults.detector_changes().items()
-        if changed
+        table: getattr(detector, table).model_copy(update=dict(values))
+        for table, values in faults.detector_changes().items()
+        if values
     }
     return detector.model_copy(update=changes)
 
 
-def deliver(pictures: Pictures, repeated: int, black: int, lost_rows: float = 0.0) -> list[np.ndarray]:
-    """Apply transmission faults to the pictures.
+def corrupt_images(pictures: Pictures, repeated: int, black: int, lost_rows: float = 0.0) -> list[np.ndarray]:
+    """Return images with transmission faults.
 
-    - repeated: number, from 1, of the picture that is replaced by the one before it; 0: none
-    - black: number of the picture that is delivered black; 0: none
-    - lost_rows: fraction of the second picture's rows that is lost, from below
+    - repeated: number, from 1, of the image that is replaced by the previous image; 0: none
+    - black: number, from 1, of the image that is replaced by a black image; 0: none
+    - lost_rows: fraction of the second image's rows that is lost, counted from the bottom
     """
-    delivered = [one.copy() for one in pictures]
+    images = [image.copy() for image in pictures]
     if repeated > 1:
-        delivered[repeated - 1] = delivered[repeated - 2].copy()
+        images[repeated - 1] = images[repeated - 2].copy()
     if black:
-        delivered[black - 1][:] = 0
-    lost = round(lost_rows * len(delivered[1])) if lost_rows else 0
-    if lost:
-        delivered[1][-lost:] = 0
-    return delivered
+        images[black - 1][:] = 0
+    lost_count = round(lost_rows * len(images[1])) if lost_rows else 0
+    if lost_count:
+        images[1][-lost_count:] = 0
+    return images

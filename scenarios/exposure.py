@@ -1,4 +1,4 @@
-"""Camera optics, calibrated cameras with errors, pictures of a body camera, and samples with the truth of pixels."""
+"""Camera optics, calibrated cameras with errors, images of a body camera, and samples with the truth of pixels."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ def camera_optics(camera: CameraModel) -> Optics:
 
 
 class CalibrationParameters(Parameters):
-    """Errors of the calibrated camera that an algorithm is given.
+    """Errors of the calibrated camera that an algorithm receives.
 
-    Assumed: those of the descent camera's calibration, in pixels and as a fraction of the focal length.
+    Assumed: the errors of the descent camera's calibration, in pixels and as a fraction of the focal length.
     """
 
     focal_error: Annotated[float, bounded_field(0.0, 0.05, "RMS relative error of the calibrated focal length")] = (
@@ -50,27 +50,27 @@ class CalibrationParameters(Parameters):
         float, bounded_field(0.0, 50.0, "RMS error of the calibrated image centre per axis, px")
     ] = 0.5
     distortion_error_px: Annotated[
-        float, bounded_field(0.0, 50.0, "RMS error of the calibrated distortion in the picture's corners, px")
+        float, bounded_field(0.0, 50.0, "RMS error of the calibrated distortion in the image corners, px")
     ] = 0.3
 
 
 def add_calibration_error(
     camera: CameraModel, focal_error: float, centre_error_px: tuple[float, float], distortion_error_px: float
 ) -> CameraModel:
-    """Return a camera with errors of its calibration.
+    """Return a camera with calibration errors.
 
     - focal_error: relative error of the focal length
     - centre_error_px: error of the image centre, (columns, rows)
     - distortion_error_px: outward displacement of the corners
     """
-    shifted = camera.magnify(1.0 + focal_error).recentre(*centre_error_px)
-    if isinstance(shifted, Cahv):
-        shifted = Cahvor.from_cahv(shifted, r=np.zeros(3))
-    # R1 moves a point outwards by the cube of its angle
-    corner = float(np.hypot(0.5 * (shifted.size[0] - 1), 0.5 * (shifted.size[1] - 1)))
-    radial = cast(Cahvor | Cahvore, shifted)
-    chi = corner / (shifted.focal_lengths[0] * (1.0 + float(radial.r[0])))
-    return replace(radial, r=radial.r + np.array([0.0, distortion_error_px / shifted.focal_lengths[0] / chi**3, 0.0]))
+    recentred = camera.magnify(1.0 + focal_error).recentre(*centre_error_px)
+    if isinstance(recentred, Cahv):
+        recentred = Cahvor.from_cahv(recentred, r=np.zeros(3))
+    # R1 displaces a point outwards in proportion to the cube of its angle
+    corner = float(np.hypot(0.5 * (recentred.size[0] - 1), 0.5 * (recentred.size[1] - 1)))
+    radial = cast(Cahvor | Cahvore, recentred)
+    chi = corner / (recentred.focal_lengths[0] * (1.0 + float(radial.r[0])))
+    return replace(radial, r=radial.r + np.array([0.0, distortion_error_px / recentred.focal_lengths[0] / chi**3, 0.0]))
 
 
 def draw_calibrated(camera: CameraModel, p: CalibrationParameters, rng: np.random.Generator) -> CameraModel:
@@ -82,14 +82,14 @@ def draw_calibrated(camera: CameraModel, p: CalibrationParameters, rng: np.rando
 
 @dataclass(frozen=True)
 class Sample:
-    """A picture and the truth of each pixel.
+    """An image and the truth of each pixel.
 
     - image: counts of `bits` bits, as delivered
     - range_m: distance along the pixel's ray to the surface; infinite for the sky
     - normal: unit normal of the surface, world axes
     - rocks: 1 for a rock or another body, 0 for ground
     - hazard: footprint hazard of a lander: 0 safe, 1 hazard, 255 not completely visible; None without a lander
-    - camera: in the body's axes
+    - camera: camera in body axes
     - about: pose, sun and other metadata; plain data
     """
 
@@ -103,8 +103,8 @@ class Sample:
     about: Mapping[str, Any]
 
 
-def sum_rows(rows_summed: int) -> slice:
-    """Select the frame's rows with the truth of a picture's rows: the middle one of each that are summed."""
+def select_middle_rows(rows_summed: int) -> slice:
+    """Select the rendered row in the middle of each group of summed rows: it represents the truth of an image row."""
     return slice(rows_summed // 2, None, rows_summed)
 
 
@@ -113,7 +113,7 @@ class ProvidesSamples(Protocol):
     """A scenario that provides samples for learning."""
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
-        """Yield the pictures of one case that `run` gives to its algorithms."""
+        """Yield the images of one case that `run` passes to its algorithms."""
 
 
 def render_state(
@@ -126,7 +126,7 @@ def render_state(
     pose = state.world_from_body if mounting is None else state.world_from_body * mounting
     frame = process_renderer(backend).render(scene, optics.rays, pose, state.time_s)
     rate = state.attitude.apply(state.body_rate_rad_s)
-    return frame, ImageMotion.of_camera(optics.camera, frame.range_m, frame.world_from_body, state.velocity_m_s, rate)
+    return frame, ImageMotion.from_camera(optics.camera, frame.range_m, frame.world_from_body, state.velocity_m_s, rate)
 
 
 def sunlight_ratio(air: Environment, elevation_rad: float, detector: DetectorParameters) -> float:
@@ -143,7 +143,7 @@ def pixel_sample(
     hazard: UInt8[np.ndarray, "rows columns"] | None = None,
 ) -> Sample:
     """Assemble a picture and the truth of its pixels; `camera` is that of the delivered picture."""
-    rows = sum_rows(detector.rows_summed)
+    rows = select_middle_rows(detector.rows_summed)
     return Sample(
         image=counts,
         bits=detector.bits,

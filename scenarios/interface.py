@@ -1,4 +1,4 @@
-"""The interface between campaigns and scenarios: parameters, shared inputs, and running one case."""
+"""Interface between campaigns and scenarios: parameters, shared inputs, and running one case."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from marsyard.sim.streams import Streams
 
 if TYPE_CHECKING:
     from marsyard.scenarios.estimators import Task
-    from marsyard.scenarios.parts.named import Kind
+    from marsyard.scenarios.parts.named import PartKind
 
-#: A value in a column of the results.
+#: Value of a column of the results.
 Scalar = float | int | str | bool
 
 
@@ -24,9 +24,9 @@ _recorder: ContextVar[Callable[[Mapping[str, Scalar]], None] | None] = ContextVa
 
 
 def record_conditions(columns: Mapping[str, Scalar]) -> None:
-    """Record columns of the running case that depend on no algorithm, before an algorithm runs.
+    """Record columns of the running case that do not depend on an algorithm, before an algorithm runs.
 
-    The engine stores them also if the case raises or its process is killed: they decide the populations of the case.
+    The engine stores them even if the case raises or its process is killed: they determine the populations of the case.
     `CaseResult.row` must contain them as well. A case may call this several times; no effect outside of a campaign.
     """
     recorder = _recorder.get()
@@ -48,7 +48,7 @@ def conditions_recorded_by(recorder: Callable[[Mapping[str, Scalar]], None]) -> 
 class Failure:
     """Failure of the algorithm under test in an otherwise valid case.
 
-    - outcome: a name of `marsyard.algorithms.faults.Fault`
+    - outcome: a name of `marsyard.algorithms.answers.Fault`
     - error, trace: stored as `error` and `traceback`
     """
 
@@ -63,7 +63,7 @@ class CaseResult:
 
     - outcome: a member of the estimate's enumeration, or the name of the failure
     - answered: whether the algorithm under test reported an answer (the population `valid` of requirements)
-    - row: scored errors (NaN without an answer) and the drawn values as read back from the simulated objects. Columns
+    - row: scored errors (NaN without an answer) and the sampled values as read back from the simulated objects. Columns
       that may differ between two runs of one case have `time` in their name.
     - products: arrays and texts for the case's figures; stored only for cases that the campaign retains
     - failure: None if the algorithm under test answered
@@ -94,18 +94,18 @@ class Scenario(Protocol):
         """Build one shared input into the cache on disk if it is missing. Safe to call in parallel."""
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """Run one case with its drawn parameters and its random streams; see `record_conditions`."""
+        """Run one case with its sampled parameters and its random streams; see `record_conditions`."""
 
 
 @runtime_checkable
 class SelectsInputs(Protocol):
-    """A scenario that states the shared inputs of a case: only those of a campaign's cases are prepared."""
+    """A scenario that reports the shared inputs of a case: only the inputs of a campaign's cases are prepared."""
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
-        """Return the numbers, out of `shared_inputs`, of the inputs of a case with these drawn parameters."""
+        """Return the numbers, out of `shared_inputs`, of the inputs of a case with these sampled parameters."""
 
     def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
-        """Return the bytes that preparing an input would add to the cache; 0 if it is there."""
+        """Return the bytes that preparing an input would add to the cache; 0 if it is cached."""
 
 
 @runtime_checkable
@@ -123,8 +123,8 @@ class HasAlgorithms(Protocol):
 
 @runtime_checkable
 class HasParts(Protocol):
-    """A scenario whose cases may use parts of a user (`marsyard.scenarios.parts`)."""
+    """A scenario whose cases may use user-defined parts (`marsyard.scenarios.parts`)."""
 
     @property
-    def part_keys(self) -> Mapping[str, Kind]:
-        """Kinds of the parts by the dotted path of the parameter that names them, one name or a list."""
+    def part_keys(self) -> Mapping[str, PartKind]:
+        """Kinds of the parts by the dotted path of their parameter, which contains one name or a list."""

@@ -1,6 +1,6 @@
-"""Meshes of a user on the ground (rocks, landers, landmarks), from the formats of trimesh.
+"""User-defined meshes on the ground (rocks, landers, landmarks), in the formats of trimesh.
 
-They appear once on the periodic terrain: in pictures with their shadows, and in the truth (range, bodies, landing site
+They appear once on the periodic terrain: in images with their shadows, and in the truth (range, bodies, landing site
 truth).
 """
 
@@ -27,18 +27,18 @@ from marsyard.sim.terrain import Surface
 
 #: Maximum size of a file, and maximum number of triangles.
 MAX_BYTES, MAX_FACES = 1 << 28, 1_000_000
-#: Archives, which are not read; and formats that are zip archives themselves.
+#: Archives, which are not supported; and formats that are zip archives themselves.
 _ARCHIVES = frozenset({"zip", "bz2", "gz", "tar.gz", "tar.bz2"})
 _ZIPPED = frozenset({"3mf", "3dxml", "zae"})
 #: Numbers in an element of a glTF accessor.
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-#: Body number of meshes; rocks of a field count from 0.
-FIRST_NAME = 1 << 30
+#: First body number of meshes; rocks of a field count from 0.
+FIRST_MESH_NUMBER = 1 << 30
 #: Default albedo: rock, painted structure, bright target.
 _ALBEDO = {"rock": 0.15, "lander": 0.5, "landmark": 0.6}
 
 
-#: Rotations that make an axis of the file point up.
+#: Rotations that make an axis of the file point up. Rotations that make an axis of the file point up.
 _UPRIGHT = {
     "x": Rotation.from_euler("y", -90.0, degrees=True),
     "y": Rotation.from_euler("x", 90.0, degrees=True),
@@ -47,33 +47,31 @@ _UPRIGHT = {
 
 
 class MeshFileError(ValueError):
-    """An unusable mesh; the message names the file, the fault, and the allowed values."""
+    """An invalid mesh; the message contains the file, the problem, and the allowed values."""
 
 
 class MeshParameters(UserFile):
     """A mesh whose lowest point is `sink_m` below the ground."""
 
-    kind: Annotated[Literal["rock", "lander", "landmark"], Field(description="what it is: rocks are smooth")] = "rock"
-    east_m: Annotated[float, Field(allow_inf_nan=False, description="where its origin stands, on the terrain")] = 0.0
+    kind: Annotated[Literal["rock", "lander", "landmark"], Field(description="object; rocks are smooth")] = "rock"
+    east_m: Annotated[float, Field(allow_inf_nan=False, description="position of the origin")] = 0.0
     north_m: Annotated[float, Field(allow_inf_nan=False)] = 0.0
-    heading_deg: Annotated[float, Field(ge=-720.0, le=720.0, description="turn about the vertical, clockwise")] = 0.0
+    heading_deg: Annotated[float, Field(ge=-720.0, le=720.0, description="rotation about up, clockwise")] = 0.0
     size_m: Annotated[
-        float | None, Field(gt=0.0, le=1000.0, description="its greatest horizontal extent; scales the file")
+        float | None, Field(gt=0.0, le=1000.0, description="maximum horizontal extent; scales the file")
     ] = None
-    scale: Annotated[
-        float, Field(gt=0.0, le=1e4, description="metres in the file's unit, where size_m is not stated")
-    ] = 1.0
+    scale: Annotated[float, Field(gt=0.0, le=1e4, description="metres per unit of the file, without size_m")] = 1.0
     up: Annotated[Literal["x", "y", "z"], Field(description="the file's axis that points up")] = "z"
-    sink_m: Annotated[float, Field(ge=-100.0, le=100.0, description="how far its lowest point is in the ground")] = 0.0
-    albedo: Annotated[float | None, Field(gt=0.0, lt=1.0, description="not stated: that of its kind")] = None
+    sink_m: Annotated[float, Field(ge=-100.0, le=100.0, description="depth of the lowest point below the ground")] = 0.0
+    albedo: Annotated[float | None, Field(gt=0.0, lt=1.0, description="default: albedo of the kind")] = None
 
     @classmethod
     def file_hash(cls, file: str) -> str:
         """Return the SHA-256 of a valid mesh file."""
         return read_mesh(file).sha256
 
-    def standing(self, surface: Surface, near: tuple[float, float]) -> Objects:
-        """Location the mesh on the ground, at its repetition nearest to a point (x, y)."""
+    def place_on_ground(self, surface: Surface, point: tuple[float, float]) -> Objects:
+        """Place the mesh on the ground, at its repetition nearest to a point (x, y)."""
         mesh = read_mesh(self.file)
         corners = _UPRIGHT[self.up].apply(mesh.triangles.reshape(-1, 3))
         extent = float(np.ptp(corners[:, :2], axis=0).max())
@@ -83,7 +81,7 @@ class MeshParameters(UserFile):
         normals = heading.apply(_UPRIGHT[self.up].apply(mesh.normals.reshape(-1, 3)))
         period = surface.levels[0].shape[0] * surface.spacing_m
         position = np.array([self.east_m, self.north_m])
-        position = position + period * np.round((np.array(near) - position) / period)
+        position = position + period * np.round((np.array(point) - position) / period)
         ground = float(surface.height(position[0], position[1]))
         corners = corners + np.array([*position, ground - self.sink_m - float(corners[:, 2].min())])
         if self.kind != "rock":  # normals of the faces
@@ -92,8 +90,8 @@ class MeshParameters(UserFile):
             lengths = np.linalg.norm(normals, axis=1, keepdims=True)
             normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0).repeat(3, axis=0)
         faces = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
-        name = np.full(len(faces), FIRST_NAME, dtype=np.int32)
-        return Objects.of_mesh(corners, normals, faces, name, self.albedo or _ALBEDO[self.kind])
+        numbers = np.full(len(faces), FIRST_MESH_NUMBER, dtype=np.int32)
+        return Objects.of_mesh(corners, normals, faces, numbers, self.albedo or _ALBEDO[self.kind])
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,22 +107,22 @@ class Mesh:
     normals: Float64[np.ndarray, "faces 3 3"]
 
 
-def add_meshes(scene: Scene, meshes: Sequence[MeshParameters], near: tuple[float, float]) -> Scene:
+def add_meshes(scene: Scene, meshes: Sequence[MeshParameters], point: tuple[float, float]) -> Scene:
     """Add meshes to a scene, each at its repetition nearest to a point (x, y)."""
     if not meshes:
         return scene
-    standing = Objects.join([one.standing(scene.surface, near) for one in meshes])
-    return scene.with_objects(Objects.join([scene.objects, standing]))
+    placed = Objects.join([mesh.place_on_ground(scene.surface, point) for mesh in meshes])
+    return scene.with_objects(Objects.join([scene.objects, placed]))
 
 
 def read_mesh(path: str) -> Mesh:
     """Read and check a mesh; cached while its file does not change. Raises MeshFileError."""
     try:
         status = check_regular(path)
-    except OSError as fault:
-        raise MeshFileError(f"{path}: cannot be read ({fault.strerror})") from fault
+    except OSError as error:
+        raise MeshFileError(f"{path}: cannot be read ({error.strerror})") from error
     if status.st_size > MAX_BYTES:
-        raise MeshFileError(f"{path}: is larger than {MAX_BYTES >> 20} MiB; make the mesh coarser")
+        raise MeshFileError(f"{path}: is larger than {MAX_BYTES >> 20} MiB; reduce the number of triangles")
     return _read(path, status.st_mtime_ns)
 
 
@@ -135,7 +133,7 @@ def _read(path: str, _changed_ns: int) -> Mesh:
     kind = Path(path).suffix.lower().lstrip(".")
     formats = sorted(set(trimesh.available_formats()) - _ARCHIVES)
     if kind not in formats:
-        raise MeshFileError(f"{path}: '.{kind}' is no format of meshes; allowed: {', '.join(formats)}")
+        raise MeshFileError(f"{path}: '.{kind}' is not a supported mesh format; allowed: {', '.join(formats)}")
     # a small file may expand to a mesh that is too large
     try:
         size = 0
@@ -143,27 +141,27 @@ def _read(path: str, _changed_ns: int) -> Mesh:
             size = expanded_bytes(path)
         elif kind in ("glb", "gltf"):
             size = _accessor_bytes(Path(path).read_bytes(), kind)
-    except (*ARCHIVE_ERRORS, struct.error, AttributeError, RecursionError) as fault:
-        raise MeshFileError(f"{path}: cannot be read as a mesh ({fault})") from fault
+    except (*ARCHIVE_ERRORS, struct.error, AttributeError, RecursionError) as error:
+        raise MeshFileError(f"{path}: cannot be read as a mesh ({error})") from error
     if size > MAX_BYTES:
         raise MeshFileError(f"{path}: expands to {size} bytes; allowed: up to {MAX_BYTES >> 20} MiB")
     try:
         loaded = trimesh.load(path, force="mesh", process=False)
         digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-    except Exception as fault:  # each format's reader raises its own
-        reason = " ".join(str(fault).split())[:200] or type(fault).__name__
-        raise MeshFileError(f"{path}: cannot be read as a mesh ({reason})") from fault
-    # trimesh's own arrays are read-only, which rotations refuse
+    except Exception as error:  # each reader raises different exceptions
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise MeshFileError(f"{path}: cannot be read as a mesh ({reason})") from error
+    # the arrays of trimesh are read-only, which rotations do not accept
     triangles = np.array(getattr(loaded, "triangles", np.zeros((0, 3, 3))), dtype=np.float64)
     if len(triangles) == 0:
-        raise MeshFileError(f"{path}: holds no triangle")
+        raise MeshFileError(f"{path}: contains no triangle")
     if len(triangles) > MAX_FACES:
-        raise MeshFileError(f"{path}: holds {len(triangles)} triangles; allowed: up to {MAX_FACES}")
+        raise MeshFileError(f"{path}: contains {len(triangles)} triangles; allowed: up to {MAX_FACES}")
     if not np.all(np.isfinite(triangles)):
-        raise MeshFileError(f"{path}: holds a corner that is not finite")
+        raise MeshFileError(f"{path}: contains a corner that is not finite")
     if not np.ptp(triangles.reshape(-1, 3), axis=0).all():
-        raise MeshFileError(f"{path}: is flat; a body with an extent along all axes is needed")
-    # equal corners become one vertex: normals are then smooth over a file of loose triangles
+        raise MeshFileError(f"{path}: is flat; allowed: bodies that extend along all axes")
+    # equal corners become one vertex, so that normals are smooth even over unconnected triangles
     vertices, numbers = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
     merged = trimesh.Trimesh(vertices, numbers.reshape(-1, 3), process=False)
     return Mesh(digest, triangles, np.array(merged.vertex_normals, dtype=np.float64)[np.array(merged.faces)])
@@ -176,4 +174,4 @@ def _accessor_bytes(contents: bytes, kind: str) -> int:
         contents = contents[20 : 20 + length]
     accessors = json.loads(contents).get("accessors", [])
     # a component has up to 4 bytes, an element (a matrix) up to 16 components
-    return sum(4 * _COMPONENTS.get(one.get("type"), 16) * int(one.get("count", 0)) for one in accessors)
+    return sum(4 * _COMPONENTS.get(accessor.get("type"), 16) * int(accessor.get("count", 0)) for accessor in accessors)

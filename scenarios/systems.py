@@ -5,7 +5,7 @@ A package adds a system by an entry point of the group `marsyard.systems`::
     [project.entry-points."marsyard.systems"]
     altitude = "mypackage.system:SYSTEM"
 
-An unusable system is left out, with one message in `problems`.
+A system that cannot be loaded is omitted, with one message in `problems`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SCENARIOS_FOLDER = Path(__file__).resolve().parent
 
 @dataclass(frozen=True)
 class Ingested:
-    """Cases made of recorded data: text of the campaign file, numbers, and a note for the user."""
+    """Cases converted from recorded data: text of the campaign file, numbers, and a note for the user."""
 
     campaign: str
     cases: int
@@ -41,22 +41,22 @@ class Ingested:
 class System:
     """A system under test; plain data, whose ``module:NAME`` objects are imported when they are needed.
 
-    A system of another package is a module-level object of this class, named by an entry point of the group
+    A system of another package is a module-level object of this class, in an entry point of the group
     `marsyard.systems` (`marsyard.scenarios.systems`).
 
     - name: short unique name; the dashboard groups campaigns by it
-    - title, summary: name for a reader, and one sentence on the tests
+    - title, summary: title for a reader, and one sentence on the tests
     - scenarios: classes that implement `marsyard.scenarios.interface.Scenario`, by the names in campaign files
     - tasks: each a `marsyard.scenarios.estimators.Task`: the published algorithm, the baselines, and the accepted forms
       of a user's algorithm. Entry points of the group `marsyard.algorithms` add algorithms.
     - catalogue: campaign files, as a folder and a pattern (``folder/altitude-*.toml``)
-    - requirements: a file of requirements that campaigns name by their ids, as `scenarios/requirements.toml`
-    - columns: a file of the columns of each scenario's rows, as `scenarios/columns.toml`. Without it requirements are
+    - requirements: file of the requirements that campaigns reference by id, as `scenarios/requirements.toml`
+    - columns: file of the columns of each scenario's rows, as `scenarios/columns.toml`. Without it, requirements are
       checked against the first finished case.
     - compiled_by: campaigns of the catalogue, each with settings (``KEY=VALUE``) that make it small: one case of each
       calls all numeric kernels of its scenario (`marsyard compile`)
     - templates: each a `marsyard.scenarios.template.CampaignTemplate`, by the values of ``marsyard new --system``
-    - ingest: function that makes cases of recorded data (`marsyard ingest`). Arguments: the folder of the data, a
+    - ingest: function that converts recorded data into cases (`marsyard ingest`). Arguments: the folder of the data, a
       folder to write into, and the folder to which that is moved. Returns `Ingested`.
     - report: a `marsyard.reports.presentation.Presentation`: report sections, and the pictures of a case
     """
@@ -82,14 +82,14 @@ class System:
         return {path.stem: path for path in sorted(self.catalogue.parent.glob(self.catalogue.name))}
 
 
-#: Entry points of other packages' systems.
+#: Entry point group of other packages' systems.
 GROUP = "marsyard.systems"
 
 #: Files that the systems of Marsyard share.
 _CATALOGUE = SCENARIOS_FOLDER / "catalogue"
 _REQUIREMENTS, _COLUMNS = SCENARIOS_FOLDER / "requirements.toml", SCENARIOS_FOLDER / "columns.toml"
 
-#: The systems of Marsyard. Recorded pictures come first: their products are also those of others.
+#: The systems of Marsyard. Recorded pictures come first: other systems also have their products.
 BUILT_IN = (
     System(
         name="measured",
@@ -108,7 +108,7 @@ BUILT_IN = (
     System(
         name="dimes",
         title="Descent Image Motion Estimation System (DIMES)",
-        summary="Horizontal velocity of a lander under its parachute, from three pictures.",
+        summary="Horizontal velocity of a lander under its parachute, from three images.",
         scenarios={"descent": "marsyard.scenarios.descent.scenario:DescentScenario"},
         tasks=("marsyard.scenarios.estimators:VELOCITY",),
         catalogue=_CATALOGUE / "dimes-*.toml",
@@ -121,7 +121,7 @@ BUILT_IN = (
     System(
         name="fieldtest",
         title="Field test of DIMES on a helicopter",
-        summary="Horizontal velocity of a helicopter from triples of pictures over desert ground.",
+        summary="Horizontal velocity of a helicopter from triples of images over desert ground.",
         scenarios={"fieldtest": "marsyard.scenarios.fieldtest.scenario:FieldTestScenario"},
         tasks=("marsyard.scenarios.estimators:VELOCITY",),
         catalogue=_CATALOGUE / "dimes-fieldtest.toml",
@@ -131,7 +131,7 @@ BUILT_IN = (
     System(
         name="vtt",
         title="Visual target tracking (VTT)",
-        summary="Position of a target that a rover drives at, tracked in the pictures of its mast.",
+        summary="Position of a target that a rover approaches, tracked in the images of its mast cameras.",
         scenarios={
             "rover": "marsyard.scenarios.rover.scenario:RoverScenario",
             "rover-drive": "marsyard.scenarios.rover.scenario:SharedDriveScenario",
@@ -147,7 +147,7 @@ BUILT_IN = (
     System(
         name="hda",
         title="Hazard detection and avoidance (HDA)",
-        summary="A safe landing site from two pictures of a moving camera.",
+        summary="A safe landing site from two images of a moving camera.",
         scenarios={"landing": "marsyard.scenarios.landing.scenario:LandingScenario"},
         tasks=("marsyard.scenarios.estimators:LANDING",),
         catalogue=_CATALOGUE / "hda-*.toml",
@@ -162,7 +162,7 @@ BUILT_IN = (
 
 @dataclass(frozen=True)
 class Registry:
-    """The systems in order, and one message for each that is left out."""
+    """The systems in order, and one message for each omitted system."""
 
     systems: tuple[System, ...]
     problems: tuple[str, ...]
@@ -171,14 +171,14 @@ class Registry:
 @cache
 def registry() -> Registry:
     """Read the systems of this installation, once per process."""
-    usable = list(BUILT_IN)
+    loaded = list(BUILT_IN)
     problems: list[str] = []
-    for point in sorted(entry_points(group=GROUP), key=lambda one: (one.name, one.value)):
+    for point in sorted(entry_points(group=GROUP), key=lambda item: (item.name, item.value)):
         try:
-            usable.append(_load(point, usable))
+            loaded.append(_load(point, loaded))
         except ValueError as error:
-            problems.append(f"system '{point.name}' ({point.value}) is left out: {error}")
-    return Registry(tuple(usable), tuple(problems))
+            problems.append(f"system '{point.name}' ({point.value}) is omitted: {error}")
+    return Registry(tuple(loaded), tuple(problems))
 
 
 def systems() -> tuple[System, ...]:
@@ -187,7 +187,7 @@ def systems() -> tuple[System, ...]:
 
 
 def problems() -> tuple[str, ...]:
-    """Return one message for each system of another package that is left out."""
+    """Return one message for each system of another package that is omitted."""
     return registry().problems
 
 
@@ -203,11 +203,11 @@ def template_paths() -> Mapping[str, str]:
 
 def find_system(scenario: str) -> System | None:
     """Return the system with a scenario of this name or ``module:Class``; None without one."""
-    return next((one for one in systems() if scenario in {*one.scenarios, *one.scenarios.values()}), None)
+    return next((item for item in systems() if scenario in {*item.scenarios, *item.scenarios.values()}), None)
 
 
-def _load(point: EntryPoint, others: list[System]) -> System:
-    """Load the system of an entry point. Raises ValueError where it is unusable or conflicts with the others."""
+def _load(point: EntryPoint, earlier_systems: list[System]) -> System:
+    """Load the system of an entry point. Raises ValueError if it is invalid or conflicts with an earlier system."""
     try:
         system = import_object(point.value)
     except ImportError as error:
@@ -218,14 +218,14 @@ def _load(point: EntryPoint, others: list[System]) -> System:
     if system.catalogue is not None and not system.campaigns:
         missing.append(str(system.catalogue))
     if missing:
-        raise ValueError(f"it names what is not there: {', '.join(missing)}")
-    for other in others:
-        shared = [f"name '{system.name}'"] if system.name == other.name else []
+        raise ValueError(f"these files do not exist: {', '.join(missing)}")
+    for earlier in earlier_systems:
+        conflicts = [f"name '{system.name}'"] if system.name == earlier.name else []
         for kind in ("scenarios", "campaigns", "templates"):
-            names = getattr(other, kind)
-            shared += [f"{kind.removesuffix('s')} '{name}'" for name in getattr(system, kind) if name in names]
-        if shared:
-            raise ValueError(f"the system '{other.name}' already has the {shared[0]}")
+            names = getattr(earlier, kind)
+            conflicts += [f"{kind.removesuffix('s')} '{name}'" for name in getattr(system, kind) if name in names]
+        if conflicts:
+            raise ValueError(f"the system '{earlier.name}' already has the {conflicts[0]}")
     return system
 
 
@@ -233,9 +233,9 @@ def _load(point: EntryPoint, others: list[System]) -> System:
 class RowColumns:
     """Columns of a scenario's rows; a star in `flags` and `numbers` matches any text.
 
-    - flags: columns of true and false
-    - numbers: columns of numbers
-    - named_flags: a list among the parameters whose entries' `name` are further columns of true and false; empty for
+    - flags: boolean columns
+    - numbers: numeric columns
+    - named_flags: path of a list among the parameters; the `name` of each entry is a further boolean column; empty for
       none
     """
 
@@ -244,27 +244,27 @@ class RowColumns:
     named_flags: str = ""
 
     def has_flag(self, name: str) -> bool:
-        """Return whether a column of true and false may have this name."""
+        """Return whether a boolean column may have this name."""
         return any(fnmatchcase(name, pattern) for pattern in self.flags)
 
     def has_number(self, name: str) -> bool:
-        """Return whether a column of numbers may have this name."""
+        """Return whether a numeric column may have this name."""
         return any(fnmatchcase(name, pattern) for pattern in self.numbers)
 
 
 @cache
 def row_columns(scenario: str) -> RowColumns | None:
-    """Return the columns of a scenario; None where its system does not state them. Raises ValueError for a bad file."""
+    """Return the columns of a scenario; None if its system declares none. Raises ValueError for an invalid file."""
     system = find_system(scenario)
     if system is None or system.columns is None:
         return None
     try:
-        stated = tomllib.loads(system.columns.read_text(encoding="utf-8")).get(scenario)
-        if stated is None:
+        columns = tomllib.loads(system.columns.read_text(encoding="utf-8")).get(scenario)
+        if columns is None:
             return None
-        return RowColumns(tuple(stated["flags"]), tuple(stated["numbers"]), stated.get("named_flags", ""))
+        return RowColumns(tuple(columns["flags"]), tuple(columns["numbers"]), columns.get("named_flags", ""))
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise ValueError(f"{system.columns}: states no columns: {type(error).__name__}: {error}") from error
+        raise ValueError(f"{system.columns}: invalid columns: {type(error).__name__}: {error}") from error
 
 
 class UnknownScenarioError(LookupError):
@@ -279,28 +279,27 @@ def scenario_names() -> list[str]:
 def scenario(name: str) -> Scenario:
     """Create the scenario of a name, or of a class ``module:Class`` that implements `Scenario`.
 
-    Raises UnknownScenarioError, whose message states the allowed names.
+    Raises UnknownScenarioError with the allowed names.
     """
     path = name if ":" in name else scenario_paths().get(name)
     if path is None:
-        near = difflib.get_close_matches(name, scenario_names(), n=1)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
+        matches = difflib.get_close_matches(name, scenario_names(), n=1)
+        hint = f" (did you mean '{matches[0]}'?)" if matches else ""
         allowed = ", ".join(scenario_names())
-        message = f"unknown scenario '{name}'{hint}; allowed: {allowed}, or your own as 'module:Class'"
+        message = f"unknown scenario '{name}'{hint}; allowed: {allowed}, or a custom one as 'module:Class'"
         raise UnknownScenarioError("; ".join((message, *problems())))
     try:
         scenario_type = import_object(path)
     except ImportError as error:
-        raise UnknownScenarioError(f"no scenario at '{path}': {error}") from error
-    missing = [
-        part for part in ("parameters_type", "shared_inputs", "prepare", "run") if not hasattr(scenario_type, part)
-    ]
+        raise UnknownScenarioError(f"cannot import scenario '{path}': {error}") from error
+    members = ("parameters_type", "shared_inputs", "prepare", "run")
+    missing = [member for member in members if not hasattr(scenario_type, member)]
     if missing:
-        raise UnknownScenarioError(f"'{path}' is not a scenario: it has no {', '.join(missing)}")
+        raise UnknownScenarioError(f"'{path}' is not a valid scenario: missing members: {', '.join(missing)}")
     return cast(Scenario, scenario_type())
 
 
 def scenario_source(name: str) -> str:
-    """Return ``module:Class`` of a scenario of another package; the name of any other."""
+    """Return ``module:Class`` for a scenario of another package; the name for any other scenario."""
     path = scenario_paths().get(name, name)
     return name if path.startswith("marsyard.") else path

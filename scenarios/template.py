@@ -15,7 +15,7 @@ from marsyard.scenarios.descent.parameters import binned_size_for
 from marsyard.scenarios.systems import SCENARIOS_FOLDER
 from marsyard.sim.camera import read_camera
 
-#: Number of terrains of a new campaign's bank: enough for appended cases, and the maximum of a bank.
+#: Number of terrains of a new campaign's bank: enough for appended cases; maximum of a bank.
 MIN_TERRAINS, MAX_TERRAINS = 10_000, 100_000
 
 
@@ -23,10 +23,10 @@ MIN_TERRAINS, MAX_TERRAINS = 10_000, 100_000
 class Choices:
     """A user's choices for a new campaign.
 
-    - name, site: the campaign's name, and the terrain's site
-    - camera, detector, flight: files of the user, or empty
-    - axes: world axes of the flight's file
-    - bound: maximum error, or minimum fraction, that the requirement states
+    - name, site: name of the campaign, and site of the terrain
+    - camera, detector, flight: the user's files, or empty
+    - axes: world axes of the flight file
+    - bound: maximum error, or minimum fraction, of the requirement
     - cases: number of cases
     """
 
@@ -44,14 +44,14 @@ class Choices:
 class CampaignTemplate:
     """A Jinja template of a campaign file.
 
-    - file: gets the fields of `Choices`, `bank` (number of terrains) and the entries of `values`; the filter ``toml``
-      formats a value as TOML. It may extend ``campaign.toml.j2``.
+    - file: receives the fields of `Choices`, `bank` (number of terrains) and the entries of `values`; its filter
+      ``toml`` formats a value as TOML. It may extend ``campaign.toml.j2``.
     - scale: scale of the site's terrain, ``descent`` or ``ground``
     - site, bound: defaults
     - bound_text: meaning of the bound, for the dialogue
     - max_bound: upper limit of the bound, exclusive
     - refused: reasons why options (``camera``, ``detector``, ``flight``) are not accepted
-    - values: further values for the file. Raises ValueError where a user's file cannot be used.
+    - values: further values for the file. Raises ValueError if a user's file is invalid.
     """
 
     file: Path
@@ -64,8 +64,8 @@ class CampaignTemplate:
     values: Callable[[Choices], Mapping[str, Any]] = lambda _: {}
 
     def text(self, choices: Choices) -> str:
-        """Return the text of the campaign file. Raises ValueError where an option is not accepted."""
-        refusal = next((why for option, why in self.refused.items() if getattr(choices, option)), None)
+        """Return the text of the campaign file. Raises ValueError if an option is not accepted."""
+        refusal = next((reason for option, reason in self.refused.items() if getattr(choices, option)), None)
         if refusal is not None:
             raise ValueError(refusal)
         template = toml_environment(self.file.parent, SCENARIOS_FOLDER).get_template(self.file.name)
@@ -91,9 +91,9 @@ def _binned_size(choices: Choices) -> Mapping[str, Any]:
     return {"binned_size": binned_size_for(*read_camera(choices.camera).size)} if choices.camera else {}
 
 
-_REFUSED_FLIGHT = "--flight: only descents fly a file's trajectory, and {} is none"
+_REFUSED_FLIGHT = "--flight: only descents accept a recorded trajectory, and {} is not a descent"
 _REFUSED_CAMERA = (
-    "--camera and --detector: tracking looks through a mast's stereo pair; see camera.preset and camera.custom"
+    "--camera and --detector: tracking uses the stereo cameras of a mast; see camera.preset and camera.custom"
 )
 
 VELOCITY = CampaignTemplate(
@@ -109,7 +109,7 @@ LANDING = CampaignTemplate(
     scale="ground",
     site="heli-hazardous",
     bound=0.99,
-    bound_text="fraction of chosen sites that must be safe",
+    bound_text="minimum fraction of safe sites among the selected sites",
     max_bound=1.0,
     refused={"flight": _REFUSED_FLIGHT.format("landing")},
 )

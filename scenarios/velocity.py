@@ -7,19 +7,18 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float64, UInt16
 
-from marsyard.algorithms.answers import AlgorithmError, Fault
+from marsyard.algorithms.answers import AlgorithmError, Fault, StreamedEstimator, check_and_set_span
 from marsyard.algorithms.dimes import DimesDetails, dimes_products
 from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator
-from marsyard.algorithms.streams import StreamedEstimator, set_span
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm_on_copy
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.offline import RecordedAnswer, Recorder
 from marsyard.sim.measurements import DescentMeasurements
 
 Horizontal = Float64[np.ndarray, "2"]
-#: Time tags of the start and end of the interval of a mean velocity; equal for an instantaneous one.
+#: Time tags of the start and end of the interval of a mean velocity; equal for an instantaneous velocity.
 Span = tuple[float, float]
-#: Indices of three pictures.
+#: Indices of three images.
 Triple = tuple[int, int, int]
 
 _THREE: Triple = (0, 1, 2)
@@ -28,56 +27,56 @@ _THREE: Triple = (0, 1, 2)
 def run_estimator(
     make: Callable[[], VelocityEstimator], measurements: DescentMeasurements, triple: Triple | None = _THREE
 ) -> AlgorithmRun[VelocityEstimate]:
-    """Run an estimator on a descent; the answer states its span.
+    """Run an estimator on a descent; the answer contains its span.
 
-    Streams and recorders get all pictures. Other estimators get three of them, and fail without.
+    Streams and recorders receive all images. Other estimators receive three of them, and fail without a triple.
     """
     tags = measurements.tags_s
 
-    def answer(given: DescentMeasurements) -> object:
+    def estimate(inputs: DescentMeasurements) -> object:
         nonlocal tags
         estimator = make()
         if isinstance(estimator, StreamedEstimator | Recorder | RecordedAnswer):
-            return estimator.estimate(given)
+            return estimator.estimate(inputs)
         if triple is None:
-            raise ValueError(f"it takes three pictures, and {len(measurements.images)} are taken")
-        three = given if len(measurements.images) == len(triple) else given.select(triple)
-        tags = three.tags_s
-        return estimator.estimate(three)
+            raise ValueError(f"it needs three images, but the descent has {len(measurements.images)}")
+        selected = inputs if len(measurements.images) == len(triple) else inputs.select(triple)
+        tags = selected.tags_s
+        return estimator.estimate(selected)
 
-    return run_algorithm_on_copy(answer, lambda answer: set_span(answer, tags), measurements)
+    return run_algorithm_on_copy(estimate, lambda answer: check_and_set_span(answer, tags), measurements)
 
 
 def check_last_interval(answer: object, measurements: DescentMeasurements) -> VelocityEstimate:
-    """Validate an answer for the last interval, the only one with known truth. Raises AlgorithmError."""
-    estimate = set_span(answer, measurements.tags_s)
+    """Validate an answer for the last interval, the only interval with known truth. Raises AlgorithmError."""
+    estimate = check_and_set_span(answer, measurements.tags_s)
     if estimate.span_s not in (None, measurements.last_interval_s):
         raise AlgorithmError(
             Fault.BAD_ANSWER,
-            f"span_s is {estimate.span_s}; allowed here: between the last two pictures, {measurements.last_interval_s}",
+            f"span_s is {estimate.span_s}; allowed here: between the last two images, {measurements.last_interval_s}",
         )
     return estimate
 
 
-def _answers_after_pictures(
+def _answers_after_images(
     estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]
 ) -> list[tuple[Span, Horizontal, Horizontal]]:
-    """Return span, velocity and truth after each picture, NaN without a velocity; empty for other estimators."""
+    """Return span, velocity and truth after each image, NaN without a velocity; empty for other estimators."""
     missing = ((np.nan, np.nan), np.full(2, np.nan), np.full(2, np.nan))
     return [
         missing
-        if one is None or one.velocity_m_s is None or one.span_s is None
-        else (one.span_s, one.velocity_m_s, truth(one.span_s))
-        for one in (estimate.after_pictures if estimate is not None else ())
+        if answer is None or answer.velocity_m_s is None or answer.span_s is None
+        else (answer.span_s, answer.velocity_m_s, truth(answer.span_s))
+        for answer in (estimate.after_pictures if estimate is not None else ())
     ]
 
 
 def stream_row(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]) -> dict[str, Scalar]:
-    """Return the errors of a stream after each picture, NaN without a velocity; empty for other estimators.
+    """Return the errors of a stream after each image, NaN without a velocity; empty for other estimators.
 
-    `pictures_before_answer` is the number of pictures before the first velocity, 0 if there is none.
+    `pictures_before_answer` is the number of images before the first velocity, 0 if there is none.
     """
-    errors = [float(np.hypot(*(velocity - true))) for _, velocity, true in _answers_after_pictures(estimate, truth)]
+    errors = [float(np.hypot(*(velocity - true))) for _, velocity, true in _answers_after_images(estimate, truth)]
     if not errors:
         return {}
     first = next((number for number, error in enumerate(errors, start=1) if not np.isnan(error)), 0)
@@ -98,10 +97,10 @@ def velocity_row(name: str, estimated: Horizontal | None, true: Horizontal) -> d
 def consistency_row(estimate: VelocityEstimate | None, true: Horizontal) -> dict[str, Scalar]:
     """Return the error relative to the reported covariance; empty without a covariance.
 
-    `velocity_nees` is the error squared in units of the covariance P, e' P^-1 e: for a consistent estimator of a normal
-    error it is distributed as chi-square with 2 degrees of freedom (Bar-Shalom, Li & Kirubarajan, "Estimation with
-    Applications to Tracking and Navigation", 2001, section 5.4.2). `velocity_normalised_x` and `_y` are the errors over
-    their standard deviations, standard normal then.
+    `velocity_nees` is the squared error normalised by the covariance P, e' P^-1 e: for a consistent estimator with a
+    normally distributed error it follows the chi-square distribution with 2 degrees of freedom (Bar-Shalom, Li &
+    Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 5.4.2).
+    `velocity_normalised_x` and `_y` are the errors divided by their standard deviations: standard normal in that case.
     """
     if estimate is None or estimate.velocity_m_s is None or estimate.covariance_m2_s2 is None:
         return {}
@@ -131,7 +130,7 @@ def velocity_products(
 
 
 def stream_products(estimate: VelocityEstimate | None, truth: Callable[[Span], Horizontal]) -> dict[str, object]:
-    """Return a stream's answers after each picture with the truth, NaN without an answer; empty for others."""
+    """Return a stream's answers after each image with the truth, NaN without an answer; empty for other estimators."""
     names = ("after_spans_s", "after_velocities_m_s", "after_true_m_s")
-    columns = zip(*_answers_after_pictures(estimate, truth), strict=True)
+    columns = zip(*_answers_after_images(estimate, truth), strict=True)
     return {name: np.array(values) for name, values in zip(names, columns, strict=False)}

@@ -1,4 +1,4 @@
-"""A homography between rectified pictures from ORB features, as OpenCV has it."""
+"""Baseline for DIMES: homography between rectified images from OpenCV's ORB features."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class HomographyOptions:
     - common: Geometry and IMU check
     - features: Maximum number of features in each image
     - fast_threshold: FAST threshold, grey levels after the stretch to 8 bits
-    - max_ratio: Largest distance of the best match over that of the second best (Lowe's ratio)
+    - max_ratio: Largest ratio of the descriptor distances of the best and the second-best match (Lowe's ratio test)
     - reprojection_px: Largest reprojection error of an inlier, rectified pixels
-    - min_inliers: Minimum number of inliers: chance matches of images of different ground agreed in up to 6, those of
-      shifted ones with the flight camera's noise in 190 and above.
-    - max_distortion: Largest relative length change by the homography in the middle of the inliers: attitudes and
-      altitudes within specification leave 0.02.
-    - confidence, iterations: Of the robust estimation
+    - min_inliers: Minimum number of inliers. Images of different ground gave up to 6 inliers by chance; shifted images
+      with the flight camera's noise gave at least 190.
+    - max_distortion: Largest relative length change by the homography at the centroid of the inliers. Attitude and
+      altitude errors within specification cause up to 0.02.
+    - confidence, iterations: Parameters of the robust estimation
     """
 
     common: CommonOptions = DEFAULT_COMMON_OPTIONS
@@ -53,47 +53,45 @@ class HomographyEstimator:
     """Horizontal velocity from a homography of ORB features between rectified images, by MAGSAC++.
 
     With exact attitude and altitude the homography is a shift; its other parameters absorb their errors. The shift is
-    taken in the middle of the inliers, where it is most accurate.
+    evaluated at the centroid of the inliers, where it is most accurate.
     """
 
     def __init__(self, options: HomographyOptions | None = None) -> None:
         self.options = HomographyOptions() if options is None else options
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """The estimate, with `BaselineDetails`. Raises as `DimesEstimator.estimate`."""
+        """Estimate the velocity, with `BaselineDetails`. Raises as `DimesEstimator.estimate`."""
         return estimate_by_pairs(measurements, self._match, self.options.common)
 
     def _match(self, patches: PairPatches) -> PairMatch | None:
-        o, points = self.options, match_features(patches, self.options)
+        opts, points = self.options, match_features(patches, self.options)
         if points is None:
             return None
         homography, inliers = cv2.findHomography(
-            *points, cv2.USAC_MAGSAC, o.reprojection_px, maxIters=o.iterations, confidence=o.confidence
+            *points, cv2.USAC_MAGSAC, opts.reprojection_px, maxIters=opts.iterations, confidence=opts.confidence
         )
         if homography is None or not inliers.any():
             return None
         inlier = inliers.ravel().astype(bool)
-        middle = points[0][inlier].mean(axis=0).astype(np.float64)
-        moved = homography @ np.array([*middle, 1.0])
-        if abs(moved[2]) < 1e-9:
+        centroid = points[0][inlier].mean(axis=0).astype(np.float64)
+        homogeneous = homography @ np.array([*centroid, 1.0])
+        depth = homogeneous[2]
+        if abs(depth) < 1e-9:
             return None
-        point = moved[:2] / moved[2]
+        mapped_point = homogeneous[:2] / depth
         count = int(inlier.sum())
-        valid = count >= o.min_inliers and distortion(homography, moved[2], point) <= o.max_distortion
-        return PairMatch(np.asarray(point - middle), float(count), valid)
+        valid = count >= opts.min_inliers and distortion(homography, depth, mapped_point) <= opts.max_distortion
+        return PairMatch(np.asarray(mapped_point - centroid), float(count), valid)
 
 
-def distortion(homography: Float[np.ndarray, "3 3"], depth: float | np.floating, place: Vector2) -> float:
-    """Largest relative length change by the homography about the point that it maps to `place`.
-
-    `depth` is the third homogeneous component of the mapped point.
-    """
-    jacobian = (homography[:2, :2] - np.outer(place, homography[2, :2])) / depth
+def distortion(homography: Float[np.ndarray, "3 3"], depth: float | np.floating, mapped_point: Vector2) -> float:
+    """Largest relative length change near the point mapped to `mapped_point`, with homogeneous component `depth`."""
+    jacobian = (homography[:2, :2] - np.outer(mapped_point, homography[2, :2])) / depth
     return float(np.abs(np.linalg.svd(jacobian, compute_uv=False) - 1.0).max())
 
 
 def stretch_to_8_bits(patch: Raster) -> UInt8[np.ndarray, "rows columns"]:
-    """The patch stretched to 8 bits between its 0.5 % and 99.5 % quantiles."""
+    """Stretch a patch to 8 bits between its 0.5 % and 99.5 % quantiles."""
     low, high = np.quantile(patch, (0.005, 0.995))
     scaled = (patch - low) * (255.0 / max(float(high - low), 1e-9))
     return np.asarray(np.clip(np.rint(scaled), 0, 255).astype(np.uint8))

@@ -1,8 +1,8 @@
 """Image pairs rectified to a common camera that looks straight down, and the phase correlation of such pairs.
 
-The baselines see the same corrected images as DIMES, in the same geometry (`dimes.binning.rectify_patch`),
-but the whole overlap of two images rather than templates. The IMU checks the change between their two velocities as in
-DIMES, with the same threshold. Only the measurement of the shift differs.
+The baselines use the same corrected images as DIMES, in the same geometry (`dimes.binning.rectify_patch`). They match
+the whole overlap of two images instead of templates. The change between the two velocities is checked against the IMU
+as in DIMES, with the same threshold. Only the measurement of the shift differs.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from marsyard.algorithms.dimes.validity import combinations
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
 
-#: Step of the lattice of the common ground, rectified pixels.
+#: Spacing of the lattice on which the common ground is searched, rectified pixels.
 COARSE_STEP_PX = 8
 
 
 @dataclass(frozen=True)
 class CommonOptions:
-    """Options of both baselines; defaults of the geometry are those of `DimesOptions`.
+    """Options of both baselines; the defaults of the geometry are those of `DimesOptions`.
 
-    - min_side_px: Minimum side of the common square, rectified pixels: twice the search range, half of which stays in
-      view
+    - min_side_px: Minimum side of the common square, rectified pixels: twice the search range, so that half of the
+      square stays in view
     - max_side_px: Maximum side of the common square
     """
 
@@ -49,9 +49,9 @@ DEFAULT_COMMON_OPTIONS = CommonOptions()
 
 @dataclass(frozen=True)
 class PairPatches:
-    """The same square of ground, at zero motion, in both images of a pair.
+    """The same square of ground, assuming no motion, in both images of a pair.
 
-    - first, second: Corrected and rectified, counts, north up
+    - first, second: Corrected and rectified patches, counts, north up
     - gsd_m: Ground sample distance
     """
 
@@ -62,7 +62,7 @@ class PairPatches:
 
 @dataclass(frozen=True)
 class PairMatch:
-    """The shift of one pair.
+    """Shift between the two images of a pair.
 
     - shift_px: Shift of the second patch's content: (columns, rows), rectified pixels
     - score: Validity measure of the match; larger is better
@@ -76,7 +76,7 @@ class PairMatch:
 
 @dataclass(frozen=True)
 class BaselineDetails:
-    """For each pair its patches, None without common ground, and its match, None without one."""
+    """Patches of each pair (None without common ground), and its match (None if there is none)."""
 
     patches: tuple[PairPatches | None, ...]
     matches: tuple[PairMatch | None, ...]
@@ -88,13 +88,13 @@ Matcher = Callable[[PairPatches], PairMatch | None]
 def find_common_square(
     first: binning.View, second: binning.View, options: CommonOptions
 ) -> tuple[Vector2, int, float] | None:
-    """The largest square of ground in both views at zero motion: middle, side in pixels, ground sample distance.
+    """Find the largest square of ground in both views at zero motion.
 
-    Sides run east and north. None if it is smaller than `min_side_px`.
+    Returns its centre (east, north), side (pixels) and ground sample distance; None if smaller than `min_side_px`.
     """
     gsd = float(second.centre[2]) * binning.pixel_angle_rad(second)
-    reach = np.tan(options.max_off_nadir_rad) * float(min(first.centre[2], second.centre[2]))
-    per_side = 2 * int(np.ceil(reach / (COARSE_STEP_PX * gsd))) + 1
+    max_offset_m = np.tan(options.max_off_nadir_rad) * float(min(first.centre[2], second.centre[2]))
+    per_side = 2 * int(np.ceil(max_offset_m / (COARSE_STEP_PX * gsd))) + 1
     lattice = binning.ground_lattice(np.zeros(2), per_side, COARSE_STEP_PX * gsd)
     visible = np.ones(lattice.shape[:2], dtype=bool)
     for view in (first, second):
@@ -107,7 +107,7 @@ def find_common_square(
 
 
 def rectify_pair(first: binning.View, second: binning.View, options: CommonOptions) -> PairPatches | None:
-    """Both images of a pair over their common ground; None if it is too small."""
+    """Rectify both images of a pair over their common ground; None if it is too small."""
     square = find_common_square(first, second, options)
     return square and PairPatches(
         binning.rectify_patch(first, *square), binning.rectify_patch(second, *square), square[2]
@@ -115,22 +115,22 @@ def rectify_pair(first: binning.View, second: binning.View, options: CommonOptio
 
 
 def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, options: CommonOptions) -> VelocityEstimate:
-    """The velocity over the second pair, if both pairs match and their difference agrees with the IMU."""
-    triple = binning.usable_views(measurements, options.binned_size)
-    if triple is None:
+    """Estimate the velocity over the second pair, if both pairs match and their difference agrees with the IMU."""
+    views = binning.usable_views(measurements, options.binned_size)
+    if views is None:
         return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, BaselineDetails((), ()))
-    views = ((triple[0], triple[1]), (triple[1], triple[2]))
-    patches = tuple(rectify_pair(first, second, options) for first, second in views)
-    matches = tuple(None if of_pair is None else matcher(of_pair) for of_pair in patches)
+    view_pairs = ((views[0], views[1]), (views[1], views[2]))
+    patches = tuple(rectify_pair(first, second, options) for first, second in view_pairs)
+    matches = tuple(None if pair_patches is None else matcher(pair_patches) for pair_patches in patches)
     details = BaselineDetails(patches, matches)
     if None in patches:
         return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, details)
     velocities = []
-    for (first, second), of_pair, match in zip(views, patches, matches, strict=True):
-        if of_pair is None or match is None or not match.valid:
+    for (first, second), pair_patches, match in zip(view_pairs, patches, matches, strict=True):
+        if pair_patches is None or match is None or not match.valid:
             return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None, details)
         # east and north, m/s: the camera moves opposite to the ground; rows run south
-        shift_m = of_pair.gsd_m * np.array([-match.shift_px[0], match.shift_px[1]])
+        shift_m = pair_patches.gsd_m * np.array([-match.shift_px[0], match.shift_px[1]])
         velocities.append(shift_m / (second.time_s - first.time_s))
     if max(np.hypot(*velocity) for velocity in velocities) > options.max_speed_m_s + options.imu_threshold_m_s:
         return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None, details)
@@ -145,8 +145,8 @@ class PhaseCorrelationOptions:
     """Options of the phase correlation.
 
     - common: Geometry and IMU check
-    - min_response: Minimum response: the peak's energy, 1 for equal images. Images of different ground gave up to 0.12,
-      shifted ones with the flight camera's noise 0.79 and above.
+    - min_response: Minimum response: the peak's energy, 1 for equal images. Images of different ground gave up to 0.12;
+      shifted images with the flight camera's noise gave at least 0.79.
     """
 
     common: CommonOptions = DEFAULT_COMMON_OPTIONS
@@ -161,7 +161,7 @@ class PhaseCorrelationEstimator:
         self.options = PhaseCorrelationOptions() if options is None else options
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """The estimate, with `BaselineDetails`. Raises as `DimesEstimator.estimate`."""
+        """Estimate the velocity, with `BaselineDetails`. Raises as `DimesEstimator.estimate`."""
         return estimate_by_pairs(measurements, self._match, self.options.common)
 
     def _match(self, patches: PairPatches) -> PairMatch | None:

@@ -2,14 +2,14 @@
 
 The virtual camera looks straight down. Its pixels are squares of ground, `gsd_m` on a side, in the plane at the
 measured altitude; rows run south and columns east. Both views of a pair are rectified to the same virtual camera,
-assuming no horizontal motion: a patch is identified by the ground point in its middle, east and north of the camera's
-nadir point. The paper uses a homography; here each point passes through the full camera model, with a cubic spline
-between pixels.
+assuming no horizontal motion: a patch is identified by the ground point at its centre, east and north of the camera's
+nadir point. The paper uses a homography. This module projects each point with the full camera model and interpolates
+between pixels by a cubic spline.
 
-Dark current is not corrected, as in the paper. It is a ramp along the columns: over the 31 rows of a template 0.05
-counts at -34 deg C (flight) and 2.5 counts at 0 deg C (field test), below a pixel's noise of 6 and without effect on
-velocities even over terrain of 2 % contrast. At +23 deg C it is 36 counts: over terrain of 2 % contrast few tracks are
-valid and no velocity is reported; over terrain of 15 % contrast errors double to 0.07 m/s.
+Dark current is not corrected, as in the paper. It is a ramp along the columns. Over the 31 rows of a template it is
+0.05 counts at -34 deg C (flight) and 2.5 counts at 0 deg C (field test). Both are below a pixel's noise of 6 counts and
+do not affect velocities, even over terrain of 2 % contrast. At +23 deg C it is 36 counts. Then few tracks are valid
+over terrain of 2 % contrast and no velocity is reported; over terrain of 15 % contrast errors double to 0.07 m/s.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DescentMeasurements, DetectorCalibration, DetectorImage
 
 #: Range of usable heights: from the size of the airbags to above the atmosphere.
-HEIGHTS_M = (1.0, 1e6)
+HEIGHT_RANGE_M = (1.0, 1e6)
 _IMAGE_COUNT = 3
 
 
@@ -38,13 +38,13 @@ _IMAGE_COUNT = 3
 class View:
     """One binned image above its ground plane.
 
-    - signal: Counts above the offset, averaged over the pixels binned by software; not yet corrected
-    - flat_field: Relative response, binned likewise
+    - signal: Counts above the offset, averaged over the pixels binned by software; not corrected
+    - flat_field: Relative response, binned in the same way
     - camera: Camera model of the binned image in the view's ground frame: axes east, north, up; the ground is the plane
       z = 0 at the measured altitude below the body's origin, and the origin is the camera's nadir point
     - centre: The camera's position in that frame, metres: (0, 0, height)
-    - time_s: Time tag of the middle of the exposure
-    - rows_summed: Physical rows in one row of `signal`, on the chip and by software together
+    - time_s: Time tag at mid-exposure
+    - rows_summed: Physical rows in one row of `signal`, binned on the chip and by software
     """
 
     signal: Raster
@@ -69,18 +69,18 @@ def bin_factors(shape: tuple[int, int], binned_size: tuple[int, int]) -> tuple[i
     rows, columns = shape
     if columns % binned_size[0] or rows % binned_size[1]:
         binned = f"{binned_size[0]} x {binned_size[1]}"
-        raise ValueError(f"a delivered picture of {columns} x {rows} pixels does not bin to {binned}")
+        raise ValueError(f"an image of {columns} x {rows} pixels cannot be binned to {binned} pixels")
     return columns // binned_size[0], rows // binned_size[1]
 
 
 def bin_mean(image: Raster, columns: int, rows: int) -> Float[np.ndarray, "binned_rows binned_columns"]:
-    """Averages over blocks of `columns` x `rows` pixels, which divide the image."""
+    """Average blocks of `columns` x `rows` pixels, which must divide the image."""
     size = (image.shape[1] // columns, image.shape[0] // rows)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
 def place_camera(camera: CameraModel, world_from_body: Rotation, altitude_m: float) -> tuple[CameraModel, Vector3]:
-    """A body's camera in a view's ground frame by attitude and altitude, and its position there.
+    """Transform a body's camera to a view's ground frame; return it and its position.
 
     The altitude is that of the body's origin; the camera's height follows from its lever arm.
     """
@@ -94,18 +94,16 @@ def build_view(
     world_from_body: Rotation,
     altitude_m: float,
     binned_size: tuple[int, int],
-    before: View | None = None,
+    previous: View | None = None,
 ) -> View:
-    """The binned image with its camera above the ground plane; the flat field of `before` is shared if its calibration
-    is.
-    """
+    """Bin an image and place its camera above the ground; for an equal calibration use the flat field of `previous`."""
     columns, rows = bin_factors(image.counts.shape, binned_size)
     detector = image.calibration
     camera, centre = place_camera(image.camera.bin(columns, rows), world_from_body, altitude_m)
-    shared = before.flat_field if before is not None and before.calibration is detector else None
+    shared_flat_field = previous.flat_field if previous is not None and previous.calibration is detector else None
     return View(
         signal=bin_mean(image.counts.astype(np.float32), columns, rows) - np.float32(detector.offset_dn),
-        flat_field=bin_mean(detector.flat_field, columns, rows) if shared is None else shared,
+        flat_field=bin_mean(detector.flat_field, columns, rows) if shared_flat_field is None else shared_flat_field,
         camera=camera,
         centre=centre,
         time_s=image.time_s,
@@ -114,52 +112,52 @@ def build_view(
     )
 
 
-def altitudes_at_images(measurements: DescentMeasurements) -> Float[np.ndarray, "pictures"]:
-    """Measured altitudes propagated from their own time tags to those of the images, metres.
+def altitudes_at_images(measurements: DescentMeasurements) -> Float[np.ndarray, "images"]:
+    """Propagate measured altitudes from their own time tags to those of the images, metres.
 
-    The vertical velocity is inertial: that of the first and of the last interval for the first and last image, the mean
-    of both neighbours between.
+    The vertical velocity is inertial. The first and the last image use the first and the last interval; an image
+    between them uses the mean of both adjacent intervals.
     """
     vertical = measurements.interval_velocities_m_s[:, 2]
     rates = np.concatenate([vertical[:1], 0.5 * (vertical[:-1] + vertical[1:]), vertical[-1:]])
-    lags = np.array([i.time_s - a.time_s for i, a in zip(measurements.images, measurements.altitudes, strict=True)])
-    return np.asarray(np.array([a.altitude_m for a in measurements.altitudes], dtype=np.float64) + rates * lags)
+    delays_s = np.array([i.time_s - a.time_s for i, a in zip(measurements.images, measurements.altitudes, strict=True)])
+    return np.asarray(np.array([a.altitude_m for a in measurements.altitudes], dtype=np.float64) + rates * delays_s)
 
 
 def usable_views(measurements: DescentMeasurements, binned_size: tuple[int, int]) -> tuple[View, View, View] | None:
-    """The three binned images, each above its own ground plane.
+    """Build the views of the three images, each above its own ground plane.
 
-    None if altitudes or times are not finite, times do not increase, or a height is outside `HEIGHTS_M`. Raises
+    None if altitudes or times are not finite, times do not increase, or a height is outside `HEIGHT_RANGE_M`. Raises
     ValueError unless there are three images.
     """
     if len(measurements.images) != _IMAGE_COUNT:
-        raise ValueError(f"{len(measurements.images)} pictures are given; this estimator takes {_IMAGE_COUNT}")
+        raise ValueError(f"{len(measurements.images)} images are given; this estimator requires {_IMAGE_COUNT}")
     altitudes = altitudes_at_images(measurements)
     times = np.array([image.time_s for image in measurements.images])
     if not (np.all(np.isfinite(altitudes)) and np.all(np.isfinite(times)) and np.all(np.diff(times) > 0.0)):
         return None
     views: list[View] = []
     for image, attitude, altitude in zip(measurements.images, measurements.attitudes, altitudes, strict=True):
-        before = views[-1] if views else None
-        views.append(build_view(image, attitude.world_from_body, float(altitude), binned_size, before))
-    in_range = all(HEIGHTS_M[0] <= one.centre[2] <= HEIGHTS_M[1] for one in views)
+        previous = views[-1] if views else None
+        views.append(build_view(image, attitude.world_from_body, float(altitude), binned_size, previous))
+    in_range = all(HEIGHT_RANGE_M[0] <= view.centre[2] <= HEIGHT_RANGE_M[1] for view in views)
     return (views[0], views[1], views[2]) if in_range else None
 
 
 def ground_from_pixels(view: View, pixels: Points2, max_off_nadir_rad: float) -> tuple[Points2, Flags]:
-    """Intersections of the rays of pixels (u, v) with the ground: (east, north) in the ground frame, metres.
+    """Intersect the rays of pixels (u, v) with the ground: (east, north) in the ground frame, metres.
 
-    A ray further from the nadir than `max_off_nadir_rad` is bent down to that angle in its azimuth, which bounds the
-    outline of an image with a horizon; the mask is true for the other rays.
+    A ray farther from the nadir than `max_off_nadir_rad` is replaced by the ray at that angle with the same azimuth.
+    This bounds the outline of an image with a horizon. The mask is true for unchanged rays.
     """
     origins, directions = view.camera.rays(pixels)
     horizontal = np.hypot(directions[:, 0], directions[:, 1])
-    steepest = np.tan(max_off_nadir_rad)
+    max_slope = np.tan(max_off_nadir_rad)
     down = -directions[:, 2]
-    near = (down > 0.0) & (horizontal <= steepest * down)
-    slope = np.where(near, horizontal / np.where(near, down, 1.0), steepest)
+    within_limit = (down > 0.0) & (horizontal <= max_slope * down)
+    slope = np.where(within_limit, horizontal / np.where(within_limit, down, 1.0), max_slope)
     azimuths = directions[:, :2] / np.maximum(horizontal, np.finfo(np.float64).tiny)[:, None]
-    return origins[:, :2] + (origins[:, 2] * slope)[:, None] * azimuths, near
+    return origins[:, :2] + (origins[:, 2] * slope)[:, None] * azimuths, within_limit
 
 
 def pixels_from_ground(
@@ -183,41 +181,41 @@ def inside_frame(
 
 
 def pixel_angle_rad(view: View) -> float:
-    """Mean angle of one pixel along columns and rows in the middle of the image."""
-    middle = (np.array(view.size) - 1) / 2.0
-    _, directions = view.camera.rays(middle + np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]]))
+    """Mean angle of one pixel along columns and rows at the image centre."""
+    centre = (np.array(view.size) - 1) / 2.0
+    _, directions = view.camera.rays(centre + np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]]))
     return float(np.linalg.norm(directions[[1, 3]] - directions[[0, 2]], axis=1).mean())
 
 
 def square(half_m: float, per_side: int) -> Points2:
-    """A lattice of `per_side` x `per_side` points (east, north) over a square of half side `half_m`."""
+    """Lattice of `per_side` x `per_side` points (east, north) over a square of half side `half_m`."""
     steps = np.linspace(-half_m, half_m, per_side)
     east, north = np.meshgrid(steps, steps)
     return np.column_stack([east.ravel(), north.ravel()])
 
 
 def square_outline(half_m: float, per_side: int) -> Points2:
-    """The points of `square` on its outline."""
+    """Points of `square` on its outline."""
     points = square(half_m, per_side)
     return np.asarray(points[np.abs(points).max(axis=1) == half_m])
 
 
-#: Minimum response for the division.
+#: Lower limit of the flat field before division.
 MIN_RESPONSE = 0.02
 
 
 def correct_patch(view: View, rows: slice, columns: slice) -> Float[np.ndarray, "_ _"]:
-    """Part of the view without frame-transfer ramp and fall-off, counts, float64."""
-    exposed = remove_frame_transfer(view.signal[:, columns], view.calibration, view.rows_summed)
-    return np.asarray(exposed[rows] / np.maximum(view.flat_field[rows, columns], MIN_RESPONSE))
+    """Correct part of a view for the frame-transfer ramp and the flat field, counts, float64."""
+    exposure_signal = remove_frame_transfer(view.signal[:, columns], view.calibration, view.rows_summed)
+    return np.asarray(exposure_signal[rows] / np.maximum(view.flat_field[rows, columns], MIN_RESPONSE))
 
 
-#: Margin of pixels for the spline coefficients; pixels beyond change them by 1e-6.
+#: Margin around the spline's pixels; pixels outside it change the result by 1e-6.
 SPLINE_MARGIN = 10
 
 
 def ground_lattice(centre: Vector2, side_px: int, gsd_m: float) -> Float[np.ndarray, "side side 2"]:
-    """Ground points (east, north) of the pixels of a square patch about `centre`, metres."""
+    """Ground points (east, north) of the pixels of a square patch around `centre`, metres."""
     steps = (np.arange(side_px) - 0.5 * (side_px - 1)) * gsd_m
     lattice = np.empty((side_px, side_px, 2))
     lattice[..., 0] = centre[0] + steps
@@ -226,23 +224,23 @@ def ground_lattice(centre: Vector2, side_px: int, gsd_m: float) -> Float[np.ndar
 
 
 def _pixel_range(smallest: float, largest: float, size: int) -> slice:
-    """Whole pixels around values from `smallest` to `largest`, with the spline's margin, within 0 .. size."""
+    """Range of whole pixels from `smallest` to `largest` with the spline's margin, clipped to 0 .. size."""
     low, high = max(int(smallest - SPLINE_MARGIN), 0), min(int(largest + SPLINE_MARGIN + 1), size)
     return slice(min(low, size - 1), max(high, 1))
 
 
 def rectify_patch(view: View, centre: Vector2, side_px: int, gsd_m: float) -> Float[np.ndarray, "side side"]:
-    """The corrected patch of `side_px` pixels about the ground point `centre` (east, north), counts.
+    """Rectify and correct a patch of `side_px` pixels around the ground point `centre` (east, north), counts.
 
-    Points outside the image take its border value, invisible points that of the upper left corner; candidates exclude
-    both.
+    Points outside the image get its border value, invisible points that of the upper left corner; template candidates
+    exclude both.
     """
     pixels, visible = pixels_from_ground(view, ground_lattice(centre, side_px, gsd_m))
     columns, rows = view.size
-    left, right, top, bottom = kernels.hold(pixels, visible, columns, rows)
-    in_rows, in_columns = _pixel_range(top, bottom, rows), _pixel_range(left, right, columns)
-    patch = correct_patch(view, in_rows, in_columns)
+    left, right, top, bottom = kernels.clamp(pixels, visible, columns, rows)
+    row_range, column_range = _pixel_range(top, bottom, rows), _pixel_range(left, right, columns)
+    patch = correct_patch(view, row_range, column_range)
     coefficients = ndimage.spline_filter(patch, order=3, mode="mirror")
     values = np.empty((side_px, side_px))
-    kernels.sample(coefficients, pixels, in_rows.start, in_columns.start, values)
+    kernels.sample(coefficients, pixels, row_range.start, column_range.start, values)
     return values

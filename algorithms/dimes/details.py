@@ -1,4 +1,4 @@
-"""Intermediate products of DIMES, as shown in the paper's Figs. 7-9."""
+"""Intermediate products of DIMES, shown in the paper's Figs. 7-9."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from marsyard.algorithms.dimes.validity import Combination, TrackMetrics, Validi
 
 @dataclass(frozen=True)
 class Track:
-    """A template tracked from the earlier to the later image of a pair.
+    """Template tracked from the earlier to the later image of a pair.
 
     - pair, index: Pair (0: images 1 and 2; 1: images 2 and 3) and number of the template in it, best contrast first
-    - template_pixel: Middle of the template, (u, v) in the earlier binned image
-    - match_pixel: Its match, (u, v) in the later binned image; NaN if outside the camera's view
-    - ground_m: Template middle on the ground, (east, north) of the earlier nadir point; the window's middle is the
-      point at the same offset from the later nadir point.
+    - template_pixel: Template centre, (u, v) in the earlier binned image
+    - match_pixel: Matched template centre, (u, v) in the later binned image; NaN if outside the camera's view
+    - ground_m: Template centre on the ground, (east, north) of the earlier nadir point. The window's centre has the
+      same offset from the later nadir point.
     - template, window: Rectified and corrected patches, counts, north up
-    - match: Row and column in `window` of the matched template's middle
-    - surface: Correlation at every shift; its middle is zero motion
+    - match: Row and column in `window` of the matched template's centre
+    - surface: Correlation at every shift; its centre is zero motion
     - velocity_m_s: Mean velocity of the camera over the pair (east, north), also of invalid tracks
     """
 
@@ -50,8 +50,8 @@ class Track:
 class PairDetails:
     """Products of one pair of images.
 
-    - overlap_polygon: Outline (u, v) in the earlier image of the later one's footprint at zero horizontal motion
-    - zero_phase_pixels: Middle of the zero-phase spot (u, v) in both images; NaN if invisible
+    - overlap_polygon: Footprint of the later image at zero horizontal motion: outline (u, v) in the earlier image
+    - zero_phase_pixels: Centre of the zero-phase spot (u, v) in both images; NaN if invisible
     - gsd_m: Ground sample distance of rectified pixels
     - candidates: Number of feasible template positions on the coarse grid
     - tracks: All tracks, valid or not
@@ -89,7 +89,7 @@ TRACK_COLUMNS = (
     "second_peak_ratio", "valid", "velocity_east_m_s", "velocity_north_m_s", "ground_east_m", "ground_north_m",
     *(f"failed_{check.name.lower()}" for check in ValidityCheck),
 )  # fmt: skip
-#: Points along a side of the lattice for rectified figures: enough for a horizon's perspective.
+#: Points along a side of the lattice for rectified figures: sufficient for the perspective of a horizon.
 LATTICE_POINTS = 49
 #: Off-nadir limit of figures: slightly more than DIMES uses.
 FIGURE_OFF_NADIR_RAD = float(np.deg2rad(60.0))
@@ -98,9 +98,9 @@ FIGURE_OFF_NADIR_RAD = float(np.deg2rad(60.0))
 def rectified_lattice(
     pair: PairDetails,
 ) -> tuple[Float[np.ndarray, "3"], tuple[Float[np.ndarray, "n n 2"], Float[np.ndarray, "n n 2"]]]:
-    """Sampling lattice of the virtual camera's image of a pair, for Figs. 7-9.
+    """Build the sampling lattice of the virtual camera's image of a pair, for Figs. 7-9.
 
-    Returns (east and north of the first, upper left point from the nadir point, step), metres, with rows running south;
+    Returns (east, north, step), metres, with the upper left point relative to the nadir point and rows running south;
     and the pixels (u, v) of the earlier and the later image at the lattice points, NaN if invisible.
     """
     footprints = []
@@ -110,39 +110,39 @@ def rectified_lattice(
         footprints.append(ground)
     low, high = np.min(footprints, axis=(0, 1)), np.max(footprints, axis=(0, 1))
     step = float((high - low).max()) / (LATTICE_POINTS - 1)
-    middle = 0.5 * (low + high)
-    along = (np.arange(LATTICE_POINTS) - 0.5 * (LATTICE_POINTS - 1)) * step
-    ground = np.stack(np.meshgrid(middle[0] + along, middle[1] - along), axis=-1)
+    centre = 0.5 * (low + high)
+    offsets = (np.arange(LATTICE_POINTS) - 0.5 * (LATTICE_POINTS - 1)) * step
+    ground = np.stack(np.meshgrid(centre[0] + offsets, centre[1] - offsets), axis=-1)
     pixels = []
     for view in pair.views:
-        seen, visible = pixels_from_ground(view, ground)
-        pixels.append(np.where(visible[..., None], seen, np.nan))
+        view_pixels, visible = pixels_from_ground(view, ground)
+        pixels.append(np.where(visible[..., None], view_pixels, np.nan))
     return np.array([ground[0, 0, 0], ground[0, 0, 1], step]), (pixels[0], pixels[1])
 
 
 def dimes_products(details: DimesDetails) -> dict[str, Any]:
-    """The details as plain arrays, for storage and figures.
+    """Convert the details to plain arrays, for storage and figures.
 
-    Keys: `tracks` (one row a track) with `tracks_columns`; `template_<pair>_<k>`, `window_<pair>_<k>` and
-    `match_<pair>_<k>` (row, column) for every track; `overlap_<pair>` and `zero_phase_<pair>` (pixels of the earlier
-    picture, and for the spot of the later one too); `gsd_<pair>` (metres); `rectified_frame_<pair>` and
-    `rectified_<pair>_<side>` (see `rectified_lattice`; side 0 is the earlier picture); `combinations` (first, second,
+    Keys: `tracks` (one row per track) with `tracks_columns`; `template_<pair>_<k>`, `window_<pair>_<k>` and
+    `match_<pair>_<k>` (row, column) for every track; `overlap_<pair>` (pixels of the earlier image) and
+    `zero_phase_<pair>` (pixels of both images); `gsd_<pair>` (metres); `rectified_frame_<pair>` and
+    `rectified_<pair>_<side>` (see `rectified_lattice`; side 0 is the earlier image); `combinations` (first, second,
     discrepancy_m_s) with `combinations_columns`, and `chosen` (first, second; empty for none). Widths are in rectified
     pixels, contrasts per binned pixel, pixels (u, v) binned, ground in metres (see `Track`); `failed_...` are 0 or 1.
     """
     chosen = () if details.chosen is None else (details.chosen.first, details.chosen.second)
     rows = []
     for track in details.tracks:
-        m, motion = track.metrics, (*track.velocity_m_s, *track.ground_m)
+        m, vectors = track.metrics, (*track.velocity_m_s, *track.ground_m)
         metrics = (m.contrast, m.peak, m.peak_width_px, m.second_peak_ratio)
         failed = (check in track.failed for check in ValidityCheck)
-        matched = (*track.template_pixel, *track.match_pixel)
-        rows.append([track.pair, track.index, *matched, *metrics, track.valid, *motion, *failed])
-    table = [[c.first, c.second, c.discrepancy_m_s] for c in details.combinations]
+        pixel_values = (*track.template_pixel, *track.match_pixel)
+        rows.append([track.pair, track.index, *pixel_values, *metrics, track.valid, *vectors, *failed])
+    combination_rows = [[c.first, c.second, c.discrepancy_m_s] for c in details.combinations]
     products: dict[str, Any] = {
         "tracks": np.array(rows, dtype=np.float64).reshape(-1, len(TRACK_COLUMNS)),
         "tracks_columns": list(TRACK_COLUMNS),
-        "combinations": np.array(table, dtype=np.float64).reshape(-1, 3),
+        "combinations": np.array(combination_rows, dtype=np.float64).reshape(-1, 3),
         "combinations_columns": ["first", "second", "discrepancy_m_s"],
         "chosen": np.array(chosen, dtype=np.float64),
     }

@@ -26,21 +26,21 @@ def match_corner(
     peak: Peak,
     options: DimesOptions,
 ) -> Vector2:
-    """Row and column in the window of the matched template's upper left pixel, refined as the options require."""
+    """Row and column in the window of the matched template's upper left pixel, refined according to the options."""
     integer_peak = np.array([peak.row, peak.column], dtype=np.float64)
     if not options.subpixel:
         return integer_peak
     start = integer_peak + biquadratic_offset(surface, peak)
-    aligned = refine_shift(template, window, start) if options.align and not peak.on_border else None
-    return start if aligned is None else aligned
+    refined_corner = refine_shift(template, window, start) if options.align and not peak.on_border else None
+    return start if refined_corner is None else refined_corner
 
 
 def camera_displacement(corner: Vector2, geometry: overlap.SearchGeometry) -> Vector2:
     """Horizontal displacement (east, north) of the camera between the images, metres.
 
-    A ground point at r1 from the first nadir point and r2 from the second means a displacement of r1 - r2. The
-    template's middle is r1, the window's middle the same offset: r2 - r1 is the shift from the window's middle times
-    the ground sample distance, with rows running south.
+    A ground point at r1 from the first nadir point and at r2 from the second gives a displacement of r1 - r2. The
+    centres of template and window have the same offset r1. Therefore r2 - r1 is the shift from the window's centre
+    times the ground sample distance, with rows running south.
     """
     shift = corner - geometry.search_px
     return np.asarray(geometry.gsd_m * np.array([-shift[1], shift[0]]))
@@ -50,9 +50,9 @@ def track_pair(pair: int, first: View, second: View, sun_direction: Vector3, opt
     """Select and track the templates of one pair of views."""
     geometry = overlap.search_geometry(first, second, options)
     candidates = overlap.template_candidates(first, second, geometry, sun_direction, options)
-    chosen, contrasts = overlap.select_templates(first, candidates, options)
+    selection, contrasts = overlap.select_templates(first, candidates, options)
     tracks = []
-    for index, (candidate, contrast) in enumerate(zip(chosen, contrasts, strict=True)):
+    for index, (candidate, contrast) in enumerate(zip(selection, contrasts, strict=True)):
         ground = candidates.ground[candidate]
         template = rectify_patch(first, ground, geometry.template_px, geometry.gsd_m)
         window = rectify_patch(second, ground, geometry.window_px, geometry.gsd_m)
@@ -91,35 +91,35 @@ def track_pair(pair: int, first: View, second: View, sun_direction: Vector3, opt
 class DimesEstimator:
     """The Descent Image Motion Estimation System of the Mars Exploration Rovers.
 
-    Two templates are tracked in each pair of consecutive images. The reported velocity is that of the second-pair track
-    in the combination of tracks whose velocity change agrees best with the IMU, if within the threshold. The ground is
-    modelled as level planes, at each image's own altitude. Only changes of the inertial velocity are used, and its
-    vertical part to propagate altitudes to the images.
+    Two templates are tracked in each pair of consecutive images. The combination of tracks whose velocity change agrees
+    best with the IMU is selected; its second-pair track gives the velocity if the discrepancy is below the threshold.
+    The ground is modelled as a level plane at each image's altitude. From the inertial velocity only its changes are
+    used, and its vertical component to propagate altitudes to the images.
     """
 
     def __init__(self, options: DimesOptions | None = None) -> None:
         self.options = DimesOptions() if options is None else options
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """The estimate, with `DimesDetails`.
+        """Estimate the velocity, with `DimesDetails`.
 
-        Raises ValueError if the image size does not bin to the size in the options, or for an impossible calibration;
-        never for image content or measurements.
+        Raises ValueError if the images cannot be binned to the size in the options, or for an impossible calibration;
+        never because of image content or measured values.
         """
-        triple = usable_views(measurements, self.options.binned_size)
-        if triple is None:
+        views = usable_views(measurements, self.options.binned_size)
+        if views is None:
             return VelocityEstimate(VelocityOutcome.NO_TEMPLATE_AREA, None, DimesDetails((), (), None))
-        first, second, third = triple
+        first, second, third = views
         sun = measurements.sun_direction
         pairs = (track_pair(0, first, second, sun, self.options), track_pair(1, second, third, sun, self.options))
-        return conclude(pairs, measurements.interval_velocities_m_s, self.options.imu_threshold_m_s)
+        return combine_pairs(pairs, measurements.interval_velocities_m_s, self.options.imu_threshold_m_s)
 
 
-def conclude(
+def combine_pairs(
     pairs: tuple[PairDetails, PairDetails], interval_velocities_m_s: Float[np.ndarray, "2 3"], imu_threshold_m_s: float
 ) -> VelocityEstimate:
-    """Combine the tracks of both pairs with the IMU."""
-    first, second = ([(one.index, one.velocity_m_s) for one in pair.tracks if one.valid] for pair in pairs)
+    """Select the combination of tracks that agrees best with the IMU, and report its velocity or a failure."""
+    first, second = ([(track.index, track.velocity_m_s) for track in pair.tracks if track.valid] for pair in pairs)
     candidates = combinations(first, second, interval_velocities_m_s)
     if candidates and candidates[0].discrepancy_m_s < imu_threshold_m_s:
         velocity = pairs[1].tracks[candidates[0].second].velocity_m_s

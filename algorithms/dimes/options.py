@@ -11,44 +11,44 @@ import numpy as np
 class DimesOptions:
     """Options of the DIMES estimator (paper: section II of 'Field Testing of the MER DIMES').
 
-    - binned_size: Columns and rows of the picture that DIMES works on (paper: 256 x 256)
-    - max_speed_m_s: Largest horizontal speed expected (paper: 30 m/s); with the time between pictures it sets the
-      search range
+    - binned_size: Columns and rows of the binned image (paper: 256 x 256)
+    - max_speed_m_s: Largest horizontal speed expected (paper: 30 m/s); multiplied by the time between images it gives
+      the search range
     - search_margin_px: Additional search range on each side: attitude and altitude errors shift the match too (0.3 deg
       between two images is 9 m, 1.6 px, at 1700 m), and a peak must not lie on the border
     - template_px: Side of the rectified template, odd. 31 px is 172 m at 1700 m.
-    - max_off_nadir_rad: Off-nadir limit of used ground: at 55 deg a pixel covers three times the ground along the line
-      of sight that it covers at the nadir, and an altitude error shifts the ground by 1.4 times itself.
+    - max_off_nadir_rad: Largest off-nadir angle of used ground. At 55 deg a pixel covers three times as much ground
+      along the line of sight as at the nadir, and an altitude error shifts the ground by 1.4 times the error.
     - border_px: Distance of templates and windows from the image border, binned pixels, for spline interpolation and
       the lens distortion of a window's sides.
     - zero_phase_radius_rad: Angle from the anti-solar point within which the ground is masked. The opposition surge of
-      soils has a half width of a few degrees, the shadow of lander and parachute is under 1 deg; beyond 4 deg the surge
-      is smooth over a template, and removing the local mean removes most of it.
-    - grid_step_px: Step of the coarse grid of candidate templates, binned pixels of the first picture: a quarter of a
+      soils has a half width of a few degrees; the shadow of lander and parachute is smaller than 1 deg. Outside 4 deg
+      the surge is smooth over a template, and subtracting the local mean removes most of it.
+    - grid_step_px: Spacing of the coarse grid of candidate templates, binned pixels of the first image: a quarter of a
       template
-    - templates_per_pair: Templates selected in each pair of pictures (paper: 2)
-    - exclusion_px: Minimum distance (in column or row, binned pixels) of the second template's centre from the first's:
-      the two share no ground and fail independently.
-    - subpixel: Whether the correlation peak is refined below a pixel (not stated for DIMES in the paper)
-    - align: Whether Gauss-Newton alignment follows, which removes the biquadratic fit's bias towards whole pixels
+    - templates_per_pair: Templates selected in each pair of images (paper: 2)
+    - exclusion_px: Minimum distance (in column or row, binned pixels) between template centres: the templates do not
+      overlap and fail independently.
+    - subpixel: Whether the correlation peak is refined to sub-pixel accuracy (not specified for DIMES in the paper)
+    - align: Whether Gauss-Newton alignment follows; it removes the biquadratic fit's bias towards whole pixels
     - min_contrast: Minimum Harris interest of a template divided by its mean signal, per binned pixel. Noise alone, at
       the flight camera's signal-to-noise ratio of 102, gives 0.0022 to 0.0029.
-    - min_peak: Minimum correlation at the peak. Over random terrains of 0.2 to 15 % contrast with that noise, wrong
-      matches peaked below 0.28 on terrain with detail and at up to 0.64 on terrain without, where the second peak
-      rejects them (0.83 or more); correct ones at 0.45 and above are accurate to about 0.5 m/s rms (3 m/s on terrain
-      without detail).
+    - min_peak: Minimum correlation at the peak, from random terrains of 0.2 to 15 % contrast with that noise. On
+      terrain with detail, wrong matches had peaks below 0.28. On terrain without detail they had up to 0.64; the
+      second-peak check rejects those (0.83 or more). Correct matches of at least 0.45 are accurate to about 0.5 m/s rms
+      (3 m/s on terrain without detail).
     - max_peak_width_px: Largest full width of the peak at three quarters of its height, rectified pixels. At the lowest
-      accepted peak, tracks of this width have errors of about 2.5 m/s rms, half of the requirement; single straight
-      edges are wider.
-    - max_second_peak_ratio: Largest ratio of the second highest local maximum to the peak. Of correct matches 98 % stay
-      below 0.8 on terrain with detail; wrong ones with an accepted peak had 0.83 or more; a repetitive terrain has
+      accepted peak, tracks of this width have errors of about 2.5 m/s rms, half of the requirement. Single straight
+      edges have wider peaks.
+    - max_second_peak_ratio: Largest ratio of the second-highest local maximum to the peak. On terrain with detail 98 %
+      of correct matches are below 0.8. Wrong matches with an accepted peak had 0.83 or more; repetitive terrain has
       nearly 1.
     - second_peak_exclusion_px: Local maxima within this distance of the peak belong to it. 3 px are 16.7 m at 1700 m,
-      4.4 m/s: confusion with a maximum so near stays within the requirement of 5 m/s.
+      4.4 m/s: an error of this size is within the requirement of 5 m/s.
     - imu_threshold_m_s: Largest horizontal discrepancy between the velocity change of a combination of tracks and that
-      of the IMU. By Monte Carlo (`benchmarks.threshold_derivation`, stored in `imu_threshold.json`; see
-      `docs/adr/0008-threshold-of-the-imu-check.md`): 99.5 % of descents with one correct track in each pair, with
-      errors as specified, agree better.
+      of the IMU. Derived by Monte Carlo (`benchmarks.threshold_derivation`, stored in `imu_threshold.json`; see
+      `docs/adr/0008-threshold-of-the-imu-check.md`): the discrepancy is smaller in 99.5 % of descents with one correct
+      track in each pair and errors as specified.
     """
 
     binned_size: tuple[int, int] = (256, 256)

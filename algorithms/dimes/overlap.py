@@ -1,4 +1,4 @@
-"""Template candidates in the overlap region of two views, and the selection among them (section II.A)."""
+"""Template candidates in the overlap region of two views, and their selection (section II.A)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from marsyard.algorithms.arrays import Flags, Points2, Values, Vector2, Vector3
+from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector2, Vector3
 from marsyard.algorithms.dimes import binning
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.image.interest import harris_interest, local_mean, structure_tensor
@@ -15,7 +15,7 @@ from marsyard.algorithms.image.interest import harris_interest, local_mean, stru
 
 @dataclass(frozen=True)
 class SearchGeometry:
-    """Sizes of template and search window of a pair, in the virtual camera that looks straight down.
+    """Sizes of template and search window of a pair in the virtual nadir camera.
 
     - gsd_m: Ground sample distance: one binned pixel of the second view at its nadir
     - template_px: Side of the template
@@ -43,23 +43,24 @@ class SearchGeometry:
 
 
 def search_geometry(first: binning.View, second: binning.View, options: DimesOptions) -> SearchGeometry:
-    """Sizes from the second view's height, pixel angle, image interval and largest speed."""
+    """Compute the sizes from the second view's height and pixel angle, the image interval and the largest speed."""
     gsd = float(second.centre[2]) * binning.pixel_angle_rad(second)
-    reach_m = options.max_speed_m_s * (second.time_s - first.time_s)
-    return SearchGeometry(gsd, options.template_px, int(np.ceil(reach_m / gsd)) + options.search_margin_px)
+    max_displacement_m = options.max_speed_m_s * (second.time_s - first.time_s)
+    return SearchGeometry(gsd, options.template_px, int(np.ceil(max_displacement_m / gsd)) + options.search_margin_px)
 
 
 def border_pixels(size: tuple[int, int], per_side: int = 8) -> Points2:
     """Pixels along the border of an image of `size` (columns, rows), in order."""
     steps, zeros, ones = np.arange(per_side) / per_side, np.zeros(per_side), np.ones(per_side)
-    along = np.concatenate([steps, ones, 1.0 - steps, zeros])
-    down = np.concatenate([zeros, steps, ones, 1.0 - steps])
-    return np.column_stack([along * (size[0] - 1.0), down * (size[1] - 1.0)])
+    column_fractions = np.concatenate([steps, ones, 1.0 - steps, zeros])
+    row_fractions = np.concatenate([zeros, steps, ones, 1.0 - steps])
+    return np.column_stack([column_fractions * (size[0] - 1.0), row_fractions * (size[1] - 1.0)])
 
 
 def overlap_polygon(first: binning.View, second: binning.View, options: DimesOptions) -> Points2:
-    """The second view's border in the first view at zero horizontal motion: pixels (u, v) in order; invisible ones
-    omitted.
+    """Project the second view's border into the first view at zero horizontal motion.
+
+    Returns pixels (u, v) in order; invisible ones are omitted.
     """
     ground, _ = binning.ground_from_pixels(second, border_pixels(second.size), options.max_off_nadir_rad)
     pixels, visible = binning.pixels_from_ground(first, ground)
@@ -67,19 +68,19 @@ def overlap_polygon(first: binning.View, second: binning.View, options: DimesOpt
 
 
 def grid_pixels(size: tuple[int, int], step: int) -> Points2:
-    """The coarse grid of candidate pixels (u, v), centred in an image of `size` (columns, rows), row by row."""
+    """Coarse grid of candidate pixels (u, v), centred in an image of `size` (columns, rows), row by row."""
     u, v = (np.arange((n - 1) % step // 2, n, step, dtype=np.float64) for n in size)
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
 def anti_solar_direction(sun_direction: Vector3) -> Vector3:
-    """Unit vector from the lander to the middle of the zero-phase spot, world axes."""
+    """Unit vector from the lander to the centre of the zero-phase spot, world axes."""
     length = float(np.linalg.norm(sun_direction))
     return -np.asarray(sun_direction, dtype=np.float64) / (length if length > 0.0 else 1.0)
 
 
 def zero_phase_pixel(view: binning.View, sun_direction: Vector3) -> Vector2:
-    """Pixel (u, v) of the middle of the zero-phase spot, in or out of frame; NaN if the camera cannot image it."""
+    """Pixel (u, v) of the centre of the zero-phase spot, in or out of frame; NaN if the camera cannot image it."""
     pixels, visible = view.camera.project((view.centre + 1e7 * anti_solar_direction(sun_direction))[None, :])
     return np.asarray(pixels[0]) if visible[0] else np.full(2, np.nan)
 
@@ -87,20 +88,20 @@ def zero_phase_pixel(view: binning.View, sun_direction: Vector3) -> Vector2:
 def outside_zero_phase(
     view: binning.View, ground: Float[np.ndarray, "*shape 2"], sun_direction: Vector3, radius_rad: float
 ) -> Bool[np.ndarray, "*shape"]:
-    """Whether ground points (east, north) are further than `radius_rad` from the anti-solar direction."""
+    """Whether ground points (east, north) are farther than `radius_rad` from the anti-solar direction."""
     spot = anti_solar_direction(sun_direction)
     east, north, height = ground[..., 0], ground[..., 1], view.centre[2]
     ranges = np.sqrt(east**2 + north**2 + height**2)
-    along = east * spot[0] + north * spot[1] - height * spot[2]
-    return np.asarray(along < np.cos(radius_rad) * ranges)
+    dot_products = east * spot[0] + north * spot[1] - height * spot[2]
+    return np.asarray(dot_products < np.cos(radius_rad) * ranges)
 
 
 @dataclass(frozen=True)
 class Candidates:
     """Feasible template positions: pixels (u, v) of the first view, ground points, and preference.
 
-    Template and search window are feasible at each, and the template is clear of the zero-phase spot at zero motion.
-    The whole search window of a preferred candidate is clear of it.
+    The template fits the first view and its search window the second. At zero motion the template does not overlap the
+    zero-phase spot. The whole search window of a preferred candidate does not overlap the spot.
     """
 
     pixels: Points2
@@ -111,34 +112,34 @@ class Candidates:
 def template_candidates(
     first: binning.View, second: binning.View, geometry: SearchGeometry, sun_direction: Vector3, options: DimesOptions
 ) -> Candidates:
-    """All feasible template positions on the coarse grid."""
+    """Find all feasible template positions on the coarse grid."""
     limit = options.max_off_nadir_rad
     pixels = grid_pixels(first.size, options.grid_step_px)
     ground, visible = binning.ground_from_pixels(first, pixels, limit)
     pixels, ground = pixels[visible], ground[visible]
-    for view, half in ((second, 0.0), (first, geometry.template_half_m), (second, geometry.window_half_m)):
-        outline = binning.square_outline(half, 3) if half > 0.0 else np.zeros((1, 2))
-        room = binning.inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1)
-        pixels, ground = pixels[room], ground[room]
+    for view, half_m in ((second, 0.0), (first, geometry.template_half_m), (second, geometry.window_half_m)):
+        outline = binning.square_outline(half_m, 3) if half_m > 0.0 else np.zeros((1, 2))
+        feasible = binning.inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1)
+        pixels, ground = pixels[feasible], ground[feasible]
 
-    def dark(view: binning.View, half_m: float, per_side: int) -> Flags:
+    def is_outside_spot(view: binning.View, half_m: float, per_side: int) -> Flags:
         points = ground[:, None] + binning.square(half_m, per_side)
         outside = outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
         return np.asarray(outside.all(axis=1))
 
-    clear = dark(first, geometry.template_half_m, 4) & dark(second, geometry.template_half_m, 4)
-    preferred = dark(second, geometry.window_half_m, 7)
-    return Candidates(pixels[clear], ground[clear], preferred[clear])
+    valid = is_outside_spot(first, geometry.template_half_m, 4) & is_outside_spot(second, geometry.template_half_m, 4)
+    preferred = is_outside_spot(second, geometry.window_half_m, 7)
+    return Candidates(pixels[valid], ground[valid], preferred[valid])
 
 
-#: Minimum mean signal that divides the interest, as a fraction of the full scale.
+#: Lower limit of the mean signal before division, as a fraction of the full scale.
 DARK_FRACTION = 0.01
 
 
-def contrasts(view: binning.View, pixels: Points2, support: int) -> Values:
-    """Harris interest over squares of `support` pixels about whole pixels (u, v), divided by the mean signal there.
+def contrasts(view: binning.View, pixels: Points2, support: int) -> Vector:
+    """Harris interest over squares of `support` pixels around whole pixels (u, v), divided by their mean signal.
 
-    Computed on the delivered image: the frame-transfer ramp is smooth along columns and hardly changes the interest.
+    Computed from the uncorrected image: the frame-transfer ramp is smooth along columns; its effect is negligible.
     """
     columns, rows = np.rint(pixels).astype(int).T
     uu, vv, uv = (part[rows, columns] for part in structure_tensor(view.signal, support))
@@ -146,25 +147,25 @@ def contrasts(view: binning.View, pixels: Points2, support: int) -> Values:
     return np.asarray(harris_interest(uu, vv, uv) / np.maximum(mean, DARK_FRACTION * view.calibration.full_scale_dn))
 
 
-def best_candidates(contrasts: Values, pixels: Points2, preferred: Flags, count: int, exclusion_px: float) -> list[int]:
+def best_candidates(contrasts: Vector, pixels: Points2, preferred: Flags, count: int, exclusion_px: float) -> list[int]:
     """Indices of up to `count` candidates by decreasing contrast, preferred ones first.
 
-    Each choice excludes the candidates closer than `exclusion_px` in both column and row.
+    Each selected candidate excludes those closer than `exclusion_px` in both column and row.
     """
-    left = np.ones(len(contrasts), dtype=bool)
-    chosen: list[int] = []
-    while len(chosen) < count and left.any():
-        pool = left & preferred if np.any(left & preferred) else left
-        best = int(np.argmax(np.where(pool, contrasts, -np.inf)))
-        chosen.append(best)
-        left &= np.abs(pixels - pixels[best]).max(axis=1) >= exclusion_px
-    return chosen
+    available = np.ones(len(contrasts), dtype=bool)
+    indices: list[int] = []
+    while len(indices) < count and available.any():
+        eligible = available & preferred if np.any(available & preferred) else available
+        best = int(np.argmax(np.where(eligible, contrasts, -np.inf)))
+        indices.append(best)
+        available &= np.abs(pixels - pixels[best]).max(axis=1) >= exclusion_px
+    return indices
 
 
 def select_templates(
     view: binning.View, candidates: Candidates, options: DimesOptions
 ) -> tuple[list[int], Float[np.ndarray, "k"]]:
     """Indices of the selected candidates, best first, and their contrasts."""
-    found, pixels = contrasts(view, candidates.pixels, options.template_px), candidates.pixels
-    chosen = best_candidates(found, pixels, candidates.preferred, options.templates_per_pair, options.exclusion_px)
-    return chosen, found[chosen]
+    values, pixels = contrasts(view, candidates.pixels, options.template_px), candidates.pixels
+    indices = best_candidates(values, pixels, candidates.preferred, options.templates_per_pair, options.exclusion_px)
+    return indices, values[indices]

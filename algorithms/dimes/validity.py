@@ -1,4 +1,4 @@
-"""Checks of a track: the four validity metrics (section II.A) and the agreement with the IMU (section II.B)."""
+"""Checks of tracks: the four validity metrics (section II.A) and the agreement with the IMU (section II.B)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ValidityCheck(Enum):
     CONTRAST = "too little contrast in the template"
     PEAK_HEIGHT = "correlation peak too low"
     PEAK_WIDTH = "correlation peak too wide"
-    SECOND_PEAK = "second peak too near to the first in height"
+    SECOND_PEAK = "second peak almost as high as the first"
     SEARCH_BORDER = "correlation highest on the border of the search range"
 
 
@@ -31,8 +31,8 @@ class TrackMetrics:
 
     - contrast: Harris interest of the template divided by its mean signal, per binned pixel
     - peak: Height of the correlation peak, at most 1
-    - peak_width_px: Its full width at three quarters of its height along its longest direction, rectified pixels
-    - second_peak_ratio: Second highest local maximum over the peak; 1 without a positive peak
+    - peak_width_px: Full width at three quarters of its height along its longest direction, rectified pixels
+    - second_peak_ratio: Second-highest local maximum divided by the peak; 1 without a positive peak
     - on_border: Whether the highest correlation lies on the border of the search range
     """
 
@@ -44,7 +44,7 @@ class TrackMetrics:
 
 
 def track_metrics(contrast: float, surface: Raster, peak: Peak, options: DimesOptions) -> TrackMetrics:
-    """The metrics of a correlation surface and its template's contrast."""
+    """Compute the metrics from a correlation surface and its template's contrast."""
     second = second_peak(surface, peak, options.second_peak_exclusion_px)
     return TrackMetrics(
         contrast=contrast,
@@ -56,7 +56,7 @@ def track_metrics(contrast: float, surface: Raster, peak: Peak, options: DimesOp
 
 
 def failed_checks(metrics: TrackMetrics, options: DimesOptions) -> tuple[ValidityCheck, ...]:
-    """The failed checks, none for a valid track."""
+    """Return the failed checks; empty for a valid track."""
     failures = {
         ValidityCheck.CONTRAST: not metrics.contrast >= options.min_contrast,
         ValidityCheck.PEAK_HEIGHT: not metrics.peak >= options.min_peak,
@@ -74,7 +74,7 @@ Horizontal = Vector2
 class Combination:
     """Indices of a first-pair and a second-pair track, and their discrepancy from the IMU.
 
-    The discrepancy is the length of the horizontal velocity change less the change measured by the IMU.
+    The discrepancy is the length of the horizontal velocity change minus the change measured by the IMU.
     """
 
     first: int
@@ -96,9 +96,9 @@ def combinations(
 def propagate_velocity(
     velocity_m_s: Horizontal, inertial_then_m_s: Horizontal, inertial_now_m_s: Horizontal
 ) -> Vector2:
-    """Propagate a velocity by the inertial unit, for example to thruster firing near 100 m (section I), m/s.
+    """Propagate a velocity by the IMU, for example to thruster firing near 100 m (section I), m/s.
 
-    `inertial_then_m_s` is the inertial mean velocity over the second pair's interval. The unknown error common to both
-    inertial velocities cancels.
+    `inertial_then_m_s` is the mean inertial velocity over the second pair's interval, `inertial_now_m_s` the present
+    one. An unknown error common to both cancels.
     """
     return np.asarray(velocity_m_s + (inertial_now_m_s - inertial_then_m_s))

@@ -1,4 +1,4 @@
-"""Algorithms that are programs of their own: cases as files, answers as JSON (docs/custom-algorithms.md)."""
+"""External executables as algorithms: cases as files, answers as JSON (docs/custom-algorithms.md)."""
 
 from marsyard.algorithms.exchange.executable import (
     ExecutableSiteEstimator,
@@ -7,8 +7,8 @@ from marsyard.algorithms.exchange.executable import (
     ExecutableVelocityStream,
 )
 from marsyard.algorithms.exchange.files import (
-    EXCHANGE,
-    Pictures,
+    FORMAT_VERSION,
+    ImageFormat,
     read_case,
     read_frame,
     read_mast,
@@ -21,7 +21,7 @@ from marsyard.algorithms.exchange.files import (
 from marsyard.algorithms.exchange.process import PREFIXES, Command, ExecutableLimits, parse_command
 from marsyard.algorithms.exchange.serving import ProgramDetails
 
-__all__ = ["EXCHANGE", "PREFIXES", "Command", "ExecutableLimits", "ExecutableSiteEstimator", "ExecutableTargetTracker"]
-__all__ += ["ExecutableVelocityEstimator", "ExecutableVelocityStream", "Pictures", "ProgramDetails", "parse_command"]
-__all__ += ["read_case", "read_frame", "read_mast", "read_pose", "read_stop", "read_target", "write_case"]
-__all__ += ["write_frame"]
+__all__ = ["FORMAT_VERSION", "PREFIXES", "Command", "ExecutableLimits", "ExecutableSiteEstimator"]
+__all__ += ["ExecutableTargetTracker", "ExecutableVelocityEstimator", "ExecutableVelocityStream", "ImageFormat"]
+__all__ += ["ProgramDetails", "parse_command", "read_case", "read_frame", "read_mast", "read_pose", "read_stop"]
+__all__ += ["read_target", "write_case", "write_frame"]

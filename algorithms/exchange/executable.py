@@ -1,4 +1,4 @@
-"""Algorithms that are programs: measurements as files, answers as JSON."""
+"""External executables as algorithms: measurements are written to files, answers are read as JSON."""
 
 from __future__ import annotations
 
@@ -32,21 +32,20 @@ from marsyard.sim.measurements import (
 
 @dataclass(frozen=True)
 class ExecutableVelocityEstimator:
-    """A program as velocity estimator; `estimate` raises AlgorithmError if the program fails to answer."""
+    """Velocity estimator that runs an external program; `estimate` raises AlgorithmError if the program fails."""
 
     command: Command
     limits: ExecutableLimits
 
     def estimate(self, measurements: DescentMeasurements) -> interface.VelocityEstimate:
-        """The program's answer."""
+        """Write the measurements, run the program and return its estimate."""
         return ask_case(self.command, self.limits, measurements, _read_velocity)
 
 
 class ExecutableVelocityStream:
-    """A program as velocity stream, one JSON line per call (docs/custom-algorithms.md).
+    """Velocity stream that runs an external program, one JSON line per call (docs/custom-algorithms.md).
 
-    Methods raise AlgorithmError if the program fails to answer. A `serve-stream:` program may have answered earlier
-    descents.
+    Methods raise AlgorithmError if the program fails. A `serve-stream:` program may have processed earlier descents.
     """
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
@@ -57,17 +56,18 @@ class ExecutableVelocityStream:
         """Start a new descent."""
         self._details = ProgramDetails("", 0.0)
         if self._session.ask("start", {}, self._read_answer) is not None:
-            raise bad_answer("start is answered with an outcome; allowed: null, before the first picture")
+            raise bad_answer("the answer to 'start' has an outcome; before the first image it must be null")
 
     def picture(self, frame: DescentFrame) -> interface.VelocityEstimate | None:
-        """The program's answer to one more image."""
+        """Send the next image and return the program's estimate, or None."""
         return self._session.ask("picture", {}, self._read_answer, {"frame": lambda folder: write_frame(folder, frame)})
 
     def finish(self) -> interface.VelocityEstimate:
-        """The program's final answer; its details sum its output and time over the descent."""
+        """Return the program's final estimate; its details contain the output and the time of the whole descent."""
         answer = self._session.ask("finish", {}, self._read_answer)
         if answer is None:
-            raise bad_answer("finish is answered with the outcome null; allowed: one of the outcomes")
+            allowed = ", ".join(interface.VelocityOutcome.__members__)
+            raise bad_answer(f"the answer to 'finish' has the outcome null; allowed: {allowed}")
         return answer
 
     def _read_answer(self, answer: Mapping[str, Any], details: ProgramDetails) -> interface.VelocityEstimate | None:
@@ -82,33 +82,33 @@ class ExecutableVelocityStream:
 
 @dataclass(frozen=True)
 class ExecutableSiteEstimator:
-    """A program as landing site estimator; `estimate` raises AlgorithmError if the program fails to answer."""
+    """Landing site estimator that runs an external program; `estimate` raises AlgorithmError if the program fails."""
 
     command: Command
     limits: ExecutableLimits
 
     def estimate(self, measurements: LandingMeasurements) -> interface.SiteEstimate:
-        """The program's answer."""
+        """Write the measurements, run the program and return its estimate."""
         return ask_case(self.command, self.limits, measurements, _read_site)
 
 
 class ExecutableTargetTracker:
-    """A program as target tracker (docs/custom-algorithms.md).
+    """Target tracker that runs an external program (docs/custom-algorithms.md).
 
-    Methods raise AlgorithmError if the program fails to answer. An `exec:` program ends with this tracker. A `serve:`
-    program may have tracked earlier targets; a designation resets it.
+    Methods raise AlgorithmError if the program fails. An `exec:` program ends with this tracker. A `serve:` program may
+    have tracked earlier targets; a designation resets it.
     """
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
         self._state = interface.TrackingState.NO_TARGET
         self._session = Session(command, limits)
         self._mast: MastCalibration | None = None
-        self._masts = 0
+        self._mast_count = 0
         self._folder = self._session.folder
 
     @property
     def state(self) -> interface.TrackingState:
-        """State of the tracker by its last answer."""
+        """State of the tracker according to its last answer."""
         return self._state
 
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
@@ -117,12 +117,12 @@ class ExecutableTargetTracker:
         self._state = self._session.ask("designate", values, _read_state)
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> interface.MastAim | None:
-        """The requested mast angles and image parts."""
+        """Request the mast angles and the image regions of interest."""
         values = {"world_from_rover": encode_pose(world_from_rover), "mast": self._write_mast(mast)}
         return self._session.ask("aim", values, lambda answer, _: check_aim(_read_aim(answer), mast))
 
     def update(self, measurements: RoverMeasurements) -> interface.TargetUpdate:
-        """The program's answer to the images of a stop."""
+        """Send the images of a rover stop and return the program's answer."""
         values = {"mast": self._write_mast(measurements.mast)}
         files = {"stop": lambda folder: write_stop(folder, measurements)}
         update = self._session.ask("update", values, _read_update, files)
@@ -134,10 +134,10 @@ class ExecutableTargetTracker:
         self._state = self._session.ask("clear", {}, _read_state)
 
     def _write_mast(self, mast: MastCalibration) -> str:
-        """The folder of the mast's files; written again for a new mast only."""
+        """Write the mast's files if the mast changed; return their folder."""
         if mast is not self._mast:
-            self._mast, self._masts = mast, self._masts + 1
-            self._folder = self._session.folder / f"mast_{self._masts}"
+            self._mast, self._mast_count = mast, self._mast_count + 1
+            self._folder = self._session.folder / f"mast_{self._mast_count}"
             self._folder.mkdir()
             write_mast(self._folder, mast)
         return str(self._folder)
@@ -176,7 +176,7 @@ def _read_aim(answer: Mapping[str, Any]) -> interface.MastAim | None:
         raise bad_answer(f"aim is {aim!r}; allowed: null, or a table of azimuth_rad, elevation_rad, left, right")
     angles = [read_numbers(aim, name, ()) for name in ("azimuth_rad", "elevation_rad")]
     if angles[0] is None or angles[1] is None:
-        raise bad_answer("aim lacks an angle; expected azimuth_rad and elevation_rad")
+        raise bad_answer("an angle of aim is missing; expected azimuth_rad and elevation_rad")
     return interface.MastAim(float(angles[0]), float(angles[1]), _read_box(aim, "left"), _read_box(aim, "right"))
 
 
@@ -195,5 +195,5 @@ def _read_update(answer: Mapping[str, Any], details: ProgramDetails) -> interfac
         raise bad_answer(f"losses is {losses!r}; allowed: a list of {', '.join(interface.TargetLoss.__members__)}")
     position = read_numbers(answer, "position_rover", (3,))
     state = read_member("state", answer.get("state"), interface.TrackingState)
-    named = tuple(read_member("a loss", one, interface.TargetLoss) for one in losses)
-    return check_update(interface.TargetUpdate(state, named, position, details))
+    decoded_losses = tuple(read_member("a loss", loss, interface.TargetLoss) for loss in losses)
+    return check_update(interface.TargetUpdate(state, decoded_losses, position, details))

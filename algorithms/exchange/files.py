@@ -1,7 +1,7 @@
-"""Cases, frames and rover stops as files: images as 16-bit PGM or PNG, cameras as `.cahvor`, all else as JSON.
+"""Cases, frames and rover stops as files: images as 16-bit PGM or PNG, cameras as `.cahvor`, all other data as JSON.
 
-Reading restores counts, flat fields and numbers bit for bit (JSON holds the shortest text of the same float64), and
-attitudes to within rounding of a quaternion's norm.
+Reading restores counts, flat fields and numbers exactly (JSON stores the shortest text of the same float64), and
+attitudes except for rounding of the quaternion's norm.
 """
 
 from __future__ import annotations
@@ -40,30 +40,30 @@ from marsyard.sim.measurements import (
     TargetDesignation,
 )
 
-#: Version of the files of a case.
-EXCHANGE = 1
-#: Versions of answers and of request lines; from 2 on each request has an `id`, which its answer repeats.
+#: Version of the exchange file format.
+FORMAT_VERSION = 1
+#: Supported versions of answers and request lines; from version 2 each request has an `id`, repeated in its answer.
 ANSWER_VERSIONS = (1, 2)
 
 CASE_FILE, FRAME_FILE = "case.json", "frame.json"
 
 #: Calibration fields of a detector, without its flat field.
-_CALIBRATION = tuple(one.name for one in fields(DetectorCalibration) if one.name != "flat_field")
+_CALIBRATION_KEYS = tuple(field.name for field in fields(DetectorCalibration) if field.name != "flat_field")
 
-#: Form in which pictures are written.
-Pictures = Literal["pgm", "png"]
+#: Image file format.
+ImageFormat = Literal["pgm", "png"]
 
 
 def write_case(
-    folder: Path, measurements: DescentMeasurements | LandingMeasurements, pictures: Pictures = "pgm"
+    folder: Path, measurements: DescentMeasurements | LandingMeasurements, image_format: ImageFormat = "pgm"
 ) -> None:
     """Write the measurements of a case into an existing folder. Raises OSError if that fails."""
     content: dict[str, Any]
     if isinstance(measurements, DescentMeasurements):
         content = {
             "task": "velocity",
-            "attitudes": [_encode_attitude(one) for one in measurements.attitudes],
-            "altitudes": [_encode_altitude(one) for one in measurements.altitudes],
+            "attitudes": [_encode_attitude(attitude) for attitude in measurements.attitudes],
+            "altitudes": [_encode_altitude(altitude) for altitude in measurements.altitudes],
             "interval_velocities_m_s": measurements.interval_velocities_m_s.tolist(),
             "inertial_velocities_m_s": _encode_vector(measurements.inertial_velocities_m_s),
             "sun_direction": measurements.sun_direction.tolist(),
@@ -71,20 +71,20 @@ def write_case(
     else:
         content = {
             "task": "landing",
-            "poses": [{**encode_pose(one.world_from_body, "body"), "time_s": one.time_s} for one in measurements.poses],
+            "poses": [{**encode_pose(p.world_from_body, "body"), "time_s": p.time_s} for p in measurements.poses],
             "slant_range_m": _encode_length(measurements.slant_range_m),
             "up_body": measurements.up_body.tolist(),
             "apriori_site_world": measurements.apriori_site_world.tolist(),
         }
-    images = _write_images(folder, measurements.images, pictures)
-    write_json(folder / CASE_FILE, {"exchange": EXCHANGE, **content, "images": images})
+    images = _write_images(folder, measurements.images, image_format)
+    write_json(folder / CASE_FILE, {"exchange": FORMAT_VERSION, **content, "images": images})
 
 
 def write_frame(folder: Path, frame: DescentFrame) -> None:
     """Write one descent image and its measurements into an existing folder. Raises OSError if that fails."""
     (image,) = _write_images(folder, [frame.image], "pgm")
     content = {
-        "exchange": EXCHANGE,
+        "exchange": FORMAT_VERSION,
         "image": image,
         "attitude": _encode_attitude(frame.attitude),
         "altitude": _encode_altitude(frame.altitude),
@@ -96,8 +96,8 @@ def write_frame(folder: Path, frame: DescentFrame) -> None:
 
 
 def read_frame(folder: Path) -> DescentFrame:
-    """Read a frame of `write_frame`. Raises ValueError for a folder without one, or of another version."""
-    with open_json(folder / FRAME_FILE, "picture of a descent") as content:
+    """Read the frame that `write_frame` wrote. Raises ValueError if it is missing or has another version."""
+    with open_json(folder / FRAME_FILE, "descent image") as content:
         _check_version(content)
         return DescentFrame(
             image=_read_image(folder, content["image"]),
@@ -110,20 +110,20 @@ def read_frame(folder: Path) -> DescentFrame:
 
 
 def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
-    """Read a case of `write_case`. Raises ValueError for a folder without one, or of another version."""
+    """Read the case that `write_case` wrote. Raises ValueError if it is missing or has another version."""
     with open_json(folder / CASE_FILE, "case") as content:
         _check_version(content)
-        images = [_read_image(folder, one) for one in content["images"]]
+        images = [_read_image(folder, record) for record in content["images"]]
         if content["task"] == "velocity":
             return DescentMeasurements(
                 images=tuple(images),
-                attitudes=tuple(_read_attitude(one) for one in content["attitudes"]),
-                altitudes=tuple(_read_altitude(one) for one in content["altitudes"]),
+                attitudes=tuple(_read_attitude(record) for record in content["attitudes"]),
+                altitudes=tuple(_read_altitude(record) for record in content["altitudes"]),
                 interval_velocities_m_s=_vector(content["interval_velocities_m_s"]).reshape(-1, 3),
                 sun_direction=_vector(content["sun_direction"]),
                 inertial_velocities_m_s=_vector(content.get("inertial_velocities_m_s")),
             )
-        poses = [PoseMeasurement(read_pose(one, "body"), one["time_s"]) for one in content["poses"]]
+        poses = [PoseMeasurement(read_pose(record, "body"), record["time_s"]) for record in content["poses"]]
         return LandingMeasurements(
             images=(images[0], images[1]),
             poses=(poses[0], poses[1]),
@@ -134,34 +134,34 @@ def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
-    """Write a table of values as JSON. Raises ValueError where one is not finite."""
+    """Write a table of values as JSON. Raises ValueError if a value is not finite."""
     path.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 @contextmanager
 def open_json(path: Path, kind: str) -> Iterator[Mapping[str, Any]]:
-    """Yield the table of a JSON file; errors in the file or its use become a ValueError that names both."""
+    """Yield the table of a JSON file; errors in the file or its use become a ValueError with the path and `kind`."""
     try:
         yield json.loads(path.read_text(encoding="utf-8"))
     except (OSError, KeyError, TypeError, IndexError, ValueError) as error:
-        raise ValueError(f"{path} is no {kind}: {error}") from error
+        raise ValueError(f"{path} is not a valid {kind} file: {error}") from error
 
 
 def _check_version(content: Mapping[str, Any]) -> None:
-    if content["exchange"] != EXCHANGE:
-        raise ValueError(f"it has version {content['exchange']} of the exchange; this program reads {EXCHANGE}")
+    if content["exchange"] != FORMAT_VERSION:
+        raise ValueError(f"exchange format version {content['exchange']} is not supported; supported: {FORMAT_VERSION}")
 
 
-def _encode_attitude(measured: AttitudeMeasurement) -> dict[str, Any]:
-    return {"world_from_body_xyzw": measured.world_from_body.as_quat().tolist(), "time_s": measured.time_s}
+def _encode_attitude(attitude: AttitudeMeasurement) -> dict[str, Any]:
+    return {"world_from_body_xyzw": attitude.world_from_body.as_quat().tolist(), "time_s": attitude.time_s}
 
 
 def _read_attitude(content: Mapping[str, Any]) -> AttitudeMeasurement:
     return AttitudeMeasurement(Rotation.from_quat(content["world_from_body_xyzw"]), content["time_s"])
 
 
-def _encode_altitude(measured: AltitudeMeasurement) -> dict[str, Any]:
-    return {"altitude_m": _encode_length(measured.altitude_m), "time_s": measured.time_s}
+def _encode_altitude(altitude: AltitudeMeasurement) -> dict[str, Any]:
+    return {"altitude_m": _encode_length(altitude.altitude_m), "time_s": altitude.time_s}
 
 
 def _read_altitude(content: Mapping[str, Any]) -> AltitudeMeasurement:
@@ -184,39 +184,40 @@ def _vector(content: Any) -> Any:
     return None if content is None else np.array(content, dtype=np.float64)
 
 
-def _write_images(folder: Path, images: Sequence[DetectorImage], pictures: Pictures) -> list[dict[str, Any]]:
+def _write_images(folder: Path, images: Sequence[DetectorImage], image_format: ImageFormat) -> list[dict[str, Any]]:
     """Write images, cameras and flat fields; a shared flat field is written once."""
-    written: list[dict[str, Any]] = []
-    fields: dict[str, Float[np.ndarray, "rows columns"]] = {}
+    records: list[dict[str, Any]] = []
+    flat_fields: dict[str, Float[np.ndarray, "rows columns"]] = {}
     for number, image in enumerate(images, start=1):
-        name, camera, detector = f"image_{number}.{pictures}", f"camera_{number}.cahvor", image.calibration
-        write_picture(folder / name, image.counts)
-        write_cahvor(image.camera, folder / camera, frame=BODY_FRAME)
-        flat = next((path for path, one in fields.items() if np.array_equal(one, detector.flat_field)), None)
-        if flat is None:
-            flat = f"flat_field_{len(fields) + 1}.f64"
-            fields[flat] = detector.flat_field
-            detector.flat_field.astype("<f8").tofile(folder / flat)
+        names = {"file": f"image_{number}.{image_format}", "camera": f"camera_{number}.cahvor"}
+        detector = image.calibration
+        write_picture(folder / names["file"], image.counts)
+        write_cahvor(image.camera, folder / names["camera"], frame=BODY_FRAME)
+        flat_name = next((n for n, field in flat_fields.items() if np.array_equal(field, detector.flat_field)), None)
+        if flat_name is None:
+            flat_name = f"flat_field_{len(flat_fields) + 1}.f64"
+            flat_fields[flat_name] = detector.flat_field
+            detector.flat_field.astype("<f8").tofile(folder / flat_name)
         rows, columns = image.counts.shape
-        calibration = {"flat_field": flat, **{one: getattr(detector, one) for one in _CALIBRATION}}
+        calibration = {"flat_field": flat_name, **{name: getattr(detector, name) for name in _CALIBRATION_KEYS}}
         size = {"columns": columns, "rows": rows}
-        written.append({"file": name, "camera": camera, "time_s": image.time_s, **size, "calibration": calibration})
-    return written
+        records.append({**names, "time_s": image.time_s, **size, "calibration": calibration})
+    return records
 
 
 def _read_image(folder: Path, content: Mapping[str, Any]) -> DetectorImage:
-    known, shape = content["calibration"], (content["rows"], content["columns"])
-    flat = np.fromfile(folder / known["flat_field"], dtype="<f8").reshape(shape)
+    calibration, shape = content["calibration"], (content["rows"], content["columns"])
+    flat_field = np.fromfile(folder / calibration["flat_field"], dtype="<f8").reshape(shape).astype(np.float64)
     return DetectorImage(
         counts=read_picture(folder / content["file"]),
         time_s=content["time_s"],
         camera=read_cahvor(folder / content["camera"]),
-        calibration=DetectorCalibration(flat.astype(np.float64), **{one: known[one] for one in _CALIBRATION}),
+        calibration=DetectorCalibration(flat_field, **{name: calibration[name] for name in _CALIBRATION_KEYS}),
     )
 
 
 def write_picture(path: Path, counts: UInt16[np.ndarray, "rows columns"]) -> None:
-    """Write counts as `.pgm` (P5, two bytes a pixel, big-endian) or `.png` (16 bits)."""
+    """Write counts as `.pgm` (P5, two bytes per pixel, big-endian) or `.png` (16 bits)."""
     if path.suffix == ".pgm":
         rows, columns = counts.shape
         path.write_bytes(b"P5\n%d %d\n65535\n" % (columns, rows) + counts.astype(">u2").tobytes())
@@ -225,10 +226,10 @@ def write_picture(path: Path, counts: UInt16[np.ndarray, "rows columns"]) -> Non
 
 
 def read_picture(path: Path) -> UInt16[np.ndarray, "rows columns"]:
-    """Read counts of `write_picture`. Raises ValueError unless it is a 16-bit image of one band."""
+    """Read the counts that `write_picture` wrote. Raises ValueError unless it is a single-channel 16-bit image."""
     counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if counts is None or counts.dtype != np.uint16 or counts.ndim != 2:
-        raise ValueError(f"{path} is no picture of one band with 16 bits")
+        raise ValueError(f"{path} is not a single-channel 16-bit image")
     return np.asarray(counts, dtype=np.uint16)
 
 
@@ -246,7 +247,7 @@ def write_mast(folder: Path, mast: MastCalibration) -> None:
 
 
 def read_mast(folder: Path) -> MastCalibration:
-    """Read a mast of `write_mast`. Raises ValueError for a folder without one."""
+    """Read the mast that `write_mast` wrote. Raises ValueError if it is missing."""
     with open_json(folder / MAST_FILE, "mast") as content:
         left, right = (read_cahvor(folder / content[name]["camera"]) for name in ("left", "right"))
         base, elbow, head = (_vector(content[name]) for name in _OFFSETS)
@@ -255,7 +256,7 @@ def read_mast(folder: Path) -> MastCalibration:
 
 
 def write_stop(folder: Path, measurements: RoverMeasurements) -> None:
-    """Write a stop's images and angles into an existing folder, without the mast."""
+    """Write the images and angles measured at one rover stop (imaging position), without the mast."""
     content: dict[str, Any] = {name: getattr(measurements, name) for name in ("azimuth_rad", "elevation_rad")}
     content["world_from_rover"] = encode_pose(measurements.world_from_rover)
     for name, image in (("left", measurements.left), ("right", measurements.right)):
@@ -266,34 +267,34 @@ def write_stop(folder: Path, measurements: RoverMeasurements) -> None:
 
 
 def read_stop(folder: Path, mast: MastCalibration) -> RoverMeasurements:
-    """Read a stop of `write_stop`. Raises ValueError for a folder without one."""
+    """Read the stop that `write_stop` wrote. Raises ValueError if it is missing."""
     with open_json(folder / STOP_FILE, "stop") as content:
         left, right = (
-            MastImage(read_picture(folder / one["file"]), (int(one["corner"][0]), int(one["corner"][1])))
-            for one in (content["left"], content["right"])
+            MastImage(read_picture(folder / record["file"]), (int(record["corner"][0]), int(record["corner"][1])))
+            for record in (content["left"], content["right"])
         )
         azimuth, elevation = float(content["azimuth_rad"]), float(content["elevation_rad"])
         return RoverMeasurements(left, right, mast, azimuth, elevation, read_pose(content["world_from_rover"]))
 
 
 def encode_pose(pose: RigidTransform, body: str = "rover") -> dict[str, Any]:
-    """The pose of a rover or a body: position in the world and unit quaternion, scalar last."""
+    """Encode the pose of a rover or a body for JSON: position in the world and unit quaternion, scalar last."""
     position, quaternion = np.asarray(pose.translation).tolist(), pose.rotation.as_quat().tolist()
     return {"position_world_m": position, f"world_from_{body}_xyzw": quaternion}
 
 
 def read_pose(content: Mapping[str, Any], body: str = "rover") -> RigidTransform:
-    """Read a pose of `encode_pose`."""
+    """Decode a pose of `encode_pose`."""
     return rigid(Rotation.from_quat(content[f"world_from_{body}_xyzw"]), _vector(content["position_world_m"]))
 
 
 def encode_target(target: TargetDesignation) -> dict[str, Any]:
-    """A target designation in one of its three forms."""
+    """Encode a target designation (pixel, rover or site coordinates) for JSON."""
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(target).items()}
 
 
 def read_target(content: Mapping[str, Any]) -> TargetDesignation:
-    """Read a designation of `encode_target`."""
+    """Decode a target designation of `encode_target`."""
     if "pixel" in content:
         return PixelTarget(_vector(content["pixel"]), content["azimuth_rad"], content["elevation_rad"])
     if "position_rover" in content:

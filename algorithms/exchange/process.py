@@ -1,6 +1,6 @@
 """Programs under test: their commands, and their execution within limits on time, memory and output.
 
-A program leads its own process group, which is killed as a whole, and ends with the process that started it.
+Each program has its own process group, so that its children can be killed with it. It ends with its parent process.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from marsyard.algorithms.processes import descendants, resident_bytes
 
 #: Interval of the memory checks, seconds.
 _POLL_S = 0.02
-#: Number of last characters of standard error that are kept.
+#: Maximum length of the stored end of standard error, characters.
 MAX_STDERR_CHARACTERS = 4000
 #: Time for a persistent program to exit after its input is closed, seconds.
 _EXIT_GRACE_S = 0.5
@@ -40,9 +40,9 @@ class ExecutableLimits(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    time_s: Annotated[float, Field(gt=0.0, le=86400.0, description="wall-clock time of an answer, s")] = 60.0
-    memory_gb: Annotated[float, Field(gt=0.0, le=4096.0, description="resident memory of it and its children")] = 2.0
-    output_mb: Annotated[float, Field(gt=0.0, le=1000.0, description="what it may write to its output and error")] = 1.0
+    time_s: Annotated[float, Field(gt=0.0, le=86400.0, description="wall-clock time for an answer, s")] = 60.0
+    memory_gb: Annotated[float, Field(gt=0.0, le=4096.0, description="resident memory of its process tree")] = 2.0
+    output_mb: Annotated[float, Field(gt=0.0, le=1000.0, description="size of its standard output and error")] = 1.0
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Command:
 
     - words: The program and its arguments
     - persistent: Whether one process answers many cases
-    - stream: Whether it gets a descent's images one by one
+    - stream: Whether the program receives a descent's images one by one
     """
 
     words: tuple[str, ...]
@@ -69,22 +69,23 @@ PREFIXES: Mapping[str, tuple[bool, bool]] = {
 
 
 def parse_command(text: str) -> Command | None:
-    """Parse a command (`exec:./mine --flag`); None for a text without one of the prefixes.
+    """Parse a command (for example `exec:./program --flag`); None for a text without one of the prefixes.
 
     Raises ValueError if the program does not exist or a quote is not closed.
     """
-    prefix = next((one for one in PREFIXES if text.startswith(one)), None)
+    prefix = next((p for p in PREFIXES if text.startswith(p)), None)
     if prefix is None:
         return None
     try:
         words = shlex.split(text.removeprefix(prefix))
     except ValueError as error:
-        raise ValueError(f"'{text}' cannot be read: {error}") from error
+        raise ValueError(f"'{text}' cannot be parsed: {error}") from error
     if not words:
-        raise ValueError(f"'{text}' names no program; expected {prefix}PROGRAM, with arguments behind it")
+        raise ValueError(f"'{text}' contains no program; expected {prefix}PROGRAM, followed by its arguments")
     if shutil.which(words[0]) is None:
-        where = "is not there, or may not be run" if "/" in words[0] else "is not on the PATH; write ./ before your own"
-        raise ValueError(f"no program for '{text}': {words[0]} {where}")
+        no_path = "is not on the PATH; for a program in this folder write ./ in front of its name"
+        problem = "does not exist or is not executable" if "/" in words[0] else no_path
+        raise ValueError(f"no program for '{text}': {words[0]} {problem}")
     return Command(tuple(words), *PREFIXES[prefix])
 
 
@@ -100,7 +101,7 @@ class Output:
 class RunningProgram:
     """A running program under test.
 
-    Every method raises AlgorithmError, after ending the program, if it breaks a limit, ends early or cannot be started.
+    Methods end the program and raise AlgorithmError if it exceeds a limit, ends early or cannot be started.
     """
 
     def __init__(self, words: tuple[str, ...], limits: ExecutableLimits) -> None:
@@ -121,51 +122,51 @@ class RunningProgram:
         self._deadline_s = time.monotonic() + limits.time_s
 
     @property
-    def process(self) -> int:
-        """Process id."""
+    def process_id(self) -> int:
+        """Process id of the program."""
         return self._process.pid
 
-    def answer(self) -> Output:
-        """The whole output of the program until it exits with status 0."""
-        started = time.perf_counter()
+    def read_all(self) -> Output:
+        """Read the output of the program until it exits with status 0."""
+        start_s = time.perf_counter()
         self._close_input()
         self._read(lambda: False)
         self._wait()
-        output = self._collect_output(bytes(self._output), started)
+        output = self._collect_output(bytes(self._output), start_s)
         self._kill()
         return output
 
-    def line(self, asked: str | None = None) -> Output:
-        """The next output line of the program, after an optional request line.
+    def read_line(self, request: str | None = None) -> Output:
+        """Send an optional request line and read one output line.
 
-        Output before the request is a fault (BAD_ANSWER): a late second line would answer the next case.
+        Output before the request is a fault (BAD_ANSWER): it could be a second line for the previous case.
         """
-        started = time.perf_counter()
+        start_s = time.perf_counter()
         self._output.clear()
         self._stderr.clear()
         self._deadline_s = time.monotonic() + self.limits.time_s
-        if asked is not None:
-            if unasked := _read_pending(self._process.stdout):
-                message = f"before it was asked it wrote {shorten(unasked)}; expected one line for each request"
+        if request is not None:
+            if early_output := _read_pending(self._process.stdout):
+                message = f"it wrote {shorten(early_output)} before the request; expected one line per request"
                 raise self._end_with_fault(Fault.BAD_ANSWER, message)
             try:
                 if self._process.stdin is None or self._process.stdin.closed:
                     raise BrokenPipeError
-                self._process.stdin.write(f"{asked}\n".encode())
+                self._process.stdin.write(f"{request}\n".encode())
                 self._process.stdin.flush()
             except BrokenPipeError:
                 self._wait()
-                raise self._end_with_fault(Fault.CRASHED, "it reads no more cases") from None
+                raise self._end_with_fault(Fault.CRASHED, "it closed its input") from None
         self._read(lambda: b"\n" in self._output)
         if b"\n" not in self._output:
             self._wait()
-            raise self._end_with_fault(Fault.CRASHED, "its output ended before it had answered")
-        first, _, rest = bytes(self._output).partition(b"\n")
-        if rest:
-            raise self._end_with_fault(Fault.BAD_ANSWER, "it wrote more than the one line of its answer")
-        return self._collect_output(first, started)
+            raise self._end_with_fault(Fault.CRASHED, "its output ended without an answer")
+        first_line, _, extra_output = bytes(self._output).partition(b"\n")
+        if extra_output:
+            raise self._end_with_fault(Fault.BAD_ANSWER, "it wrote more than one line")
+        return self._collect_output(first_line, start_s)
 
-    def leave(self) -> None:
+    def stop(self) -> None:
         """End the program: close its input, then kill it if it does not exit."""
         self._close_input()
         with suppress(subprocess.TimeoutExpired):
@@ -177,36 +178,36 @@ class RunningProgram:
             with suppress(BrokenPipeError):
                 self._process.stdin.close()
 
-    def _read(self, enough: Callable[[], bool]) -> None:
-        """Read both streams until they end or `enough` holds, under the limits on time, memory and size."""
+    def _read(self, is_complete: Callable[[], bool]) -> None:
+        """Read both streams until they end or `is_complete()` is true, within the limits on time, memory and size."""
         with selectors.DefaultSelector() as selector:
-            for stream, kept in ((self._process.stdout, self._output), (self._process.stderr, self._stderr)):
+            for stream, buffer in ((self._process.stdout, self._output), (self._process.stderr, self._stderr)):
                 if stream is not None:
-                    selector.register(stream, selectors.EVENT_READ, kept)
-            while selector.get_map() and not enough():
-                self._check()
+                    selector.register(stream, selectors.EVENT_READ, buffer)
+            while selector.get_map() and not is_complete():
+                self._check_limits()
                 for key, _ in selector.select(_POLL_S):
-                    if read := os.read(key.fd, 1 << 16):
-                        key.data.extend(read)
+                    if data := os.read(key.fd, 1 << 16):
+                        key.data.extend(data)
                     else:
                         selector.unregister(key.fileobj)
 
-    def _check(self) -> None:
+    def _check_limits(self) -> None:
         if time.monotonic() > self._deadline_s:
             raise self._end_with_fault(Fault.TIMED_OUT, f"no answer within {self.limits.time_s:g} s")
         if len(self._output) + len(self._stderr) > self.limits.output_mb * 1e6:
             raise self._end_with_fault(Fault.TOO_MUCH_OUTPUT, f"it wrote more than {self.limits.output_mb:g} MB")
         if resident_bytes([self._process.pid, *descendants(self._process.pid)]) > self.limits.memory_gb * 1e9:
-            raise self._end_with_fault(Fault.OUT_OF_MEMORY, f"it took more than {self.limits.memory_gb:g} GB of memory")
+            raise self._end_with_fault(Fault.OUT_OF_MEMORY, f"it used more than {self.limits.memory_gb:g} GB of memory")
 
     def _wait(self) -> None:
         while True:
-            self._check()
+            self._check_limits()
             with suppress(subprocess.TimeoutExpired):
                 status = self._process.wait(_POLL_S)
                 break
         if status < 0:
-            name = next((one.name for one in signal.Signals if one == -status), f"signal {-status}")
+            name = next((s.name for s in signal.Signals if s == -status), f"signal {-status}")
             raise self._end_with_fault(Fault.CRASHED, f"it was ended by {name}")
         if status > 0:
             raise self._end_with_fault(Fault.CRASHED, f"it ended with status {status}")
@@ -224,20 +225,20 @@ class RunningProgram:
                 with suppress(BrokenPipeError):
                     stream.close()
 
-    def _collect_output(self, output: bytes, started: float) -> Output:
-        """The answer, with the pending content of standard error."""
+    def _collect_output(self, output: bytes, start_s: float) -> Output:
+        """Build the output, including pending data of standard error."""
         while pending := _read_pending(self._process.stderr):
             self._stderr.extend(pending)
-        return Output(output, _decode_tail(self._stderr), time.perf_counter() - started)
+        return Output(output, _decode_tail(self._stderr), time.perf_counter() - start_s)
 
 
 def _end_with_parent() -> None:
-    """Between fork and exec: let Linux kill the program when the thread that started it ends."""
+    """Between fork and exec, ask Linux to kill the program when its parent thread ends."""
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _read_pending(stream: IO[bytes] | None) -> bytes:
-    """Bytes that a stream holds now; none at its end."""
+    """Read the bytes available in a stream without waiting; empty at its end."""
     if stream is None or stream.closed:
         return b""
     with selectors.DefaultSelector() as selector:
@@ -246,12 +247,12 @@ def _read_pending(stream: IO[bytes] | None) -> bytes:
 
 
 def shorten(raw: bytes) -> str:
-    """The first 200 bytes of output, as text in quotes."""
+    """Convert the first 200 bytes of an output to quoted text."""
     text = raw[:200].decode("utf-8", errors="replace")
     return repr(text + ("..." if len(raw) > 200 else ""))
 
 
 def _decode_tail(raw: bytearray) -> str:
-    """The end of an output as printable text."""
+    """Decode the end of an output as printable text."""
     text = bytes(raw[-4 * MAX_STDERR_CHARACTERS :]).decode("utf-8", errors="replace")[-MAX_STDERR_CHARACTERS:]
     return "".join(letter if letter.isprintable() or letter in "\n\t" else "�" for letter in text)

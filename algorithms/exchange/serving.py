@@ -1,8 +1,8 @@
-"""Requests to programs and their replies: one JSON object a line, with the exchange's version and known keys.
+"""Requests to programs and their answers: one JSON object per line, with the version of the exchange format.
 
-A persistent program (`serve:`) is started once in a process, answers many cases, and ends with the process. An `exec:`
-program serves a single target, stream or case. For one case it needs no greeting: the case's folder is its last
-argument, and its answer is its whole output.
+A persistent program (`serve:`) is started once per process, answers many cases, and ends with the process. An `exec:`
+program processes a single target, stream or case. For one case it writes no greeting line: its last argument is the
+case's folder, and its complete output is the answer.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ class ProgramDetails:
     time_s: float
 
 
-#: A function that reads an answer of the program: its table, and the details to attach.
+#: Function that decodes an answer of the program from its table and the details to attach.
 AnswerReader = Callable[[Mapping[str, Any], ProgramDetails], Answer]
 
 
 def parse_table(output: Output) -> Mapping[str, Any]:
-    """Parse the JSON object of an output, keys unchecked; raises AlgorithmError (BAD_ANSWER)."""
+    """Parse the JSON object of an output; raises AlgorithmError (BAD_ANSWER). Keys are not checked."""
     message = f"its output is not one JSON object: {shorten(output.stdout)}"
     try:
         answer = json.loads(output.stdout.decode("utf-8"), parse_constant=float)
@@ -54,7 +54,7 @@ def parse_table(output: Output) -> Mapping[str, Any]:
 
 
 def check_keys(answer: Mapping[str, Any], allowed: set[str]) -> None:
-    """Raise AlgorithmError (BAD_ANSWER) for another version of the exchange or an unknown key."""
+    """Raise AlgorithmError (BAD_ANSWER) for an unsupported version of the exchange format or an unknown key."""
     if type(answer.get("exchange")) is not int or answer["exchange"] not in ANSWER_VERSIONS:
         versions = ", ".join(map(str, ANSWER_VERSIONS))
         raise bad_answer(f"the answer's exchange is {answer.get('exchange')!r}; allowed: {versions}")
@@ -64,32 +64,32 @@ def check_keys(answer: Mapping[str, Any], allowed: set[str]) -> None:
 
 
 def read_member(label: str, name: object, kinds: type[Member]) -> Member:
-    """The member of an enumeration by name."""
+    """Look up the member of an enumeration by name; raises AlgorithmError (BAD_ANSWER)."""
     if not isinstance(name, str) or name not in kinds.__members__:
         raise bad_answer(f"{label} is {name!r}; allowed: {', '.join(kinds.__members__)}")
     return kinds[name]
 
 
 def read_numbers(answer: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray | None:
-    """An array under a key of the answer; None if it is null or absent."""
+    """Read an array from the answer; None if it is null or absent. Raises AlgorithmError (BAD_ANSWER)."""
     value = answer.get(name)
     if value is None:
         return None
     if not _is_nested(value, shape):
-        received = shorten(json.dumps(value).encode())
-        raise bad_answer(f"{name} is {received}; allowed: numbers in the shape {list(shape)}")
+        value_text = shorten(json.dumps(value).encode())
+        raise bad_answer(f"{name} is {value_text}; allowed: numbers in the shape {list(shape)}")
     return np.array(value, dtype=np.float64)
 
 
 def _is_nested(value: Any, shape: tuple[int, ...]) -> bool:
-    """Whether a value consists of numbers in nested lists of this shape."""
+    """Whether a value is a nested list of numbers of this shape."""
     if not shape:
         return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
-    return isinstance(value, list) and len(value) == shape[0] and all(_is_nested(one, shape[1:]) for one in value)
+    return isinstance(value, list) and len(value) == shape[0] and all(_is_nested(item, shape[1:]) for item in value)
 
 
 def read_answer(answer: Mapping[str, Any], output: Output, read: AnswerReader[Answer]) -> Answer:
-    """Read an answer of a program; an AlgorithmError gets the program's standard error attached."""
+    """Decode an answer of a program; the program's standard error is added to an AlgorithmError."""
     try:
         return read(answer, ProgramDetails(output.stderr, output.time_s))
     except AlgorithmError as error:
@@ -98,83 +98,83 @@ def read_answer(answer: Mapping[str, Any], output: Output, read: AnswerReader[An
 
 @dataclass
 class Server:
-    """A running program after its greeting.
+    """Running program that has written its greeting.
 
-    - version: The exchange's version in the greeting, one of `ANSWER_VERSIONS`
-    - requests: Number of requests so far: the `id` of the last one
+    - version: Version of the exchange format in the greeting, one of `ANSWER_VERSIONS`
+    - request_count: Number of requests sent: the `id` of the last one
     """
 
     child: RunningProgram
     version: int
-    requests: int = 0
+    request_count: int = 0
 
     def ask(self, request: Mapping[str, Any]) -> tuple[Mapping[str, Any], Output]:
-        """The program's answer to one request, without its `id`, and its raw output.
+        """Send one request; return the program's answer without its `id`, and its raw output.
 
-        Raises AlgorithmError, after ending the program, if it fails, its answer is not one JSON object, or the answer
-        belongs to another request.
+        Ends the program and raises AlgorithmError if it fails, its answer is not one JSON object, or the answer belongs
+        to another request.
         """
-        self.requests += 1
-        identity = {"id": self.requests} if self.version > 1 else {}
-        output = self.child.line(json.dumps({"exchange": self.version, **identity, **request}, allow_nan=False))
+        self.request_count += 1
+        identity = {"id": self.request_count} if self.version > 1 else {}
+        output = self.child.read_line(json.dumps({"exchange": self.version, **identity, **request}, allow_nan=False))
         try:
             answer = parse_table(output)
             for key, expected in {"exchange": self.version, **identity}.items():
                 if type(answer.get(key)) is not int or answer[key] != expected:
-                    message = f"the answer's {key} is {answer.get(key)!r}; allowed: {expected}, that of the request"
+                    message = f"the answer's {key} is {answer.get(key)!r}; allowed: {expected}, as in the request"
                     raise AlgorithmError(Fault.BAD_ANSWER, message, output.stderr)
         except AlgorithmError:
-            self.child.leave()
+            self.child.stop()
             raise
         return {key: value for key, value in answer.items() if key not in identity}, output
 
 
 #: Idle persistent programs by command and limits.
-_waiting: dict[tuple[Command, ExecutableLimits], Server] = {}
+_idle: dict[tuple[Command, ExecutableLimits], Server] = {}
 
 
 def acquire(command: Command, limits: ExecutableLimits) -> Server:
-    """A waiting persistent program, or a new one whose greeting is checked; the caller owns it."""
-    if command.persistent and (command, limits) in _waiting:
-        return _waiting.pop((command, limits))
+    """Take an idle persistent program, or start a new one and check its greeting; the caller owns it."""
+    if command.persistent and (command, limits) in _idle:
+        return _idle.pop((command, limits))
     child = RunningProgram(command.words, limits)
-    output = child.line()
+    output = child.read_line()
     try:
         greeting = dict(parse_table(output))
         version = greeting.get("exchange")
-        ready = greeting == {"exchange": version, "ready": True}
-        if type(version) is not int or version not in ANSWER_VERSIONS or not ready:
+        is_ready = greeting == {"exchange": version, "ready": True}
+        if type(version) is not int or version not in ANSWER_VERSIONS or not is_ready:
             expected = f'{{"exchange": {ANSWER_VERSIONS[-1]}, "ready": true}}'
             message = f"its first line is {shorten(output.stdout)}; expected {expected}"
             raise AlgorithmError(Fault.BAD_ANSWER, message, output.stderr)
     except AlgorithmError:
-        child.leave()
+        child.stop()
         raise
     return Server(child, version)
 
 
 def release(command: Command, limits: ExecutableLimits, server: Server) -> None:
     """Keep a persistent program for the next case; end any other."""
-    if command.persistent and (command, limits) not in _waiting:
-        _waiting[command, limits] = server
+    if command.persistent and (command, limits) not in _idle:
+        _idle[command, limits] = server
     else:
-        server.child.leave()
+        server.child.stop()
 
 
-def waiting_processes() -> set[int]:
-    """Process ids of the waiting persistent programs."""
-    return {server.child.process for server in _waiting.values()}
+def idle_processes() -> set[int]:
+    """Process ids of the idle persistent programs."""
+    return {server.child.process_id for server in _idle.values()}
 
 
 @atexit.register
 def end_persistent() -> None:
     """End the persistent programs of this process."""
-    while _waiting:
-        _waiting.popitem()[1].child.leave()
+    while _idle:
+        _idle.popitem()[1].child.stop()
 
 
 class Session:
-    """A dialogue of one algorithm with a program, one JSON line per request; the first request starts the program.
+    """Requests of one algorithm to a program, one JSON line each; the first request starts the program.
 
     The session's `folder` holds the input files and is removed with it.
     """
@@ -188,33 +188,33 @@ class Session:
 
     def ask(
         self,
-        do: str,
+        action: str,
         values: Mapping[str, Any],
-        read: AnswerReader[Answer],
+        parse: AnswerReader[Answer],
         files: Mapping[str, Callable[[Path], None]] | None = None,
     ) -> Answer:
-        """The program's answer to the request `do` with `values`.
+        """Send the request `action` with `values` and return the program's answer, decoded by `parse`.
 
-        `files` maps keys of the request to writers of the folders named there; the folders exist until the answer.
+        `files` maps request keys to functions that write a folder; the folders are removed after the answer.
         """
-        request = {"do": do, **values}
+        request = {"do": action, **values}
         if self._server is None:
             self._server = acquire(self._command, self._limits)
             self._release = weakref.finalize(self, release, self._command, self._limits, self._server)
-        with tempfile.TemporaryDirectory(prefix=f"{do}-", dir=self.folder) as below:
+        with tempfile.TemporaryDirectory(prefix=f"{action}-", dir=self.folder) as request_folder:
             for key, write in (files or {}).items():
-                folder = Path(below) / key
+                folder = Path(request_folder) / key
                 folder.mkdir()
                 write(folder)
                 request[key] = str(folder)
             try:
                 answer, output = self._server.ask(request)
             except AlgorithmError:
-                # it has ended already: do not return it to the idle programs
+                # the program has ended: do not return it to the idle programs
                 if self._release is not None:
                     self._release.detach()
                 raise
-        return read_answer(answer, output, read)
+        return read_answer(answer, output, parse)
 
 
 def ask_case(
@@ -223,7 +223,7 @@ def ask_case(
     measurements: DescentMeasurements | LandingMeasurements,
     read: AnswerReader[Answer],
 ) -> Answer:
-    """A program's answer to one case.
+    """Run a program on one case and return its answer.
 
     A persistent program that fails is ended; the next case starts it again.
     """
@@ -234,6 +234,6 @@ def ask_case(
             answer, output = server.ask({"case": folder})
             release(command, limits, server)
         else:
-            output = RunningProgram((*command.words, folder), limits).answer()
+            output = RunningProgram((*command.words, folder), limits).read_all()
             answer = parse_table(output)
     return read_answer(answer, output, read)

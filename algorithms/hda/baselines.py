@@ -1,6 +1,6 @@
 """Baselines from OpenCV: essential matrix for motion, semi-global matching for structure.
 
-All other stages are shared with the algorithm under test.
+All other stages are those of `HdaEstimator`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.hda.estimator import find_site, matched_structure
+from marsyard.algorithms.hda import structure
+from marsyard.algorithms.hda.estimator import find_site, match_structure
 from marsyard.algorithms.hda.motion import (
     LandingScene,
     Motion,
@@ -25,17 +26,16 @@ from marsyard.algorithms.hda.motion import (
     undistort,
 )
 from marsyard.algorithms.hda.options import HdaOptions
-from marsyard.algorithms.hda.structure import Fate, Matches, depth_bounds, epipolar_segments, pixel_lattice, triangulate
 from marsyard.algorithms.hda.tracking import Tracks
 from marsyard.algorithms.interface import SiteEstimate
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements
 
-#: Confidence of the search for an essential matrix.
+#: Confidence of the robust estimation of the essential matrix.
 CONFIDENCE = 0.9999
-#: Methods and inlier distances, pixels. Two motions explain a plane; each method sometimes returns the wrong one, which
-#: puts most tracks behind a camera.
+#: Methods and inlier distances, pixels. For a planar scene there are two solutions. Each method sometimes returns the
+#: wrong one, in which most tracks are behind a camera.
 ATTEMPTS = ((cv2.LMEDS, 1.0), (cv2.RANSAC, 0.1), (cv2.RANSAC, 0.3), (cv2.RANSAC, 1.0), (cv2.USAC_PROSAC, 0.1))
 #: Window of the semi-global matching, pixels, and the penalties of disparity steps recommended by OpenCV.
 BLOCK_PX = 5
@@ -58,8 +58,8 @@ class EssentialMatrixEstimator:
         self.options = HdaOptions() if options is None else options
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
-        """The estimate; details and errors are those of `HdaEstimator.estimate`."""
-        return find_site(build_scene(measurements), essential_motion, matched_structure, self.options)
+        """Select the site; details and errors are those of `HdaEstimator.estimate`."""
+        return find_site(build_scene(measurements), essential_motion, match_structure, self.options)
 
 
 @final
@@ -70,36 +70,36 @@ class SemiGlobalEstimator:
         self.options = HdaOptions() if options is None else options
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
-        """The estimate; details and errors are those of `HdaEstimator.estimate`."""
+        """Select the site; details and errors are those of `HdaEstimator.estimate`."""
         return find_site(build_scene(measurements), essential_motion, semi_global_structure, self.options)
 
 
 def essential_motion(scene: LandingScene, tracks: Tracks, options: HdaOptions) -> Motion | None:
-    """The essential matrix motion with most tracks in front of both cameras; None without any.
+    """Estimate the motion by essential matrices; the one with most tracks in front of both cameras is returned.
 
-    Its scale makes the median depth equal the range.
+    It is scaled so that the median depth equals the range. None if no motion was found.
     """
     focal = scene.views[1].focal_px
     accepted = (tracks.first[tracks.accepted], tracks.second[tracks.accepted])
-    first, second = (undistort(one.camera, pixels) for one, pixels in zip(scene.views, accepted, strict=True))
+    first, second = (undistort(view.camera, pixels) for view, pixels in zip(scene.views, accepted, strict=True))
     intrinsics = np.diag([focal, focal, 1.0])
     poses = []
     for method, inlier_px in ATTEMPTS:
         pixels = focal * first, focal * second
-        matrix, agreeing = cv2.findEssentialMat(*pixels, intrinsics, method, CONFIDENCE, inlier_px)
+        matrix, inlier_mask = cv2.findEssentialMat(*pixels, intrinsics, method, CONFIDENCE, inlier_px)
         if matrix is not None and matrix.shape == (3, 3) and np.all(np.isfinite(matrix)):
-            poses.append(cv2.recoverPose(matrix, *pixels, intrinsics, mask=agreeing)[:3])
+            poses.append(cv2.recoverPose(matrix, *pixels, intrinsics, mask=inlier_mask)[:3])
     if not poses:
         return None
     _, rotation, translation = max(poses, key=lambda pose: pose[0])
-    moved = rigid(Rotation.from_matrix(rotation), translation.ravel())
-    depths = triangulate(first, second, moved)
+    second_from_first = rigid(Rotation.from_matrix(rotation), translation.ravel())
+    depths = structure.triangulate(first, second, second_from_first)
     depths[~(np.abs(depths) > 0.0)] = np.inf
-    ahead = depths[np.isfinite(depths) & (depths > 0.0)]
-    if len(ahead) == 0:
+    positive_depths = depths[np.isfinite(depths) & (depths > 0.0)]
+    if len(positive_depths) == 0:
         return None
-    motion = assess_motion(first, second, focal, moved, depths, True, options)
-    return motion.scale(scene.range_m / float(np.median(ahead)))
+    motion = assess_motion(first, second, focal, second_from_first, depths, True, options)
+    return motion.scale(scene.range_m / float(np.median(positive_depths)))
 
 
 @dataclass(frozen=True)
@@ -122,21 +122,21 @@ class Rectification:
 
 
 def rectify_views(views: Views, second_from_first: RigidTransform) -> Rectification | None:
-    """The rectification of a pair; None for motion along the optical axis."""
+    """Compute the rectification of a pair; None for motion along the optical axis."""
     first_from_second = second_from_first.inv()
     baseline = float(np.linalg.norm(first_from_second.translation))
-    along = first_from_second.translation / baseline
+    baseline_axis = first_from_second.translation / baseline
     axis = np.array([0.0, 0.0, 1.0]) + first_from_second.rotation.apply(np.array([0.0, 0.0, 1.0]))
     axis /= np.linalg.norm(axis)
-    if abs(float(along @ axis)) > MAX_BASELINE_COSINE:
+    if abs(float(baseline_axis @ axis)) > MAX_BASELINE_COSINE:
         return None
-    axis -= (along @ axis) * along
+    axis -= (baseline_axis @ axis) * baseline_axis
     axis /= np.linalg.norm(axis)
-    turn = Rotation.from_matrix(np.stack([along, np.cross(axis, along), axis]))
+    rectified_from_first = Rotation.from_matrix(np.stack([baseline_axis, np.cross(axis, baseline_axis), axis]))
     focal = views[0].focal_px
     borders = [
-        turn.apply(rotation.apply(one.camera.rays(one.camera.border(16))[1]))
-        for one, rotation in zip(views, (Rotation.identity(), first_from_second.rotation), strict=True)
+        rectified_from_first.apply(rotation.apply(view.camera.rays(view.camera.border(16))[1]))
+        for view, rotation in zip(views, (Rotation.identity(), first_from_second.rotation), strict=True)
     ]
     edges = np.concatenate(borders)
     if np.any(edges[:, 2] <= 0.0):
@@ -152,24 +152,24 @@ def rectify_views(views: Views, second_from_first: RigidTransform) -> Rectificat
         right=(1.0, 0.0, 0.0),
         image_centre=(-float(low[0]), -float(low[1])),
     )
-    return Rectification(turn, baseline, camera)
+    return Rectification(rectified_from_first, baseline, camera)
 
 
 def match_disparities(
     views: Views, pair: Rectification, second_from_first: RigidTransform, bounds_m: tuple[float, float]
 ) -> Float[np.ndarray, "rows columns"]:
-    """Disparities of the first rectified image by semi-global matching, pixels; NaN without a match."""
+    """Disparities of the first rectified image from semi-global matching, pixels; NaN without a match."""
     first_from_rectified = pair.rectified_from_first.inv()
     full_scale = max(float(np.quantile(views[0].counts, 0.995)), 1.0)
-    turns = (first_from_rectified, second_from_first.rotation * first_from_rectified)
+    rotations = (first_from_rectified, second_from_first.rotation * first_from_rectified)
     rays = pair.camera.rays(pair.camera.pixel_grid())[1].reshape(-1, 3)
-    pictures = []
-    for one, turn in zip(views, turns, strict=True):
-        # in 8 bits; black outside the field of view
-        pixels = np.nan_to_num(one.camera.project(turn.apply(rays))[0], nan=-10.0).astype(np.float32)
-        grey = np.clip(one.counts * (255.0 / full_scale), 0.0, 255.0).astype(np.float32)
+    images = []
+    for view, rotation in zip(views, rotations, strict=True):
+        # 8-bit images, black outside the field of view
+        pixels = np.nan_to_num(view.camera.project(rotation.apply(rays))[0], nan=-10.0).astype(np.float32)
+        grey = np.clip(view.counts * (255.0 / full_scale), 0.0, 255.0).astype(np.float32)
         grid = pixels.reshape(pair.camera.size[1], pair.camera.size[0], 2)
-        pictures.append(np.rint(cv2.remap(grey, grid, None, cv2.INTER_LINEAR)).astype(np.uint8))
+        images.append(np.rint(cv2.remap(grey, grid, None, cv2.INTER_LINEAR)).astype(np.uint8))
     disparity_px_m = pair.focal_px * pair.baseline_m
     min_disparity = int(disparity_px_m / bounds_m[1])
     count = DISPARITY_STEP * (int(disparity_px_m / bounds_m[0] - min_disparity) // DISPARITY_STEP + 1)
@@ -185,28 +185,29 @@ def match_disparities(
         speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )
-    disparities = matcher.compute(*pictures).astype(np.float64) * DISPARITY_UNIT
+    disparities = matcher.compute(*images).astype(np.float64) * DISPARITY_UNIT
     return np.where(disparities >= max(min_disparity, 1), disparities, np.nan)
 
 
-def semi_global_structure(scene: LandingScene, motion: Motion, options: HdaOptions) -> Matches:
-    """Structure on the same pixel grid from the disparities of the rectified images."""
+def semi_global_structure(scene: LandingScene, motion: Motion, options: HdaOptions) -> structure.Matches:
+    """Compute structure on the pixel grid of `HdaEstimator` from the disparities of the rectified images."""
     first, second = scene.views
-    bounds = depth_bounds(motion.depth_range_m, options.depth_margin)
+    bounds = structure.depth_bounds(motion.depth_range_m, options.depth_margin)
     border = options.search_half_px + 1
-    pixels = pixel_lattice(first.camera.size, options.grid_px, border)
-    places = undistort(first.camera, pixels)
-    starts, ends, room = epipolar_segments(second, motion.second_from_first, places, bounds, border)
-    pixels, places, starts, ends = pixels[room], places[room], starts[room], ends[room]
+    pixels = structure.pixel_lattice(first.camera.size, options.grid_px, border)
+    coordinates = undistort(first.camera, pixels)
+    starts, ends, valid = structure.epipolar_segments(second, motion.second_from_first, coordinates, bounds, border)
+    pixels, coordinates, starts, ends = pixels[valid], coordinates[valid], starts[valid], ends[valid]
     depths = np.full(len(pixels), np.nan)
-    pair = rectify_views(scene.views, motion.second_from_first)
-    if pair is not None:
-        disparities = match_disparities(scene.views, pair, motion.second_from_first, bounds)
-        rays = pair.rectified_from_first.apply(np.column_stack([places, np.ones(len(places))]))
-        column, row = np.rint(pair.camera.project(rays)[0]).astype(np.int64).T
-        depths = pair.focal_px * pair.baseline_m / disparities[row, column] / rays[:, 2]
+    rectification = rectify_views(scene.views, motion.second_from_first)
+    if rectification is not None:
+        disparities = match_disparities(scene.views, rectification, motion.second_from_first, bounds)
+        rays = rectification.rectified_from_first.apply(np.column_stack([coordinates, np.ones(len(coordinates))]))
+        column, row = np.rint(rectification.camera.project(rays)[0]).astype(np.int64).T
+        depths = rectification.focal_px * rectification.baseline_m / disparities[row, column] / rays[:, 2]
     accepted = (depths > bounds[0]) & (depths < bounds[1])
-    fates = np.where(accepted, Fate.ACCEPTED, Fate.OUT_OF_BOUNDS).astype(np.uint8)
-    points = points_at_depth(places, depths)
-    matched, _ = project_points(second.camera, motion.second_from_first.apply(points))
-    return Matches(pixels, starts, ends, matched, np.full(len(pixels), np.nan), depths, fates, points[accepted])
+    statuses = np.where(accepted, structure.MatchStatus.ACCEPTED, structure.MatchStatus.OUT_OF_BOUNDS).astype(np.uint8)
+    points = points_at_depth(coordinates, depths)
+    matched_pixels, _ = project_points(second.camera, motion.second_from_first.apply(points))
+    no_scores = np.full(len(pixels), np.nan)
+    return structure.Matches(pixels, starts, ends, matched_pixels, no_scores, depths, statuses, points[accepted])

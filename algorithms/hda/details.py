@@ -1,4 +1,4 @@
-"""Intermediate products of the hazard detection, as shown in the paper's Figs. 1-5 and 7."""
+"""Intermediate products of the hazard detection, shown in the paper's Figs. 1-5 and 7."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from marsyard.algorithms.hda.motion import Motion, View, Views, points_at_depth,
 from marsyard.algorithms.hda.structure import Matches
 from marsyard.algorithms.hda.tracking import Tracks
 
-#: The stages of Table I, in order; the scale belongs to motion, the elevation map to hazards.
+#: The stages of Table I, in order; the scale is part of motion, the elevation map part of hazards.
 STAGES = ("tracking", "motion", "structure", "hazards")
 
 
 @dataclass(frozen=True)
 class Ground:
-    """The mapped ground.
+    """Mapped ground.
 
-    - surface_from_camera: From the first camera's frame to the surface frame, both with their origin in that camera
-    - world_from_surface: The remaining rotation about the vertical, by the on-board pose
+    - surface_from_camera: From the first camera's frame to the surface frame, both with their origin at that camera
+    - world_from_surface: Rotation about the vertical to the world frame, from the on-board pose
     - points: The point cloud in the surface frame, metres
     - apriori_cell: Row and column of the a-priori site, fractional, possibly outside the map
-    - site_cell: Row and column of the chosen site; None if no cell is safe
+    - site_cell: Row and column of the selected site; None if no cell is safe
     """
 
     surface_from_camera: Rotation
@@ -42,10 +42,10 @@ class Ground:
 
 @dataclass(frozen=True)
 class HdaDetails:
-    """Intermediate products of the estimator; None for stages that were not reached.
+    """Intermediate products of the estimator; None for stages that did not run.
 
     - views: The two images with their cameras and on-board poses
-    - motion: Motion, and depths of the accepted tracks; at the altimeter's scale if there are matches
+    - motion: Motion, and depths of the accepted tracks; scaled by the altimeter if there are matches
     - ends_s: Processor time at the start and at the end of every completed stage of `STAGES`
     """
 
@@ -56,9 +56,9 @@ class HdaDetails:
     ground: Ground | None = None
     ends_s: tuple[float, ...] = field(default_factory=lambda: (time.process_time(),))
 
-    def end_stage(self, **found: Any) -> HdaDetails:
-        """These details with the products of a stage that ends now."""
-        return replace(self, **found, ends_s=(*self.ends_s, time.process_time()))
+    def end_stage(self, **products: Any) -> HdaDetails:
+        """Return the details with the products of a stage and its end time (now)."""
+        return replace(self, **products, ends_s=(*self.ends_s, time.process_time()))
 
     @property
     def times_s(self) -> Mapping[str, float]:
@@ -68,18 +68,18 @@ class HdaDetails:
 
 
 def hda_products(details: HdaDetails) -> dict[str, Any]:
-    """The details as plain arrays, for storage and figures; stages that were not reached are left out.
+    """Convert the details to plain arrays, for storage and figures; stages that did not run are omitted.
 
     Keys, pixels (u, v), lengths in metres, angles in radians:
 
     - Fig. 1: `features`, `tracked`, `correlations`, `tracks_accepted`;
     - Fig. 2: `rotation` and `translation` (second from first camera), `sparse_points` (of the accepted tracks, first
-      camera's frame), `residuals_px`, `inliers`, `frustum_0` and `frustum_1` (rays of each picture's corners in its
-      camera's frame, of depth one);
+      camera's frame), `residuals_px`, `inliers`, `frustum_0` and `frustum_1` (rays of each image's corners in its
+      camera's frame, at unit depth);
     - Fig. 3: `grid`, `segment_starts`, `segment_ends`, `matched`, `matches_accepted`;
     - Fig. 4: `points`, `elevation`, `corner`, `cell` (surface frame);
     - Figs. 5 and 7: `smooth`, `roughness`, `slope`, `safety` (values of `Safety`), `site` and `apriori` (row, column;
-      the site empty for none), `map_pixels` (of the first picture, for every cell's middle at its elevation),
+      the site empty for none), `map_pixels` (pixels of the first image of every cell's centre at its elevation),
       `surface_from_camera` and `world_from_surface` (matrices).
     """
     products: dict[str, Any] = {}
@@ -89,13 +89,13 @@ def hda_products(details: HdaDetails) -> dict[str, Any]:
         products["tracks_accepted"] = tracks.accepted
     if details.tracks is not None and details.motion is not None:
         motion = details.motion
-        places = undistort(details.views[0].camera, details.tracks.first[details.tracks.accepted])
+        coordinates = undistort(details.views[0].camera, details.tracks.first[details.tracks.accepted])
         products["rotation"] = motion.second_from_first.rotation.as_matrix()
         products["translation"] = motion.second_from_first.translation
-        products["sparse_points"] = points_at_depth(places, motion.depths)
+        products["sparse_points"] = points_at_depth(coordinates, motion.depths)
         products |= {"residuals_px": motion.residuals_px, "inliers": motion.inliers}
-        for number, one in enumerate(details.views):
-            rays = one.camera.corner_rays()[1]
+        for number, view in enumerate(details.views):
+            rays = view.camera.corner_rays()[1]
             products[f"frustum_{number}"] = rays / rays[:, 2:]
     if details.matches is not None:
         matches = details.matches
@@ -109,9 +109,9 @@ def hda_products(details: HdaDetails) -> dict[str, Any]:
 def _ground_products(first: View, ground: Ground) -> dict[str, Any]:
     elevation = ground.elevation
     shape = elevation.elevation_m.shape
-    places = elevation.places(np.moveaxis(np.indices(shape).astype(np.float64), 0, -1))
-    middles = np.concatenate([places, elevation.elevation_m[..., None]], axis=-1).reshape(-1, 3)
-    pixels, _ = first.camera.project(ground.surface_from_camera.inv().apply(middles))
+    positions = elevation.positions(np.moveaxis(np.indices(shape).astype(np.float64), 0, -1))
+    centres = np.concatenate([positions, elevation.elevation_m[..., None]], axis=-1).reshape(-1, 3)
+    pixels, _ = first.camera.project(ground.surface_from_camera.inv().apply(centres))
     return {
         "points": ground.points,
         "elevation": elevation.elevation_m,

@@ -1,8 +1,8 @@
-"""Hazard detection and avoidance from two pictures of one moving camera (sections II and III).
+"""Hazard detection and avoidance from two images of one moving camera (sections II and III).
 
-The surface frame is level, with its origin at the first camera: z is up, x runs along the image columns as seen from
-above, y = z x x. Only its azimuth in the world comes from the on-board pose; the options choose the source of the
-vertical.
+The surface frame is level, with its origin at the first camera: z is up, x is the horizontal direction of increasing
+image columns, y = z x x. Only its azimuth in the world comes from the on-board pose; the options select the source of
+the vertical.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ StructureSolver = Callable[[LandingScene, Motion, HdaOptions], Matches]
 class HdaEstimator:
     """The landing hazard avoidance of JPL's autonomous helicopter.
 
-    Features tracked between two images give the motion and, with the laser's range, its scale. A pixel grid matched
-    along epipolar segments gives points and an elevation map; its slope and roughness give the safe landing map; the
+    Motion is estimated from features tracked between two images, its scale from the laser range. A pixel grid matched
+    along epipolar segments gives points and an elevation map. Its slope and roughness give the safe landing map. The
     site is the cell farthest from all hazards.
     """
 
@@ -53,52 +53,52 @@ class HdaEstimator:
         self.options = HdaOptions() if options is None else options
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
-        """The estimate, with `HdaDetails`. Raises ValueError if an image's size is not its camera's."""
-        return find_site(build_scene(measurements), motion_from_tracks, matched_structure, self.options)
+        """Select the site, with `HdaDetails`. Raises ValueError if an image's size differs from its camera's."""
+        return find_site(build_scene(measurements), motion_from_tracks, match_structure, self.options)
 
 
 def find_site(
     scene: LandingScene, solve_motion: MotionSolver, solve_structure: StructureSolver, options: HdaOptions
 ) -> SiteEstimate:
-    """Run all stages, with the given solvers for motion and structure."""
+    """Run all stages with these solvers for motion and structure."""
     details = HdaDetails(scene.views)
     if not (np.isfinite(scene.range_m) and scene.range_m > 0.0):
-        return _report_unconverged(SiteOutcome.NO_RANGE, scene, details)
+        return _report_failure(SiteOutcome.NO_RANGE, scene, details)
     features = select_features(scene.views[0].counts, options)
     if len(features) < options.min_tracks:
-        return _report_unconverged(SiteOutcome.NO_FEATURES, scene, details)
+        return _report_failure(SiteOutcome.NO_FEATURES, scene, details)
     tracks = track_features(
         scene.views[0].counts, scene.views[1].counts, features, expected_pixels(scene, features, options), options
     )
     details = details.end_stage(tracks=tracks)
     if np.count_nonzero(tracks.accepted) < options.min_tracks:
-        return _report_unconverged(SiteOutcome.NO_TRACKS, scene, details)
+        return _report_failure(SiteOutcome.NO_TRACKS, scene, details)
     motion = solve_motion(scene, tracks, options)
     details = replace(details, motion=motion)
     failure = motion_failure(motion, options)
     if motion is None or failure is not None:
-        return _report_unconverged(failure or SiteOutcome.NO_MOTION, scene, details)
-    places = undistort(scene.views[0].camera, tracks.first[tracks.accepted])
-    factor = scale_factor(scene.views, motion, places, scene.range_m, options)
+        return _report_failure(failure or SiteOutcome.NO_MOTION, scene, details)
+    coordinates = undistort(scene.views[0].camera, tracks.first[tracks.accepted])
+    factor = scale_factor(scene.views, motion, coordinates, scene.range_m, options)
     if not (np.isfinite(factor) and factor > 0.0):
-        return _report_unconverged(SiteOutcome.NO_MOTION, scene, details)
+        return _report_failure(SiteOutcome.NO_MOTION, scene, details)
     motion = motion.scale(factor)
     details = details.end_stage(motion=motion)
     matches = solve_structure(scene, motion, options)
     details = details.end_stage(matches=matches)
     if len(matches.points) < options.min_points:
-        return _report_unconverged(SiteOutcome.NO_STRUCTURE, scene, details)
+        return _report_failure(SiteOutcome.NO_STRUCTURE, scene, details)
     resolution = hazards.map_resolution(motion, scene.views[0].focal_px, options)
     ground = map_ground(scene, matches.points, resolution, options)
     if ground is None:
-        return _report_unconverged(SiteOutcome.NO_STRUCTURE, scene, details)
+        return _report_failure(SiteOutcome.NO_STRUCTURE, scene, details)
     site = site_world(scene, ground)
     details = details.end_stage(ground=ground)
     outcome = SiteOutcome.NO_SAFE_SITE if site is None else SiteOutcome.SAFE_SITE
     return SiteEstimate(outcome, site, details)
 
 
-def _report_unconverged(outcome: SiteOutcome, scene: LandingScene, details: HdaDetails) -> SiteEstimate:
+def _report_failure(outcome: SiteOutcome, scene: LandingScene, details: HdaDetails) -> SiteEstimate:
     return SiteEstimate(outcome, scene.apriori_site_world, details)
 
 
@@ -106,48 +106,46 @@ def expected_pixels(scene: LandingScene, features: Points2, options: HdaOptions)
     """Expected pixels of the features in the second image."""
     if options.track_seed is TrackSeed.NOTHING:
         return features
-    places = undistort(scene.views[0].camera, features)
-    ground = points_at_depth(places, plane_depths(places, scene.range_m, scene.up_camera))
+    coordinates = undistort(scene.views[0].camera, features)
+    ground = points_at_depth(coordinates, plane_depths(coordinates, scene.range_m, scene.up_camera))
     pixels, visible = scene.views[1].camera.project(scene.second_from_first.apply(ground))
     return np.where(visible[:, None], pixels, features)
 
 
 def motion_from_tracks(scene: LandingScene, tracks: Tracks, options: HdaOptions) -> Motion:
-    """The motion by robust least squares: the better of the starts from the on-board poses and from rest."""
+    """Solve for the motion by robust least squares, starting from the on-board poses and from zero motion."""
     accepted = (tracks.first[tracks.accepted], tracks.second[tracks.accepted])
-    first, second = (undistort(one.camera, pixels) for one, pixels in zip(scene.views, accepted, strict=True))
+    first, second = (undistort(view.camera, pixels) for view, pixels in zip(scene.views, accepted, strict=True))
     depths = plane_depths(first, scene.range_m, scene.up_camera)
-    starts: tuple[RigidTransform, ...] = (scene.second_from_first, rigid(Rotation.identity(), np.zeros(3)))
-    return estimate_motion(first, second, scene.views[1].focal_px, depths, starts, options)
+    initial_motions: tuple[RigidTransform, ...] = (scene.second_from_first, rigid(Rotation.identity(), np.zeros(3)))
+    return estimate_motion(first, second, scene.views[1].focal_px, depths, initial_motions, options)
 
 
 def motion_failure(motion: Motion | None, options: HdaOptions) -> SiteOutcome | None:
     """Why a motion is rejected; None if it is accepted."""
     if motion is None:
         return SiteOutcome.NO_MOTION
-    min_inliers = max(options.min_inlier_share * len(motion.inliers), 6)
+    min_inliers = max(options.min_inlier_fraction * len(motion.inliers), 6)
     if np.count_nonzero(motion.residuals_px <= options.max_residual_px) < min_inliers:
         return SiteOutcome.NO_MOTION
     if motion.parallax_px < options.min_parallax_px:
         return SiteOutcome.NO_BASELINE
-    if not motion.converged or np.count_nonzero(motion.inliers) < min_inliers:
-        return SiteOutcome.NO_MOTION
-    return None
+    return SiteOutcome.NO_MOTION if not motion.converged or np.count_nonzero(motion.inliers) < min_inliers else None
 
 
-def matched_structure(scene: LandingScene, motion: Motion, options: HdaOptions) -> Matches:
-    """Structure by matches along epipolar segments."""
+def match_structure(scene: LandingScene, motion: Motion, options: HdaOptions) -> Matches:
+    """Compute structure by matches along epipolar segments."""
     return dense_structure(scene.views, motion.second_from_first, motion.depth_range_m, options)
 
 
-#: Trials of the robust plane through all points.
+#: Number of random triples for the robust plane through all points.
 PLANE_TRIALS = 200
 
 
 def up_direction(first: View, up_camera: Vector3, points: Points3, options: HdaOptions) -> Vector3:
-    """Unit vector upwards in the first camera's frame, from the source in the options.
+    """Unit vector upwards in the first camera's frame, from the source that the options select.
 
-    `up_camera` is the inclinometers' measurement, `points` are in the first camera's frame.
+    `up_camera` is the inclinometers' measurement; `points` are in the first camera's frame.
     """
     if options.surface_frame is SurfaceFrame.INCLINOMETER:
         return up_camera
@@ -159,34 +157,34 @@ def up_direction(first: View, up_camera: Vector3, points: Points3, options: HdaO
 def plane_normal(points: Points3, seed: int) -> Vector3:
     """Unit normal, towards the origin, of the least-median-of-squares plane through at least four points.
 
-    The best of planes through random triples, refined by least squares over the points within 2.5 standard deviations
+    The best plane through random triples is refined by least squares over the points within 2.5 standard deviations
     (Rousseeuw & Leroy 1987).
     """
     rng = np.random.default_rng(seed)
     corners = points[rng.integers(0, len(points), (PLANE_TRIALS, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
-    real = lengths > 1e-9 * float(np.mean(points**2))
-    normals, corners = normals[real] / lengths[real, None], corners[real]
+    is_valid = lengths > 1e-9 * float(np.mean(points**2))
+    normals, corners = normals[is_valid] / lengths[is_valid, None], corners[is_valid]
     if len(normals) == 0:
         return np.array([0.0, 0.0, -1.0])
     distances = np.abs(points @ normals.T - np.sum(normals * corners[:, 0], axis=1))
     medians = np.median(distances, axis=0)
     best = int(np.argmin(medians))
-    near = points[distances[:, best] <= 2.5 * 1.4826 * (1.0 + 5.0 / max(len(points) - 3, 1)) * medians[best]]
-    normal = np.linalg.svd(near - near.mean(axis=0), full_matrices=False)[2][2] if len(near) >= 3 else normals[best]
+    fit = points[distances[:, best] <= 2.5 * 1.4826 * (1.0 + 5.0 / max(len(points) - 3, 1)) * medians[best]]
+    normal = np.linalg.svd(fit - fit.mean(axis=0), full_matrices=False)[2][2] if len(fit) >= 3 else normals[best]
     return np.asarray(-np.sign(normal @ points.mean(axis=0)) * normal)
 
 
 def surface_from_camera(up_camera: Vector3) -> Rotation:
-    """The rotation from the camera's frame to the surface frame; up must not be parallel to the columns."""
+    """Rotation from the camera's frame to the surface frame; up must not be parallel to the camera's x axis."""
     x = np.array([1.0, 0.0, 0.0]) - up_camera[0] * up_camera
     x /= np.linalg.norm(x)
     return Rotation.from_matrix(np.stack([x, np.cross(up_camera, x), up_camera]))
 
 
 def world_from_surface(world_from_camera: Rotation, surface_from_first: Rotation) -> Rotation:
-    """The rotation about the vertical that aligns the surface frame's azimuth with the on-board pose."""
+    """Rotation about the vertical that aligns the surface frame's azimuth with the on-board pose."""
     x = (world_from_camera * surface_from_first.inv()).apply(np.array([1.0, 0.0, 0.0]))
     return Rotation.from_euler("z", float(np.arctan2(x[1], x[0])))
 
@@ -194,7 +192,7 @@ def world_from_surface(world_from_camera: Rotation, surface_from_first: Rotation
 def map_ground(
     scene: LandingScene, points_camera: Points3, resolution: hazards.Resolution, options: HdaOptions
 ) -> Ground | None:
-    """The maps of points in the first camera's frame, and the site; None if the points cover no area."""
+    """Compute the maps of points in the first camera's frame, and the site; None if the points cover no area."""
     first = scene.views[0]
     to_surface = surface_from_camera(up_direction(first, scene.up_camera, points_camera, options))
     points = to_surface.apply(points_camera)
@@ -212,9 +210,9 @@ def map_ground(
 
 
 def site_world(scene: LandingScene, ground: Ground) -> Vector3 | None:
-    """The site in the world frame, metres, on the smooth surface; None if no cell is safe."""
+    """Site in the world frame, metres, on the smooth surface; None if no cell is safe."""
     if ground.site_cell is None:
         return None
-    x, y = ground.elevation.places(np.array(ground.site_cell, dtype=np.float64))
+    x, y = ground.elevation.positions(np.array(ground.site_cell, dtype=np.float64))
     site = np.array([x, y, ground.hazards.smooth_m[ground.site_cell]])
     return np.asarray(scene.views[0].world_from_camera.translation + ground.world_from_surface.apply(site))

@@ -1,4 +1,4 @@
-"""The elevation map (section II.D), its slope and roughness, the safe landing map and the site (section III)."""
+"""Elevation map (section II.D), slope and roughness, safe landing map and selection of the site (section III)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from marsyard.algorithms.hda.kernels import elevation as kernels
 from marsyard.algorithms.hda.motion import Motion
 from marsyard.algorithms.hda.options import HdaOptions
 
-#: Minimum sum of bilinear weights of a known cell: a point less than 0.9 of a cell away along an axis.
+#: Minimum sum of bilinear weights of a valid cell: one point at a distance of 0.9 cells along an axis.
 MIN_WEIGHT = 0.1
 
 
@@ -22,9 +22,9 @@ MIN_WEIGHT = 0.1
 class ElevationMap:
     """Elevations on a level grid in the surface frame.
 
-    - elevation_m: z of the middle of each cell; NaN without near points. Rows run along -y, columns along x, as in the
+    - elevation_m: z at the centre of each cell; NaN without near points. Rows run along -y, columns along x, as in the
       image.
-    - corner_m: (x, y) of the middle of the first cell
+    - corner_m: (x, y) of the centre of the first cell
     - cell_m: Side of a cell
     """
 
@@ -32,21 +32,21 @@ class ElevationMap:
     corner_m: Vector2
     cell_m: float
 
-    def places(self, cells: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """(x, y) of cells (row, column), whole or not."""
+    def positions(self, cells: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Positions (x, y) of cells (row, column), also fractional ones."""
         return np.asarray(self.corner_m + self.cell_m * cells[..., ::-1] * np.array([1.0, -1.0]))
 
-    def cells(self, places: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """(row, column), not whole, of places (x, y)."""
-        offsets = (places - self.corner_m) / self.cell_m * np.array([1.0, -1.0])
+    def cells(self, positions: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Fractional cells (row, column) of positions (x, y)."""
+        offsets = (positions - self.corner_m) / self.cell_m * np.array([1.0, -1.0])
         return np.asarray(offsets[..., ::-1])
 
 
 def elevation_map(points: Points3) -> ElevationMap | None:
-    """The map of points in the surface frame; None if they cover no area.
+    """Compute the elevation map of points in the surface frame; None if they cover no area.
 
     The cell side is sqrt(A / N) with A the area of the horizontal bounding box: about one point per cell. An elevation
-    is the mean of the points about a cell by bilinear weights.
+    is the mean of the points around a cell with bilinear weights.
     """
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     extent = high - low
@@ -57,17 +57,17 @@ def elevation_map(points: Points3) -> ElevationMap | None:
     corner = 0.5 * (low + high) + 0.5 * cell * np.array([-(columns - 1.0), rows - 1.0])
     empty = ElevationMap(np.full((rows, columns), np.nan), corner, cell)
     row, column = empty.cells(points[:, :2]).T
-    sums, weights = kernels.spread(row, column, points[:, 2], (rows, columns))
+    sums, weights = kernels.accumulate_bilinear(row, column, points[:, 2], (rows, columns))
     values = np.divide(sums, weights, out=np.full_like(sums, np.nan), where=weights >= MIN_WEIGHT)
     return ElevationMap(values, corner, cell)
 
 
-#: Least side of the regions that planes are fitted to, cells: a median of squares needs more than a few points.
+#: Minimum side of the squares for plane fits, cells: a median of squares needs more than a few points.
 MIN_SIDE_CELLS = 3
 
 
 class Safety(IntEnum):
-    """Values of the safe landing map: green, yellow and red in the paper's figures."""
+    """Values of the safe landing map: green, yellow and red in the paper's figures, in this order."""
 
     SAFE = 0
     UNKNOWN = 1
@@ -78,8 +78,8 @@ class Safety(IntEnum):
 class HazardMaps:
     """Hazard maps on the cells of the elevation map.
 
-    - planes: Of each footprint: elevation at its middle (metres) and slopes per metre along columns and rows; NaN if
-      unknown
+    - planes: Plane of each footprint: elevation at its centre (metres) and slopes per metre along columns and rows; NaN
+      if unknown
     - smooth_m: Elevation of the smooth underlying surface
     - roughness_m: Absolute distance of the elevation from the smooth surface
     - slope_rad: Angle between the ground's normal and the vertical
@@ -94,17 +94,17 @@ class HazardMaps:
 
 
 def hazard_maps(ground: ElevationMap, options: HdaOptions) -> HazardMaps:
-    """The hazard maps of an elevation map."""
+    """Compute the hazard maps of an elevation map."""
     planes, smooth, slope = smooth_surface(ground, options)
     roughness = np.abs(ground.elevation_m - smooth)
     return HazardMaps(planes, smooth, roughness, slope, safe_landing_map(slope, roughness, ground.cell_m, options))
 
 
 def smooth_surface(ground: ElevationMap, options: HdaOptions) -> tuple[Float[np.ndarray, "m n 3"], Raster, Raster]:
-    """Robust planes of the footprints, and elevation (metres) and slope (radians) interpolated between their middles.
+    """Robust planes of the footprints, and elevation (metres) and slope (radians) interpolated between their centres.
 
-    Squares of the footprint's side are spread evenly over the map. Beyond the outermost middles the extrapolation is
-    linear, with slopes clipped at zero. A square with fewer than half of its cells known has NaN.
+    Squares of the footprint's side are distributed evenly over the map. Outside the outermost centres the extrapolation
+    is linear, with slopes clipped at zero. A square has NaN if fewer than half of its cells are valid.
     """
     side = max(round(options.lander_diameter_m / ground.cell_m), MIN_SIDE_CELLS)
     shape = ground.elevation_m.shape
@@ -116,20 +116,20 @@ def smooth_surface(ground: ElevationMap, options: HdaOptions) -> tuple[Float[np.
     planes[..., 1:] /= ground.cell_m
     if planes.size == 0:
         return planes, np.full(shape, np.nan), np.full(shape, np.nan)
-    middles = [start + 0.5 * (side - 1) for start in starts]
-    rows, columns = (_interpolation_weights(middle, extent) for middle, extent in zip(middles, shape, strict=True))
+    centres = [start + 0.5 * (side - 1) for start in starts]
+    rows, columns = (_interpolation_weights(centre, extent) for centre, extent in zip(centres, shape, strict=True))
     smooth = _interpolate(planes[..., 0], rows, columns)
-    # Along an axis with a single footprint nothing can be interpolated: the planes' own slope is taken.
-    for axis, middle in enumerate(middles):
-        if len(middle) == 1:
-            offsets = np.expand_dims(np.arange(shape[axis]) - middle[0], 1 - axis)
+    # Along an axis with a single footprint, interpolation is impossible: the slope of its plane is used.
+    for axis, centre in enumerate(centres):
+        if len(centre) == 1:
+            offsets = np.expand_dims(np.arange(shape[axis]) - centre[0], 1 - axis)
             smooth = smooth + _interpolate(planes[..., 2 - axis], rows, columns) * ground.cell_m * offsets
     slopes = np.arctan(np.hypot(planes[..., 1], planes[..., 2]))
     return planes, smooth, np.maximum(_interpolate(slopes, rows, columns), 0.0)
 
 
 def _square_starts(extent: int, side: int) -> Int[np.ndarray, "n"]:
-    """First cells of the squares along an axis, evenly spread from end to end; empty if the axis is too short."""
+    """First cells of the squares along an axis, evenly distributed; empty if the axis is too short."""
     if extent < side:
         return np.zeros(0, dtype=np.int64)
     count = round(extent / side)
@@ -138,14 +138,14 @@ def _square_starts(extent: int, side: int) -> Int[np.ndarray, "n"]:
     return np.rint(np.linspace(0.0, extent - side, count)).astype(np.int64)
 
 
-def _interpolation_weights(middles: Float[np.ndarray, "n"], extent: int) -> Float[np.ndarray, "extent n"]:
-    """Weights of the middles for every cell along an axis: piecewise linear, extrapolated at the ends."""
-    if len(middles) == 1:
+def _interpolation_weights(centres: Float[np.ndarray, "n"], extent: int) -> Float[np.ndarray, "extent n"]:
+    """Weights of the centres for every cell along an axis: piecewise linear, extrapolated at the ends."""
+    if len(centres) == 1:
         return np.ones((extent, 1))
-    weights = np.zeros((extent, len(middles)))
+    weights = np.zeros((extent, len(centres)))
     cells = np.arange(extent)
-    left = np.clip(np.searchsorted(middles, cells, side="right") - 1, 0, len(middles) - 2)
-    fraction = (cells - middles[left]) / (middles[left + 1] - middles[left])
+    left = np.clip(np.searchsorted(centres, cells, side="right") - 1, 0, len(centres) - 2)
+    fraction = (cells - centres[left]) / (centres[left + 1] - centres[left])
     weights[cells, left] = 1.0 - fraction
     weights[cells, left + 1] = fraction
     return weights
@@ -154,10 +154,10 @@ def _interpolation_weights(middles: Float[np.ndarray, "n"], extent: int) -> Floa
 def _interpolate(
     values: Float[np.ndarray, "m n"], rows: Float[np.ndarray, "r m"], columns: Float[np.ndarray, "c n"]
 ) -> Float[np.ndarray, "r c"]:
-    """Interpolate footprint values to cells by row and column weights; NaN if a value with weight is NaN."""
+    """Interpolate footprint values to cells by row and column weights; NaN if a value with nonzero weight is NaN."""
     unknown = np.isnan(values)
-    touched = (rows != 0.0).astype(np.float64) @ unknown @ (columns != 0.0).T
-    return np.where(touched > 0.0, np.nan, rows @ np.where(unknown, 0.0, values) @ columns.T)
+    unknown_counts = (rows != 0.0).astype(np.float64) @ unknown @ (columns != 0.0).T
+    return np.where(unknown_counts > 0.0, np.nan, rows @ np.where(unknown, 0.0, values) @ columns.T)
 
 
 def safe_landing_map(
@@ -165,14 +165,14 @@ def safe_landing_map(
 ) -> UInt8[np.ndarray, "rows columns"]:
     """Classify cells by slope and roughness: values of `Safety`.
 
-    Hazards grow by the lander's diameter. Cells near the map's border or near an unknown cell are unknown. Hazard has
-    precedence over unknown.
+    Hazards are dilated by the lander's diameter. Cells near the map's border or near an unknown cell are unknown.
+    Hazard has precedence over unknown.
     """
     with np.errstate(invalid="ignore"):
         hazards = [slope_rad > options.max_slope_rad, roughness_m > options.max_roughness_m]
-    reach = options.hazard_growth * options.lander_diameter_m / cell_m
-    hazard = np.logical_or(*(_dilate(one, reach) for one in hazards))
-    # The cells around the map are as unknown as its holes.
+    growth_cells = options.hazard_growth * options.lander_diameter_m / cell_m
+    hazard = np.logical_or(*(_dilate(hazard_mask, growth_cells) for hazard_mask in hazards))
+    # Cells outside the map are unknown.
     holes = np.pad(np.isnan(slope_rad) | np.isnan(roughness_m), 1, constant_values=True)
     unknown = _dilate(holes, options.unknown_growth * options.lander_diameter_m / cell_m)[1:-1, 1:-1]
     safety = np.where(hazard, Safety.HAZARD, np.where(unknown, Safety.UNKNOWN, Safety.SAFE))
@@ -180,21 +180,19 @@ def safe_landing_map(
 
 
 def grassfire(marked: Mask) -> Raster:
-    """Distance of every cell from the nearest marked cell, cells; infinite without any (grassfire transform, Blum
-    1973).
-    """
+    """Grassfire transform (Blum 1973): distance of every cell from the nearest marked cell, cells; inf if none is."""
     if not np.any(marked):
         return np.full(marked.shape, np.inf)
     distances = cv2.distanceTransform((~marked).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(distances.astype(np.float64))
 
 
-def _dilate(marked: Mask, reach: float) -> Mask:
-    return np.asarray(marked | (grassfire(marked) <= reach))
+def _dilate(marked: Mask, radius_cells: float) -> Mask:
+    return np.asarray(marked | (grassfire(marked) <= radius_cells))
 
 
 def safe_site(safety: UInt8[np.ndarray, "rows columns"], apriori_cell: Vector2) -> tuple[int, int] | None:
-    """The safe cell (row, column) farthest from all unsafe cells, ties broken by distance to the a-priori site.
+    """Select the safe cell (row, column) farthest from all unsafe cells; ties: the nearest to the a-priori site.
 
     None if no cell is safe. Cells outside the map are unsafe.
     """
@@ -202,90 +200,92 @@ def safe_site(safety: UInt8[np.ndarray, "rows columns"], apriori_cell: Vector2) 
     farthest = float(distances.max(initial=0.0))
     if farthest == 0.0:
         return None
-    equals = np.argwhere(distances >= farthest - 1e-4)
-    nearest = np.argmin(np.hypot(*(equals - apriori_cell).T))
-    return int(equals[nearest, 0]), int(equals[nearest, 1])
+    best_cells = np.argwhere(distances >= farthest - 1e-4)
+    nearest = np.argmin(np.hypot(*(best_cells - apriori_cell).T))
+    return int(best_cells[nearest, 0]), int(best_cells[nearest, 1])
 
 
-#: Number of fitted points, and of tested positions, across a footprint.
-POINTS_ACROSS = 16
+#: Number of fitted points, and of tested positions, per footprint diameter.
+POINTS_PER_DIAMETER = 16
 #: Ratio of standard deviation to median absolute value of a normal distribution.
-DEVIATION_OF_MEDIAN = 1.4826
+SIGMA_PER_MEDIAN = 1.4826
 
 
 @dataclass(frozen=True)
 class Resolution:
-    """Side of the matched windows on the ground, and standard deviation of a point's elevation."""
+    """Side of the correlation windows on the ground, and standard deviation of a point's elevation."""
 
     window_m: float
     noise_m: float
 
 
 def map_resolution(motion: Motion, focal_px: float, options: HdaOptions) -> Resolution:
-    """Resolution of a map at the features' median depth.
+    """Estimate the resolution of a map at the features' median depth.
 
-    The tracks' residuals estimate the match error across epipolar lines; the same error along them is a depth error.
+    The tracks' residuals give the match error perpendicular to epipolar lines. The same error is assumed along the
+    lines, where it causes a depth error.
     """
     depth = float(np.median(motion.depths[motion.inliers]))
-    error_px = DEVIATION_OF_MEDIAN * float(np.median(motion.residuals_px[motion.inliers]))
+    error_px = SIGMA_PER_MEDIAN * float(np.median(motion.residuals_px[motion.inliers]))
     error_px = float(np.hypot(error_px, options.match_error_px))
     return Resolution(depth * (2 * options.search_half_px + 1) / focal_px, depth * error_px / motion.parallax_px)
 
 
 def roughness_limit_m(resolution: Resolution, cell_m: float, options: HdaOptions) -> float:
-    """Largest roughness of a safe footprint in the map; not above 0 if the map cannot resolve hazards.
+    """Maximum roughness of a safe footprint in the map; zero or negative if the map cannot resolve hazards.
 
-    A match averages a window of side w; a cell of side s averages points up to s away and its middle is up to s / 2 off
-    the top of a hazard. A paraboloid of width D appears with the fraction ``1 - 4 r2 / D**2`` of its height, with r2
+    A match averages a window of side w. A cell of side s averages points up to a distance s, and its centre is up to
+    s / 2 from the top of a hazard. A paraboloid of width D has ``1 - 4 r2 / D**2`` of its height in the map, with r2
     the mean square distance from its top: w**2 / 6 (window) + s**2 / 3 (weights) + s**2 / 2 (position). The limit is
-    the appearing height of the narrowest hazard of the lander's limit, less the map's noise.
+    the height in the map of the narrowest hazard at the lander's limit, minus the map's noise.
     """
-    spread = resolution.window_m**2 / 6.0 + 5.0 / 6.0 * cell_m**2
+    mean_square_m2 = resolution.window_m**2 / 6.0 + 5.0 / 6.0 * cell_m**2
     width = options.narrowest_hazard * options.max_roughness_m
-    resolved = max(1.0 - 4.0 * spread / width**2, 0.0)
-    return resolved * options.max_roughness_m - options.margin_deviations * resolution.noise_m
+    height_fraction = max(1.0 - 4.0 * mean_square_m2 / width**2, 0.0)
+    return height_fraction * options.max_roughness_m - options.margin_deviations * resolution.noise_m
 
 
 def check_footprints(
     safety: UInt8[np.ndarray, "rows columns"], ground: ElevationMap, resolution: Resolution, options: HdaOptions
 ) -> UInt8[np.ndarray, "rows columns"]:
-    """The safe landing map with unsafe footprints as hazards.
+    """Mark unsafe footprints as hazards in a safe landing map; return the new map.
 
-    The maps of section III know planes of fixed squares only. Here the footprint about each position is tested for the
-    slope of its own robust plane and its largest distance from that plane. A lattice of `POINTS_ACROSS` positions per
-    diameter is tested; each cell takes the result of the nearest one.
+    The maps of section III use planes of fixed squares only. This test fits a robust plane to the footprint at each
+    position and checks its slope and the largest distance from it. The positions are a lattice of `POINTS_PER_DIAMETER`
+    positions per diameter; each cell gets the result of the nearest position.
     """
-    cells_across = options.lander_diameter_m / ground.cell_m
-    step = max(int(cells_across / POINTS_ACROSS), 1)
+    diameter_cells = options.lander_diameter_m / ground.cell_m
+    step = max(int(diameter_cells / POINTS_PER_DIAMETER), 1)
     lattice = np.zeros(safety.shape, dtype=bool)
     lattice[::step, ::step] = True
-    # a safe cell off the lattice needs its nearest lattice cell tested, safe or not
-    wanted = np.zeros_like(lattice)
+    # test the nearest lattice cell of each safe cell, also if it is not safe
+    is_tested = np.zeros_like(lattice)
     safe = np.argwhere(safety == Safety.SAFE)
     nearest = tuple(np.minimum((safe + step // 2) // step * step, (np.array(safety.shape) - 1) // step * step).T)
-    wanted[nearest] = True
-    rows, columns = np.nonzero(wanted & lattice)
-    offsets = disc_cells(0.5 * cells_across)
-    fitted = offsets[np.all(offsets % step == 0, axis=1)].copy()
+    is_tested[nearest] = True
+    rows, columns = np.nonzero(is_tested & lattice)
+    offsets = disc_cells(0.5 * diameter_cells)
+    fit_offsets = offsets[np.all(offsets % step == 0, axis=1)].copy()
     triples = np.random.default_rng(options.seed).uniform(size=(options.plane_trials, 3))
-    slopes, roughness = kernels.under_lander(
-        ground.elevation_m, rows, columns, offsets, fitted, max(len(fitted) // 2, 4), triples, options.refine_planes
+    min_cells = max(len(fit_offsets) // 2, 4)
+    slopes, roughness = kernels.evaluate_footprints(
+        ground.elevation_m, rows, columns, offsets, fit_offsets, min_cells, triples, options.refine_planes
     )
     max_slope_rad = options.max_slope_rad - options.margin_deviations * options.level_error_rad
     max_roughness_m = roughness_limit_m(resolution, ground.cell_m, options)
     with np.errstate(invalid="ignore"):
-        good = (np.arctan(slopes / ground.cell_m) <= max_slope_rad) & (roughness <= max_roughness_m)
-    good &= max_roughness_m > 0.0
-    fails = np.zeros_like(lattice)
-    fails[rows[~good], columns[~good]] = True
+        is_safe = (np.arctan(slopes / ground.cell_m) <= max_slope_rad) & (roughness <= max_roughness_m)
+    is_safe &= max_roughness_m > 0.0
+    is_unsafe = np.zeros_like(lattice)
+    is_unsafe[rows[~is_safe], columns[~is_safe]] = True
     result = safety.copy()
-    result[tuple(safe[fails[nearest]].T)] = Safety.HAZARD
+    result[tuple(safe[is_unsafe[nearest]].T)] = Safety.HAZARD
     return result
 
 
 def disc_cells(radius_cells: float) -> Int[np.ndarray, "n 2"]:
-    """Cells (row, column) of a disc, relative to its middle."""
-    reach = int(radius_cells)
-    across = np.arange(-reach, reach + 1)
-    cells = np.stack(np.meshgrid(across, across, indexing="ij"), axis=-1).reshape(-1, 2)
+    """Cells (row, column) of a disc, relative to its centre."""
+    radius = int(radius_cells)
+    offsets = np.arange(-radius, radius + 1)
+    cells = np.stack(np.meshgrid(offsets, offsets, indexing="ij"), axis=-1).reshape(-1, 2)
     return np.asarray(cells[np.hypot(*cells.T) <= radius_cells])

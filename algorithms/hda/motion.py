@@ -1,4 +1,4 @@
-"""Undistorted views, and structure from motion: camera motion and depths of features from tracks (section II.B)."""
+"""Views with undistorted coordinates, and structure from motion: camera motion and feature depths (section II.B)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.arrays import Flags, Points2, Points3, Values, Vector3
+from marsyard.algorithms.arrays import Flags, Points2, Points3, Vector, Vector3
 from marsyard.algorithms.hda.kernels import motion as kernels
 from marsyard.algorithms.hda.options import HdaOptions
 from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
@@ -16,7 +16,7 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DetectorImage, LandingMeasurements, PoseMeasurement
 
-#: Minimum relative response for the division; dead pixels have less.
+#: Lower limit of the flat field before division; dead pixels are below it.
 MIN_RESPONSE = 0.05
 
 
@@ -24,9 +24,9 @@ MIN_RESPONSE = 0.05
 class View:
     """One image in its camera's frame.
 
-    - counts: Detector counts without frame transfer, pixel response and lens fall-off
-    - camera: Its camera, in the camera frame
-    - world_from_camera: The camera's pose by the on-board filter
+    - counts: Detector counts corrected for frame transfer, pixel response and lens fall-off
+    - camera: Camera model, in the camera's own frame
+    - world_from_camera: Camera pose estimated on board
     """
 
     counts: UInt16[np.ndarray, "rows columns"]
@@ -44,21 +44,21 @@ Views = tuple[View, View]
 
 
 def build_view(image: DetectorImage, pose: PoseMeasurement) -> View:
-    """The view of an image taken at a pose. Raises ValueError if the image's size is not its camera's."""
+    """Build the view of an image taken at a pose. Raises ValueError if the image's size differs from its camera's."""
     if image.counts.shape != image.camera.size[::-1]:
-        raise ValueError(f"the picture has (rows, columns) {image.counts.shape}, its camera {image.camera.size[::-1]}")
+        raise ValueError(f"the image has (rows, columns) {image.counts.shape}, its camera {image.camera.size[::-1]}")
     body_from_camera = camera_pose(image.camera)
     camera = image.camera.transform(body_from_camera.inv())
-    return View(flat_fielded(image), camera, pose.world_from_body * body_from_camera)
+    return View(apply_flat_field(image), camera, pose.world_from_body * body_from_camera)
 
 
-def flat_fielded(image: DetectorImage) -> UInt16[np.ndarray, "rows columns"]:
-    """Counts without offset, frame transfer and response variations.
+def apply_flat_field(image: DetectorImage) -> UInt16[np.ndarray, "rows columns"]:
+    """Correct counts for offset, frame transfer and response variations.
 
-    A lens passes a third less light in its corners, which biases sums of absolute differences (Eq. 9) of the same
-    ground seen in the middle and near the border. Over rendered rocks from 15 m a fifth of the points was wrong without
-    this correction, and half a per cent with it. Frame transfer is removed first: at 10 ms it is half of the exposure's
-    light in the last of the MER camera's 1,024 rows.
+    A lens transmits a third less light in its corners. This biases sums of absolute differences (Eq. 9) between image
+    centre and border. Over rendered rocks from 15 m, 20 % of the points were wrong without this correction and 0.5 %
+    with it. Frame transfer is removed first: at 10 ms it is half of the exposure's signal in the last of the MER
+    camera's 1,024 rows.
     """
     detector = image.calibration
     response = np.maximum(detector.flat_field, MIN_RESPONSE).astype(np.float32)
@@ -68,27 +68,27 @@ def flat_fielded(image: DetectorImage) -> UInt16[np.ndarray, "rows columns"]:
 
 
 def camera_pose(camera: CameraModel) -> RigidTransform:
-    """The transform from the camera frame to the frame of the camera model."""
+    """Transform from the camera frame to the frame of the camera model."""
     axes = np.column_stack([camera.right, np.cross(camera.a, camera.right), camera.a])
     return rigid(Rotation.from_matrix(axes), np.array(camera.c))
 
 
 def undistort(camera: CameraModel, pixels: Points2) -> Points2:
-    """Unit focal length coordinates of pixels; NaN without a forward ray."""
+    """Normalised image coordinates of pixels; NaN if the ray does not point forward."""
     directions = camera.rays(pixels)[1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        places: Points2 = directions[:, :2] / directions[:, 2:]
-    places[~(directions[:, 2] > 0.0)] = np.nan
-    return places
+        coordinates: Points2 = directions[:, :2] / directions[:, 2:]
+    coordinates[~(directions[:, 2] > 0.0)] = np.nan
+    return coordinates
 
 
-def points_at_depth(places: Points2, depths: Values) -> Points3:
-    """Points (camera frame) of undistorted coordinates at depths (Eq. 6)."""
-    return np.asarray(np.column_stack([places, np.ones(len(places))]) * depths[:, None])
+def points_at_depth(coordinates: Points2, depths: Vector) -> Points3:
+    """Points (camera frame) of normalised image coordinates at depths (Eq. 6)."""
+    return np.asarray(np.column_stack([coordinates, np.ones(len(coordinates))]) * depths[:, None])
 
 
 def project_points(camera: CameraModel, points: Points3) -> tuple[Points2, Flags]:
-    """Pixels of points in the camera frame and whether they lie in the picture."""
+    """Pixels of points in the camera frame, and whether they lie inside the image."""
     pixels, visible = camera.project(points)
     return pixels, visible & camera.in_frame(pixels)
 
@@ -98,7 +98,7 @@ class LandingScene:
     """Two views and the measurements taken with the first.
 
     - range_m: Depth of the ground on the first camera's optical axis; NaN if unknown
-    - up_camera: Unit vector upwards by the inclinometers, in the first camera's frame
+    - up_camera: Unit vector upwards measured by the inclinometers, in the first camera's frame
     - apriori_site_world: Default landing site
     """
 
@@ -109,12 +109,12 @@ class LandingScene:
 
     @property
     def second_from_first(self) -> RigidTransform:
-        """The camera's motion by the on-board poses."""
+        """Relative camera pose from the on-board poses."""
         return self.views[1].world_from_camera.inv() * self.views[0].world_from_camera
 
 
 def build_scene(measurements: LandingMeasurements) -> LandingScene:
-    """Transform the measurements to the cameras' frames. Raises ValueError if an image's size is not its camera's."""
+    """Transform the measurements to the cameras' frames. Raises ValueError as `build_view`."""
     pairs = zip(measurements.images, measurements.poses, strict=True)
     first, second = (build_view(image, pose) for image, pose in pairs)
     body_from_camera = camera_pose(measurements.images[0].camera)
@@ -123,16 +123,16 @@ def build_scene(measurements: LandingMeasurements) -> LandingScene:
 
 
 #: Decreasing scales of Cauchy's cost, pixels, for the motion at fixed initial depths (graduated non-convexity, Blake &
-#: Zisserman 1987). Of 300 motions with a fifth of the tracks wrong by 20 px rms, 97 % are solved correctly; 80 % if
-#: depths are free after the first scale.
+#: Zisserman 1987). Of 300 motions with 20 % of the tracks wrong by 20 px rms, 97 % are solved correctly; 80 % if the
+#: depths are estimated after the first scale.
 START_SCALES_PX = (32.0, 8.0, 3.0)
-#: Maximum number of steps at a scale. Over slopes the initial plane is wrong: of 40 rendered pairs over steep ground 4
-#: needed 60 to 100 steps.
+#: Maximum number of steps at each scale. Over slopes the initial plane is wrong: of 40 rendered pairs over steep ground
+#: 4 required 60 to 100 steps.
 ITERATIONS = 300
 START_TOLERANCE = 1e-4
-#: Step (radians; fraction of the depth) below which the minimum is reached.
+#: Step length (radians; fraction of the depth) below which the iteration has converged.
 TOLERANCE = 1e-9
-#: Largest relative deviation of an inlier's inverse depth from the plane through all.
+#: Largest relative deviation of an inlier's inverse depth from the plane fit.
 MAX_INVERSE_DEPTH_FRACTION = 0.6
 
 
@@ -144,21 +144,21 @@ class Motion:
     - depths: Depths of the features in the first camera's frame, metres
     - residuals_px: Reprojection errors in the second image
     - inliers: Whether residual and depth of a feature are plausible
-    - parallax_px: Median shift due to the translation, of the features that fit the motion
+    - parallax_px: Median image shift due to the translation, over the features that fit the motion
     - converged: Whether the iteration reached a minimum
     """
 
     second_from_first: RigidTransform
-    depths: Values
-    residuals_px: Values
+    depths: Vector
+    residuals_px: Vector
     inliers: Flags
     parallax_px: float
     converged: bool
 
     def scale(self, factor: float) -> Motion:
-        """The motion with all lengths multiplied."""
-        moved = rigid(self.second_from_first.rotation, factor * self.second_from_first.translation)
-        return replace(self, second_from_first=moved, depths=factor * self.depths)
+        """Return the motion with all lengths multiplied by a factor."""
+        scaled_pose = rigid(self.second_from_first.rotation, factor * self.second_from_first.translation)
+        return replace(self, second_from_first=scaled_pose, depths=factor * self.depths)
 
     @property
     def depth_range_m(self) -> tuple[float, float]:
@@ -167,11 +167,11 @@ class Motion:
         return float(depths.min()), float(depths.max())
 
 
-def plane_depths(places: Points2, range_m: float, up_camera: Vector3) -> Values:
-    """Depths of level ground that the optical axis meets at `range_m`; the range itself for implausible depths."""
-    toward = np.column_stack([places, np.ones(len(places))]) @ up_camera
+def plane_depths(coordinates: Points2, range_m: float, up_camera: Vector3) -> Vector:
+    """Depths of level ground at `range_m` on the optical axis; `range_m` itself if a depth is implausible."""
+    up_components = np.column_stack([coordinates, np.ones(len(coordinates))]) @ up_camera
     with np.errstate(divide="ignore", invalid="ignore"):
-        depths = range_m * up_camera[2] / toward
+        depths = range_m * up_camera[2] / up_components
     return np.where((depths > 0.2 * range_m) & (depths < 5.0 * range_m), depths, range_m)
 
 
@@ -179,32 +179,32 @@ def estimate_motion(
     first: Points2,
     second: Points2,
     focal_px: float,
-    depths: Values,
-    starts: tuple[RigidTransform, ...],
+    depths: Vector,
+    initial_motions: tuple[RigidTransform, ...],
     options: HdaOptions,
 ) -> Motion:
-    """Motion and depths of least cost over several starts; the common scale of lengths is that of `depths`.
+    """Estimate motion and depths of minimum cost from several initial motions.
 
-    `first` and `second` are undistorted coordinates, `focal_px` their unit in pixels, `depths` initial depths (metres,
-    from the altimeter), `starts` initial motions. The unknowns are a unit quaternion, the translation and the inverse
-    depths; the reprojection error in the second image (Eqs. 6-8) is minimised under Cauchy's cost. From each start the
-    motion is first solved for fixed depths, which avoids the second of the two motions that explain a plane.
+    `first` and `second` are normalised image coordinates, `focal_px` their unit in pixels. `depths` are initial depths
+    (metres, from the altimeter); they define the scale of lengths. The unknowns are a unit quaternion, the translation
+    and the inverse depths; Cauchy's cost of the reprojection error in the second image (Eqs. 6-8) is minimised. The
+    motion is first solved for fixed depths, which avoids the second solution for planar scenes.
     """
     unit = float(np.median(depths))
     stages = [(scale_px, False, START_TOLERANCE) for scale_px in START_SCALES_PX]
     stages.append((options.robust_px, True, TOLERANCE))
     candidates = []
-    for start in starts:
+    for start in initial_motions:
         cost, converged = np.inf, False
         motion = kernels.Motion(start.rotation.as_quat(scalar_first=True), start.translation / unit, unit / depths)
         for scale_px, with_depths, tolerance in stages:
             matches = kernels.Matches(first, second, focal_px, scale_px)
             motion, cost, converged, _ = kernels.solve(matches, motion, with_depths, ITERATIONS, tolerance)
         candidates.append((motion, cost, converged))
-    best, _, converged = min(candidates, key=lambda found: found[1])
-    moved = rigid(Rotation.from_quat(best.q, scalar_first=True), unit * best.t)
+    best, _, converged = min(candidates, key=lambda candidate: candidate[1])
+    second_from_first = rigid(Rotation.from_quat(best.q, scalar_first=True), unit * best.t)
     with np.errstate(divide="ignore"):
-        return assess_motion(first, second, focal_px, moved, unit / best.inverse_depths, converged, options)
+        return assess_motion(first, second, focal_px, second_from_first, unit / best.inverse_depths, converged, options)
 
 
 def assess_motion(
@@ -212,40 +212,40 @@ def assess_motion(
     second: Points2,
     focal_px: float,
     second_from_first: RigidTransform,
-    depths: Values,
+    depths: Vector,
     converged: bool,
     options: HdaOptions,
 ) -> Motion:
-    """A motion with its residuals, inliers and parallax; the arguments are those of `estimate_motion`."""
+    """Compute residuals, inliers and parallax of a motion; the arguments are those of `estimate_motion`."""
     quaternion = second_from_first.rotation.as_quat(scalar_first=True)
     inverse = 1.0 / depths
     unmatched = kernels.Matches(first, np.zeros_like(first), focal_px, 1.0)
-    shifts = (np.zeros(3), np.array(second_from_first.translation))
-    still, moved = (kernels.residuals(unmatched, kernels.Motion(quaternion, one, inverse)) for one in shifts)
-    residuals = np.hypot(*(moved - focal_px * second).T)
-    fitting = residuals <= options.max_residual_px
+    translations = (np.zeros(3), np.array(second_from_first.translation))
+    without_t, with_t = (kernels.residuals(unmatched, kernels.Motion(quaternion, t, inverse)) for t in translations)
+    residuals = np.hypot(*(with_t - focal_px * second).T)
+    is_fit = residuals <= options.max_residual_px
     return Motion(
         second_from_first=second_from_first,
         depths=depths,
         residuals_px=residuals,
-        inliers=fitting & _has_plausible_depth(first, inverse, fitting),
-        parallax_px=float(np.median(np.hypot(*(moved - still)[fitting].T))) if np.any(fitting) else 0.0,
+        inliers=is_fit & _has_plausible_depth(first, inverse, is_fit),
+        parallax_px=float(np.median(np.hypot(*(with_t - without_t)[is_fit].T))) if np.any(is_fit) else 0.0,
         converged=converged,
     )
 
 
-def _has_plausible_depth(first: Points2, inverse: Values, fitting: Flags) -> Flags:
-    """Whether an inverse depth is near that of the ground plane, linear in undistorted coordinates.
+def _has_plausible_depth(first: Points2, inverse: Vector, is_fit: Flags) -> Flags:
+    """Whether inverse depths are near those of the ground plane, linear in normalised image coordinates.
 
-    A wrong match along the epipolar line fits any motion and shows in its depth alone.
+    A wrong match along the epipolar line fits any motion; only its depth is wrong.
     """
     design = np.column_stack([first, np.ones(len(first))])
-    used = fitting & (inverse > 0.0)
+    mask = is_fit & (inverse > 0.0)
     for _ in range(3):
-        if used.sum() < 4:
-            return used
-        plane = design @ np.linalg.lstsq(design[used], inverse[used], rcond=None)[0]
+        if mask.sum() < 4:
+            return mask
+        plane = design @ np.linalg.lstsq(design[mask], inverse[mask], rcond=None)[0]
         deviations = np.abs(inverse - plane)
-        spread = max(3.0 * 1.4826 * float(np.median(deviations[used])), 1e-3 * float(np.median(inverse[used])))
-        used = fitting & (inverse > 0.0) & (deviations <= spread)
+        limit = max(3.0 * 1.4826 * float(np.median(deviations[mask])), 1e-3 * float(np.median(inverse[mask])))
+        mask = is_fit & (inverse > 0.0) & (deviations <= limit)
     return np.asarray((inverse > 0.0) & (deviations <= MAX_INVERSE_DEPTH_FRACTION * np.abs(plane)))

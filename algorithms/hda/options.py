@@ -9,7 +9,7 @@ import numpy as np
 
 
 class SurfaceFrame(Enum):
-    """Where the direction of gravity comes from (paper: section II.D). Azimuth always comes from the on-board pose."""
+    """Source of the vertical direction (paper: section II.D). The azimuth always comes from the on-board pose."""
 
     INCLINOMETER = "the inclinometers"
     STATE = "the on-board filter's attitude"
@@ -17,7 +17,7 @@ class SurfaceFrame(Enum):
 
 
 class TrackSeed(Enum):
-    """Where the search for a feature in the second picture begins."""
+    """Start of the search for a feature in the second image."""
 
     NOTHING = "where it was in the first picture, as the paper has it"
     POSE = "where level ground at the measured range would move it by the on-board poses"
@@ -29,54 +29,54 @@ class HdaOptions:
 
     - template_half_px: Half width t of the sparse tracker's templates and of the interest window: 2 t + 1 pixels (Table
       I: 11 x 11)
-    - window_half_px: Half width w of the window in which a feature is looked for (Table I: 81 x 81)
-    - block_px: Side of the blocks of which each gives its best feature. 64 px give 80 blocks on 640 x 480, and 50 to 70
-      tracks; the paper had 59.
-    - min_eigenvalue: Minimum eigenvalue lambda_t of Eq. 2, for the template's mean instead of its sum, squared counts
-      per squared pixel. Noise of one count alone has about 0.2.
-    - min_track_correlation: Minimum correlation (Eq. 3) of a track at the finest level. Without `align` wrong tracks
-      over rocks have up to 0.8, and correct ones of images whose heights differ by a fifth as low as 0.6.
-    - min_aligned_correlation: Minimum correlation of the aligned track with the stretched template. Over 25 rendered
-      pairs, at the paper's limits, 99 % of correct tracks of each pair have at least 0.91; of wrong ones, most of which
-      left the image, two in three have less than 0.88.
+    - window_half_px: Half width w of the search window of a feature (Table I: 81 x 81)
+    - block_px: Side of the blocks; the best feature of each block is used. 64 px give 80 blocks in 640 x 480 pixels,
+      and 50 to 70 tracks; the paper had 59.
+    - min_eigenvalue: Minimum eigenvalue lambda_t of Eq. 2, for the mean over the template instead of the sum, squared
+      counts per squared pixel. Noise of one count alone has about 0.2.
+    - min_track_correlation: Minimum correlation (Eq. 3) of a track at the finest level. Without `align`, wrong tracks
+      over rocks have up to 0.8; correct tracks have down to 0.6 if the heights of the images differ by 20 %.
+    - min_aligned_correlation: Minimum correlation of the aligned track with the warped template. Over 25 rendered pairs
+      at the paper's limits, 99 % of the correct tracks of each pair have at least 0.91. Two thirds of the wrong tracks,
+      most of which left the image, have less than 0.88.
     - track_seed: Start of the search
-    - align: Whether Gauss-Newton alignment over an affine warp follows the biquadratic of the paper, whose bias towards
-      whole pixels is up to 0.09 px and which neglects rotation and scale. A track that cannot be aligned is rejected:
-      over rocks, at small changes, 6 of 276 such tracks were correct; of 1,199 aligned ones 4 were wrong and the others
-      accurate to 0.2 px, with a median of 0.004 px.
-    - min_tracks: Minimum number of tracks: a motion needs five; more reveal outliers
-    - robust_px: Scale of Cauchy's cost of a residual, pixels: the spread of good tracks
+    - align: Whether Gauss-Newton alignment with an affine warp follows the biquadratic fit of the paper. The fit has a
+      bias towards whole pixels of up to 0.09 px and neglects rotation and scale. A track that cannot be aligned is
+      rejected: over rocks, at small changes, 6 of 276 such tracks were correct. Of 1,199 aligned tracks 4 were wrong
+      and the others accurate to 0.2 px, with a median of 0.004 px.
+    - min_tracks: Minimum number of tracks: five determine a motion, more are needed to detect outliers
+    - robust_px: Scale of Cauchy's cost of a residual, pixels: the standard deviation of good tracks
     - max_residual_px: Residual above which a track is an outlier
-    - min_inlier_share: Minimum fraction of inliers among the tracks of an accepted motion
+    - min_inlier_fraction: Minimum fraction of inliers among the tracks of an accepted motion
     - min_parallax_px: Minimum median shift of the features by translation alone. Tracks are accurate to 0.1 px: below
       this, depths would be wrong by more than 5 %.
-    - depth_margin: Relative margin of the depth bounds beyond the features' (section II.C: 0.2 to 0.4)
+    - depth_margin: Relative margin added to the features' depth range (section II.C: 0.2 to 0.4)
     - grid_px: Spacing of the grid of structure pixels
     - search_half_px: Half width of the windows compared along epipolar segments
     - min_match_correlation: Minimum correlation (Eq. 3) of a structure match
-    - max_return_px: Not in the paper: each structure match is matched back from the second image to the first, and
-      dropped if it returns farther than this, pixels, from its start. None: no such check, as in the paper. Both
-      searches use whole pixels near a line, each up to 0.7 px off.
+    - max_return_px: Maximum forward-backward error, pixels: each structure match is matched back from the second image
+      to the first and rejected if the distance to its start is larger. None: no check, as in the paper. Both searches
+      use whole pixels near a line, with errors of up to 0.7 px.
     - min_points: Minimum number of points for an elevation map
     - surface_frame: Source of the vertical
-    - lander_diameter_m: Side of the lander's footprint; hazards grow by it (section III). The helicopter is 2 m long.
-    - plane_trials: Random triples of points for the least-median-of-squares plane of a footprint. With half of the
-      points off the plane 30 trials find it in 98 % of footprints, with 30 % in all but 3 in a million.
+    - lander_diameter_m: Side of the lander's footprint, by which hazards are dilated (section III). Helicopter: 2 m.
+    - plane_trials: Random triples of points for the least-median-of-squares plane of a footprint. If half of the points
+      are not on the plane, 30 trials find it in 98 % of footprints; if 30 % are not, in all but 3 in a million.
     - refine_planes: Whether each plane is refined by least squares over its inliers (Rousseeuw & Leroy 1987)
     - max_slope_rad, max_roughness_m: Limits of the lander, set by the user (section III)
-    - hazard_growth, unknown_growth: By how many diameters hazards, and borders and holes of the map, are grown. The
-      paper has 1 for hazards; "near" borders is taken as half of one: the lander would stand on ground that was not
-      seen.
-    - check_footprints: Whether positions that are safe in the paper's maps must also be safe for the plane of their own
-      footprint, with a margin for the map's resolution (`marsyard.algorithms.hda.hazards.check_footprints`). The paper
-      interpolates planes and slopes between fixed squares: over curved ground the distance from that surface is half of
-      the distance from a plane.
-    - narrowest_hazard: Width at the foot of the narrowest hazard over its height. Rocks are up to 0.65 as tall as wide
-      (Golombek & Rapp 1997: 0.5, with the spread of a third that rocks have).
-    - margin_deviations: Safety margin in standard deviations of the map's noise, and of the vertical
+    - hazard_growth, unknown_growth: Dilation of hazards, and of borders and holes of the map, in lander diameters. The
+      paper uses 1 for hazards. For "near" borders 0.5 is assumed: nearer, part of the lander would stand on unmapped
+      ground.
+    - check_footprints: Whether each position that is safe in the paper's maps is also checked with a plane fitted to
+      its footprint, with a margin for the map's resolution (`marsyard.algorithms.hda.hazards.check_footprints`). The
+      paper interpolates planes and slopes between fixed squares: over curved ground the distance from that surface is
+      half of the distance from a plane.
+    - narrowest_hazard: Ratio of base width to height of the narrowest hazard. Rocks have heights of up to 0.65 widths
+      (Golombek & Rapp 1997: 0.5, with a variation of one third).
+    - margin_deviations: Safety margin in standard deviations of the map's noise and of the vertical
     - match_error_px: Minimum error of a structure match: the biquadratic's bias towards whole pixels is up to 0.09 px
-    - level_error_rad: Standard deviation of the vertical, including the tilt of the map by the motion's error
-    - seed: Seed of the random triples, the same for every map: the answer is a function of the measurements
+    - level_error_rad: Standard deviation of the vertical, including the map's tilt due to the motion's error
+    - seed: Seed of the random triples, the same for every map: the result depends only on the measurements
     """
 
     template_half_px: int = 5
@@ -90,7 +90,7 @@ class HdaOptions:
     min_tracks: int = 12
     robust_px: float = 0.1
     max_residual_px: float = 1.0
-    min_inlier_share: float = 0.5
+    min_inlier_fraction: float = 0.5
     min_parallax_px: float = 2.0
     depth_margin: float = 0.3
     grid_px: int = 8
@@ -126,7 +126,7 @@ class HdaOptions:
             raise ValueError(f"depth_margin is {self.depth_margin}; it must be below 1")
 
 
-#: Names of options by their minimum.
+#: Minimum value: names of the options.
 _MINIMA = {
     0: (
         *("depth_margin", "hazard_growth", "unknown_growth", "margin_deviations"),

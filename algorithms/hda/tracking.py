@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from marsyard.algorithms.arrays import Counts, Flags, Points2, Raster, Values, Vector2
+from marsyard.algorithms.arrays import Counts, Flags, Points2, Raster, Vector, Vector2
 from marsyard.algorithms.hda.kernels import matching
 from marsyard.algorithms.hda.options import HdaOptions
 from marsyard.algorithms.image.correlation import halve
@@ -29,8 +29,8 @@ class LevelSize:
 def level_sizes(template_half: int, window_half: int) -> tuple[LevelSize, ...]:
     """Sizes at each pyramid level, finest first (Eqs. 4 and 5).
 
-    w of Eq. 4 is taken as the half width of Eq. 5: n = log2(w) - 2 levels leave a window of half width 4 to 8 at the
-    coarsest. Fractions are truncated.
+    w of Eq. 4 is assumed to be the half width of Eq. 5: with n = log2(w) - 2 levels the coarsest window has a half
+    width of 4 to 8. Fractions are truncated.
     """
     coarsest = max(int(np.log2(window_half)) - 2, 0)
     sizes = []
@@ -41,14 +41,14 @@ def level_sizes(template_half: int, window_half: int) -> tuple[LevelSize, ...]:
     return tuple(sizes)
 
 
-def template_reach_px(options: HdaOptions) -> int:
-    """Largest half width of a template over the levels, pixels of the full image; one more at the finest."""
+def feature_border_px(options: HdaOptions) -> int:
+    """Minimum distance of features from the image border, pixels: templates fit at all levels with one pixel margin."""
     sizes = level_sizes(options.template_half_px, options.window_half_px)
     return max((size.template_half + 1) << level for level, size in enumerate(sizes))
 
 
 def pyramid(counts: Counts, levels: int) -> tuple[Float[np.ndarray, "_ _"], ...]:
-    """The image and its block averages over 2, 4, ... pixels, finest first, float32."""
+    """Image and its block averages over 2, 4, ... pixels, finest first, float32."""
     result = [counts.astype(np.float32)]
     for _ in range(levels - 1):
         result.append(halve(result[-1]))
@@ -56,23 +56,23 @@ def pyramid(counts: Counts, levels: int) -> tuple[Float[np.ndarray, "_ _"], ...]
 
 
 def eigenvalue_test(image: Raster, support: int, min_eigenvalue: float) -> Raster:
-    """P of Eq. 2 where both eigenvalues of the structure tensor exceed the minimum l, minus infinity elsewhere.
+    """Interest P of Eq. 2 where both eigenvalues of the structure tensor exceed the minimum l; -inf elsewhere.
 
     P is (a - l)(c - l) - b b with a > l (Benedetti & Perona 1998). The tensor is the mean, not the sum, over
     `support` x `support` pixels (Eq. 1 divided by their number).
     """
     a, c, b = structure_tensor(image, support)
-    p = (a - min_eigenvalue) * (c - min_eigenvalue) - b * b
-    return np.asarray(np.where((p > 0.0) & (a > min_eigenvalue), p, -np.inf), dtype=np.float32)
+    interest = (a - min_eigenvalue) * (c - min_eigenvalue) - b * b
+    return np.asarray(np.where((interest > 0.0) & (a > min_eigenvalue), interest, -np.inf), dtype=np.float32)
 
 
 def select_features(counts: Counts, options: HdaOptions) -> Points2:
-    """Pixels (u, v) of the best feature in each block that has one, block by block along rows.
+    """Pixels (u, v) of the best feature of each block, block by block along rows; blocks without a feature are skipped.
 
-    Features keep the distance from the image border that their template needs at every pyramid level.
+    The distance of features from the image border is at least `feature_border_px`.
     """
     interest = eigenvalue_test(counts.astype(np.float32), 2 * options.template_half_px + 1, options.min_eigenvalue)
-    border = template_reach_px(options)
+    border = feature_border_px(options)
     interest[:border] = interest[-border:] = -np.inf
     interest[:, :border] = interest[:, -border:] = -np.inf
     side = options.block_px
@@ -85,8 +85,8 @@ def select_features(counts: Counts, options: HdaOptions) -> Points2:
     return np.column_stack([column[has_peak], row[has_peak]]).astype(np.float64)
 
 
-#: Limits of an alignment: a height change of a fifth stretches the image by a quarter, and the first steps overshoot.
-#: The default limits (0.35, 1.5 px, 12 steps) rejected a fifth of the correct tracks at 20 % less height.
+#: Limits of an alignment: a height change of 20 % stretches the image by 25 %, and the first steps overshoot. The
+#: default limits (0.35, 1.5 px, 12 steps) rejected 20 % of the correct tracks at 20 % less height.
 ALIGNMENT = Limits(shift_px=2.5, stretch=0.5, steps=30)
 
 
@@ -96,55 +96,55 @@ class Tracks:
 
     - first: Pixels (u, v) in the first image
     - second: Pixels (u, v) in the second image; NaN if no template fits
-    - correlations: Eq. 3 at the top of the biquadratic; NaN likewise
+    - correlations: Eq. 3 at the biquadratic peak; NaN if no template fits
     - accepted: Whether the correlation exceeds the threshold and, with `align`, the alignment succeeded
     """
 
     first: Points2
     second: Points2
-    correlations: Values
+    correlations: Vector
     accepted: Flags
 
 
 def track_features(first: Counts, second: Counts, features: Points2, expected: Points2, options: HdaOptions) -> Tracks:
-    """Track features by correlation, coarse to fine, within the window about their expected pixels (u, v).
+    """Track features by correlation, coarse to fine, within the window around their expected pixels (u, v).
 
-    Twice the best shift at a level starts the search at the next finer level. Tracks end at the top of the biquadratic
-    through the correlations about the best pixel or, with `align`, are aligned from there.
+    Twice the best shift of a level is the start of the search at the next finer level. The result is the biquadratic
+    peak of the correlations around the best pixel; with `align` it is refined by registration.
     """
     sizes = level_sizes(options.template_half_px, options.window_half_px)
     firsts, seconds = (pyramid(counts, len(sizes)) for counts in (first, second))
-    places = np.rint(features[:, ::-1]).astype(np.int64)
+    pixels = np.rint(features[:, ::-1]).astype(np.int64)
     limit = float(max(first.shape))
-    wanted = np.clip(np.nan_to_num(expected - features, nan=0.0), -limit, limit)[:, ::-1]
-    shifts = np.rint(wanted / 2 ** (len(sizes) - 1)).astype(np.int64)
+    expected_shifts = np.clip(np.nan_to_num(expected - features, nan=0.0), -limit, limit)[:, ::-1]
+    shifts = np.rint(expected_shifts / 2 ** (len(sizes) - 1)).astype(np.int64)
     for level in range(len(sizes) - 1, -1, -1):
         size = sizes[level]
-        shifts, _ = matching.search_level(
-            firsts[level], seconds[level], places >> level, shifts, size.template_half, size.window_half
+        shifts, _ = matching.search_windows(
+            firsts[level], seconds[level], pixels >> level, shifts, size.template_half, size.window_half
         )
         shifts = 2 * shifts if level else shifts
-    found, correlations = matching.refine_shifts(firsts[0], seconds[0], places, shifts, options.template_half_px)
+    tracked, correlations = matching.refine_shifts(firsts[0], seconds[0], pixels, shifts, options.template_half_px)
     accepted = correlations >= options.min_track_correlation
     if options.align:
         for k in np.flatnonzero(accepted):
-            match = align_track(firsts[0], seconds[0], places[k], found[k], options)
+            match = align_track(firsts[0], seconds[0], pixels[k], tracked[k], options)
             accepted[k] = match is not None
-            found[k] = found[k] if match is None else match
-    return Tracks(features, found, correlations, accepted)
+            tracked[k] = tracked[k] if match is None else match
+    return Tracks(features, tracked, correlations, accepted)
 
 
 def align_track(
-    first: Raster, second: Raster, place: Int[np.ndarray, "2"], found: Vector2, options: HdaOptions
+    first: Raster, second: Raster, pixel: Int[np.ndarray, "2"], match_pixel: Vector2, options: HdaOptions
 ) -> Vector2 | None:
-    """Pixel (u, v) in the second image of a position (row, column) in the first, aligned from the match `found`.
+    """Align the match of a pixel (row, column) of the first image; return its pixel (u, v) in the second image.
 
-    The template may stretch. None if the alignment fails or its correlation is too low.
+    The alignment starts at `match_pixel` (u, v), with an affine warp. None if it fails or its correlation is too low.
     """
     half = options.template_half_px
-    row, column = place
+    row, column = pixel
     template = first[row - half : row + half + 1, column - half : column + half + 1]
-    match = register_template(template, second, found[::-1] - half, "stretch", limits=ALIGNMENT)
+    match = register_template(template, second, match_pixel[::-1] - half, "stretch", limits=ALIGNMENT)
     if match is None or match.score < options.min_aligned_correlation:
         return None
     return np.asarray(match.corner[::-1] + half)

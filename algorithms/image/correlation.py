@@ -1,4 +1,4 @@
-"""Normalised and pseudo-normalised correlation of a template with a window, and the peaks of correlation surfaces."""
+"""Normalised and pseudo-normalised correlation of a template with a window, and peaks of correlation surfaces."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ class Peak:
 
 
 def highest_peak(surface: Raster) -> Peak:
-    """The maximum of the surface; the first of equals."""
+    """Find the maximum of a surface; the first one of equal values."""
     row, column = (int(i) for i in np.unravel_index(int(np.argmax(surface)), surface.shape))
     on_border = row in (0, surface.shape[0] - 1) or column in (0, surface.shape[1] - 1)
     return Peak(row, column, float(surface[row, column]), on_border)
 
 
 def biquadratic_offset(surface: Raster, peak: Peak) -> Vector2:
-    """Offset (row, column) of the top of the least-squares quadric through the 3 x 3 values about the peak.
+    """Fit a quadratic by least squares to the 3 x 3 values around the peak; return its maximum's offset (row, column).
 
-    In pixels, clipped to [-1, 1]; zero on the border and without a maximum. Its bias towards whole pixels reaches
-    several hundredths of a pixel; `refine_shift` has no such bias.
+    In pixels, clipped to [-1, 1]. Zero if the peak is on the border or the quadratic has no maximum. The bias towards
+    whole pixels is up to several hundredths of a pixel; `refine_shift` has no such bias.
     """
     if peak.on_border:
         return np.zeros(2)
@@ -55,8 +55,8 @@ def biquadratic_offset(surface: Raster, peak: Peak) -> Vector2:
 def peak_width(surface: Raster, peak: Peak, level: float = 0.75) -> float:
     """Full width of the peak at `level` times its height along its longest direction, in pixels.
 
-    The major axis of the ellipse with the second moments of the connected region above the level. A sharp peak of one
-    pixel has 1.15; a ridge has its length. The surface's diagonal without a positive peak.
+    This is the major axis of the ellipse with the second moments of the connected region above the level: 1.15 for a
+    sharp peak of one pixel, the length of a ridge, and the surface's diagonal without a positive peak.
     """
     if peak.value <= 0.0:
         return float(np.hypot(*surface.shape))
@@ -68,18 +68,18 @@ def peak_width(surface: Raster, peak: Peak, level: float = 0.75) -> float:
 
 
 def second_peak(surface: Raster, peak: Peak, exclusion: float) -> float:
-    """The highest local maximum (of 3 x 3) further than `exclusion` pixels from the peak; 0 without a positive one."""
+    """Highest local maximum (of 3 x 3) farther than `exclusion` pixels from the peak; 0 if none is positive."""
     maxima = np.argwhere(surface >= ndimage.maximum_filter(surface, size=3, mode="nearest"))
     distances = np.hypot(maxima[:, 0] - peak.row, maxima[:, 1] - peak.column)
-    others = maxima[distances > exclusion]
-    values = surface[others[:, 0], others[:, 1]]
+    distant_maxima = maxima[distances > exclusion]
+    values = surface[distant_maxima[:, 0], distant_maxima[:, 1]]
     return float(max(values.max(initial=0.0), 0.0))
 
 
 def cross_sums(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ _"]) -> Float[np.ndarray, "_ _"]:
     """Sums of products of the template with the window at every position, by FFT.
 
-    The transform has the window's size: wrap-around only affects positions where the template does not fit.
+    The transform has the window's size: wrap-around affects only positions where the template does not fit.
     """
     shape = (fft.next_fast_len(window.shape[0], real=True), fft.next_fast_len(window.shape[1], real=True))
     spectrum = fft.rfft2(window, shape) * np.conj(fft.rfft2(template, shape))
@@ -88,11 +88,11 @@ def cross_sums(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ 
 
 
 def pseudo_normalized_correlation(template: Float[np.ndarray, "n m"], window: Raster) -> Float[np.ndarray, "_ _"]:
-    """``2 sum(A B) / (sum(A A) + sum(B B))`` with A the template and B the window's patch, each less its own mean.
+    """Pseudo-normalised correlation ``2 sum(A B) / (sum(A A) + sum(B B))`` (DIMES, section II.A).
 
-    Entry (i, j) belongs to the patch with its upper left pixel at (i, j) of the window; the shape is (rows - n + 1,
-    columns - m + 1). Values lie in [-1, 1]; unlike normalised correlation it falls with a contrast difference. Zero if
-    neither has contrast. (DIMES, section II.A.)
+    A is the template and B a patch of the window, each minus its mean. Entry (i, j) belongs to the patch with its upper
+    left pixel at (i, j) of the window; the shape is (rows - n + 1, columns - m + 1). Values lie in [-1, 1] and decrease
+    with a contrast difference, unlike normalised correlation. Zero if neither has contrast.
     """
     scale = max(float(np.abs(template).max()), float(np.abs(window).max()))
     a = template - template.mean(dtype=np.float64)
@@ -102,33 +102,33 @@ def pseudo_normalized_correlation(template: Float[np.ndarray, "n m"], window: Ra
     return np.asarray(kernels.pseudo_normalized(cross, b, template.shape, float(np.sum(a * a)), floor))
 
 
-#: Search radius about a candidate of the coarser level, pixels: its error is one pixel, and one more for sampling.
-REACH_PX = 2
+#: Search radius around a candidate of the coarser level, pixels: one for its error, one for sampling.
+SEARCH_RADIUS_PX = 2
 
 
 def normalized_correlation(template: Float[np.ndarray, "n m"], window: Raster) -> Float[np.ndarray, "_ _"]:
-    """``sum(A B) / sqrt(sum(A A) sum(B B))`` with A the template and B the window's patch, each less its own mean.
+    """Normalised correlation ``sum(A B) / sqrt(sum(A A) sum(B B))`` (tracking paper, Eq. 11).
 
-    Entry (i, j) belongs to the patch with its upper left pixel at (i, j) of the window; the shape is (rows - n + 1,
-    columns - m + 1). Values lie in [-1, 1]; zero if either has no contrast. Accurate to about 1e-5: products are summed
-    in float32. (Tracking paper, Eq. 11.) Raises ValueError if the template is larger than the window.
+    A is the template and B a patch of the window, each minus its mean. Entry (i, j) belongs to the patch with its upper
+    left pixel at (i, j); the shape is (rows - n + 1, columns - m + 1). Values lie in [-1, 1]; zero if either is flat.
+    Accurate to about 1e-5: products are summed in float32. Raises ValueError if the template exceeds the window.
     """
     _check_fit(template, window)
-    a, bright_a = kernels.subtract_mean(np.ascontiguousarray(template, dtype=np.float32))
-    b, bright_b = kernels.subtract_mean(np.ascontiguousarray(window, dtype=np.float32))
-    return np.asarray(kernels.surface(a, b, _flat_energy(template, max(bright_a, bright_b))))
+    a, max_abs_a = kernels.subtract_mean(np.ascontiguousarray(template, dtype=np.float32))
+    b, max_abs_b = kernels.subtract_mean(np.ascontiguousarray(window, dtype=np.float32))
+    return np.asarray(kernels.surface(a, b, _flat_energy(template, max(max_abs_a, max_abs_b))))
 
 
 def coarse_to_fine_peak(template: Float[np.ndarray, "n m"], window: Raster, levels: int, candidates: int) -> Peak:
-    """The maximum of `normalized_correlation`, searched at reduced resolution first.
+    """Find the maximum of `normalized_correlation`, first at reduced resolution.
 
     Template and window are halved `levels` times. The best local maxima of the coarsest correlation, at most
-    `candidates`, are refined level by level; the best at full resolution wins. No levels: full search. (Rosenfeld &
-    Vanderbrug 1977; tracking paper, 4.3.2.) Raises ValueError if the template is larger than the window, or too small
-    to be halved.
+    `candidates`, are refined level by level; the best one at full resolution is returned. With 0 levels the search is
+    exhaustive. (Rosenfeld & Vanderbrug 1977; tracking paper, 4.3.2.) Raises ValueError if the template is larger than
+    the window, or too small to be halved.
     """
     if min(template.shape) >> levels < 2:
-        raise ValueError(f"a template of {template.shape} pixels cannot be halved {levels} times: 2 must be left")
+        raise ValueError(f"a template of {template.shape} pixels cannot be halved {levels} times: fewer than 2 remain")
     _check_fit(template, window)
     pyramid = [(template, window)]
     for _ in range(levels):
@@ -137,22 +137,22 @@ def coarse_to_fine_peak(template: Float[np.ndarray, "n m"], window: Raster, leve
     maxima = np.argwhere(surface >= cv2.dilate(surface, np.ones((3, 3), np.uint8)))
     values = surface[maxima[:, 0], maxima[:, 1]]
     order = np.argsort(-values, kind="stable")[: candidates if levels else 1]
-    places, values = maxima[order], values[order]
+    positions, values = maxima[order], values[order]
     for small, large in reversed(pyramid[:-1]):
-        a, bright = kernels.subtract_mean(np.ascontiguousarray(small, dtype=np.float32))
+        a, max_abs = kernels.subtract_mean(np.ascontiguousarray(small, dtype=np.float32))
         b = np.ascontiguousarray(large, dtype=np.float32)
-        places, values = kernels.search_near(a, b, 2 * places, REACH_PX, _flat_energy(small, bright))
+        positions, values = kernels.search_near(a, b, 2 * positions, SEARCH_RADIUS_PX, _flat_energy(small, max_abs))
     best = int(np.argmax(values))
-    row, column = (int(i) for i in places[best])
-    last = (window.shape[0] - template.shape[0], window.shape[1] - template.shape[1])
-    return Peak(row, column, float(values[best]), row in (0, last[0]) or column in (0, last[1]))
+    row, column = (int(i) for i in positions[best])
+    last_corner = (window.shape[0] - template.shape[0], window.shape[1] - template.shape[1])
+    return Peak(row, column, float(values[best]), row in (0, last_corner[0]) or column in (0, last_corner[1]))
 
 
 def halve(image: Raster) -> Float[np.ndarray, "_ _"]:
-    """Means of 2 x 2 pixels; an odd last row or column is dropped."""
+    """Reduce an image to means of 2 x 2 pixels; an odd last row or column is dropped."""
     rows, columns = image.shape[0] // 2, image.shape[1] // 2
-    even = np.ascontiguousarray(image[: 2 * rows, : 2 * columns])
-    return np.asarray(cv2.resize(even, (columns, rows), interpolation=cv2.INTER_AREA))
+    even_part = np.ascontiguousarray(image[: 2 * rows, : 2 * columns])
+    return np.asarray(cv2.resize(even_part, (columns, rows), interpolation=cv2.INTER_AREA))
 
 
 def _check_fit(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ _"]) -> None:
@@ -160,6 +160,6 @@ def _check_fit(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ 
         raise ValueError(f"a template of {template.shape} pixels does not fit into a window of {window.shape}")
 
 
-def _flat_energy(template: Float[np.ndarray, "_ _"], largest: float) -> float:
-    """The energy of a flat patch, for values up to `largest`."""
-    return kernels.FLAT_ENERGY * template.size * largest * largest
+def _flat_energy(template: Float[np.ndarray, "_ _"], max_abs: float) -> float:
+    """Energy below which a patch is flat, for values up to `max_abs`."""
+    return kernels.FLAT_ENERGY * template.size * max_abs * max_abs

@@ -10,7 +10,7 @@ from jaxtyping import Float
 def structure_tensor(
     image: Float[np.ndarray, "rows columns"], support: int
 ) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"], Float[np.ndarray, "rows columns"]]:
-    """Mean products of the picture's gradients over a square of `support` pixels about every pixel.
+    """Mean products of the image gradients over a square of `support` pixels around every pixel.
 
     Returns the means of ``g_u g_u``, ``g_v g_v`` and ``g_u g_v`` in squared counts per squared pixel, each of shape
     (rows, columns). The gradient is Sobel's, scaled so that a ramp of one count per pixel gives one. Borders reflect.
@@ -29,11 +29,11 @@ def structure_tensor(
 def harris_interest(
     uu: Float[np.ndarray, "*shape"], vv: Float[np.ndarray, "*shape"], uv: Float[np.ndarray, "*shape"]
 ) -> Float[np.ndarray, "*shape"]:
-    """Harris interest of entries of `structure_tensor`, in counts per pixel.
+    """Harris interest from the entries of `structure_tensor`, in counts per pixel.
 
-    It is Noble's form of the Harris operator, ``determinant / trace`` of the mean structure tensor, which needs no
-    constant to be chosen; ``sqrt(2 determinant / trace)`` is the root mean square gradient per axis when structure is
-    the same in all directions, and near zero when there is none, or when it runs in one direction only.
+    This is Noble's form of the Harris operator, ``determinant / trace`` of the mean structure tensor, which has no free
+    constant. ``sqrt(2 determinant / trace)`` is the root mean square gradient per axis if the texture is isotropic; it
+    is near zero without texture or with texture in one direction only.
     """
     determinant = np.maximum(uu * vv - uv * uv, 0.0)
     trace = uu + vv
@@ -42,5 +42,5 @@ def harris_interest(
 
 
 def local_mean(image: Float[np.ndarray, "rows columns"], support: int) -> Float[np.ndarray, "rows columns"]:
-    """Mean over a square of `support` pixels about every pixel; borders reflect."""
+    """Mean over a square of `support` pixels around every pixel; borders reflect."""
     return np.asarray(cv2.blur(image.astype(np.float32, copy=False), (support, support)))

@@ -1,10 +1,10 @@
 """Registration and resampling of templates by quintic splines, to hundredths of a pixel.
 
-Fits of a surface to a correlation peak are biased towards whole pixels (up to about 0.09 px for the biquadratic);
-OpenCV's warps misplace samples by up to 0.05 px. Gauss-Newton registration of the images, with a spline of high order
-between pixels, has no such bias. A pure shift is biased where the image is stretched relative to the
-template, by up to tenths of a pixel; a linear map removes that bias. A round surface seen from another height bends the
-image; a quadratic map removes that bias.
+Surface fits to a correlation peak are biased towards whole pixels (up to about 0.09 px for the biquadratic). OpenCV's
+warps displace samples by up to 0.05 px. Gauss-Newton registration of images interpolated by a high-order spline has no
+such bias. A pure-shift model is biased by up to tenths of a pixel if the image is stretched relative to the template; a
+linear map removes this bias. A round surface seen from another height causes quadratic distortion; a quadratic map
+removes this bias.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from marsyard.algorithms.image.kernels import quintic
 from marsyard.algorithms.image.kernels import registration as kernels
 
 ORDER: Final = 5
-#: Step that ends the shift refinement; the next step is smaller by a factor of ten or more.
+#: Step length that ends the shift refinement; the next step is smaller by a factor of at least ten.
 ALIGNMENT_TOLERANCE_PX = 1e-3
-#: Margin of pixels for the spline; pixels beyond shift the result by less than 1e-4 px.
-SURROUND = 12
+#: Margin around a patch for its spline; pixels outside it change the result by less than 1e-4 px.
+MARGIN_PX = 12
 _TAPS = np.arange(ORDER + 1) - ORDER // 2
 _BASIS = BSpline.basis_element(np.arange(ORDER + 2) - (ORDER + 1) / 2.0, extrapolate=False)
 _SLOPE = _BASIS.derivative()
 
 
 def spline_coefficients(image: Raster) -> Raster:
-    """Coefficients of the quintic spline through the image; borders mirror about their last pixels."""
+    """Coefficients of the quintic spline through the image, mirrored at its outermost pixels."""
     return np.asarray(ndimage.spline_filter(image, order=ORDER, output=np.float64, mode="mirror"))
 
 
 def shifted_patch(coefficients: Raster, corner: Vector2, shape: tuple[int, int]) -> Float[np.ndarray, "3 n m"]:
-    """The patch of `shape` with its upper left pixel at `corner` (row, column), and its derivatives by row and column.
+    """Patch of `shape` with its upper left pixel at `corner` (row, column), and its derivatives by row and column.
 
-    All pixels share the fraction of the shift: the spline is a separable filter of six taps. The patch must lie at
+    All pixels have the same fraction of the shift: the spline is a separable filter with six taps. The patch must be at
     least three pixels inside the image.
     """
     integer_part = np.floor(corner)
-    places = (corner - integer_part)[:, np.newaxis] - _TAPS
-    taps = np.stack([_BASIS(places), _SLOPE(places)])
+    tap_positions = (corner - integer_part)[:, np.newaxis] - _TAPS
+    taps = np.stack([_BASIS(tap_positions), _SLOPE(tap_positions)])
     samples = np.empty((3, *shape))
     quintic.sample_with_derivatives(
         coefficients, int(integer_part[0]), int(integer_part[1]), taps[:, 0], taps[:, 1], samples
@@ -53,24 +53,24 @@ def shifted_patch(coefficients: Raster, corner: Vector2, shape: tuple[int, int])
 
 
 def refine_shift(
-    template: Float[np.ndarray, "n m"], window: Raster, corner: Vector2, iterations: int = 6, reach: float = 1.5
+    template: Float[np.ndarray, "n m"], window: Raster, corner: Vector2, iterations: int = 6, max_shift_px: float = 1.5
 ) -> Vector2 | None:
     """Refine the corner (row, column) of a template in the window to hundredths of a pixel.
 
-    Minimises ``sum (A - gain B)^2`` over shift and gain, A and B less their means, from `corner` by Gauss-Newton. None
-    if it moves more than `reach` pixels, comes within three pixels of the window's border, or the normal equations are
-    singular.
+    Minimises ``sum (A - gain B)^2`` over shift and gain by Gauss-Newton from `corner`; the means of A and B are
+    subtracted. None if it moves more than `max_shift_px` or within three pixels of the window's border, or if the
+    normal equations are singular.
     """
-    near = np.maximum(np.floor(corner).astype(int) - SURROUND, 0)
-    far = np.floor(corner).astype(int) + np.array(template.shape) + SURROUND
-    region = window[near[0] : far[0], near[1] : far[1]]
+    low = np.maximum(np.floor(corner).astype(int) - MARGIN_PX, 0)
+    high = np.floor(corner).astype(int) + np.array(template.shape) + MARGIN_PX
+    region = window[low[0] : high[0], low[1] : high[1]]
     coefficients = spline_coefficients(region)
-    last = np.array(region.shape) - np.array(template.shape) - 4.0
+    last_position = np.array(region.shape) - np.array(template.shape) - 4.0
     a = template - template.mean()
-    start = corner - near
+    start = corner - low
     position = start
     for _ in range(iterations):
-        if np.hypot(*(position - start)) > reach or np.any(position < 3.0) or np.any(position > last):
+        if np.hypot(*(position - start)) > max_shift_px or np.any(position < 3.0) or np.any(position > last_position):
             return None
         samples = shifted_patch(coefficients, position, (template.shape[0], template.shape[1]))
         b = samples[0] - samples[0].mean()
@@ -85,15 +85,15 @@ def refine_shift(
         position = position + step
         if np.hypot(*step) < ALIGNMENT_TOLERANCE_PX:
             break
-    return position + near if np.hypot(*(position - start)) <= reach else None
+    return position + low if np.hypot(*(position - start)) <= max_shift_px else None
 
 
-#: Model of the registration: shift; with a linear map; with a quadratic map of the offsets.
+#: Model of the registration: shift; shift and linear map; shift, linear and quadratic map of the offsets.
 Warp = Literal["shift", "stretch", "bend"]
 _ORDERS: dict[Warp, int] = {"shift": 0, "stretch": 1, "bend": 2}
-#: Step that ends the registration; the remaining error is less than 1e-3 px.
+#: Step length that ends the registration; the remaining error is less than 1e-3 px.
 REGISTRATION_TOLERANCE_PX = 3e-3
-#: Minimum pivot of the normal equations with unit diagonal; below, the texture does not separate the unknowns.
+#: Minimum pivot of the normal equations with unit diagonal; below it the texture does not determine the unknowns.
 SINGULAR = 1e-4
 
 
@@ -101,8 +101,8 @@ SINGULAR = 1e-4
 class Limits:
     """Limits of a registration.
 
-    - shift_px: Largest displacement of the middle
-    - stretch: Largest entry of the linear map's difference from the identity, and of the bend at the template's border
+    - shift_px: Largest displacement of the centre
+    - stretch: Largest entry of the linear map minus the identity, and of the quadratic map at the template's border
     - steps: Maximum number of steps; four to six are usual
     """
 
@@ -117,7 +117,7 @@ LIMITS = Limits()
 
 @dataclass(frozen=True)
 class Registration:
-    """Best match: corner (row, column in the window) of the unwarped template, and normalised correlation."""
+    """Registered template: corner (row, column in the window) without the warp, and normalised correlation."""
 
     corner: Vector2
     score: float
@@ -125,71 +125,71 @@ class Registration:
 
 @dataclass(frozen=True)
 class SplinePart:
-    """Part of a window about a template: first row and column, those after its last, quintic spline coefficients."""
+    """Quintic spline of the part of a window around a template, from `start` up to `stop` (row, column), exclusive."""
 
-    near: tuple[int, int]
-    far: tuple[int, int]
+    start: tuple[int, int]
+    stop: tuple[int, int]
     coefficients: Raster
 
 
-def build_spline(window: Raster, corner: Vector2, side: int, known: SplinePart | None = None) -> SplinePart:
-    """The spline about a template of `side` pixels with its upper left one at `corner` (row, column).
+def build_spline(window: Raster, corner: Vector2, side: int, previous: SplinePart | None = None) -> SplinePart:
+    """Build the spline around a template of `side` pixels with its upper left pixel at `corner` (row, column).
 
-    Returns `known`, of the same window, if it is the same part.
+    Returns `previous`, a spline of the same window, if it covers the same part.
     """
-    first = np.maximum(np.floor(corner).astype(int) - SURROUND, 0)
-    last = np.ceil(corner).astype(int) + side + SURROUND
-    near, far = (int(first[0]), int(first[1])), (int(last[0]), int(last[1]))
-    if known is not None and (known.near, known.far) == (near, far):
-        return known
-    return SplinePart(near, far, spline_coefficients(window[near[0] : far[0], near[1] : far[1]]))
+    low = np.maximum(np.floor(corner).astype(int) - MARGIN_PX, 0)
+    high = np.ceil(corner).astype(int) + side + MARGIN_PX
+    start, stop = (int(low[0]), int(low[1])), (int(high[0]), int(high[1]))
+    if previous is not None and (previous.start, previous.stop) == (start, stop):
+        return previous
+    return SplinePart(start, stop, spline_coefficients(window[start[0] : stop[0], start[1] : stop[1]]))
 
 
 def register_template(
     template: Patch, window: Raster | SplinePart, corner: Vector2, warp: Warp, limits: Limits = LIMITS
 ) -> Registration | None:
-    """Register a template in a window, or in the part of it about `corner`, from `corner` (row, column).
+    """Register a template in a window, or in its spline around `corner`, starting from `corner` (row, column).
 
-    Minimises ``sum (B(c + M d + Q(d)) - gain A(d) - offset)^2`` over the middle c, gain, offset and, as `warp` allows,
-    the matrix M (else the identity) and the quadratic form Q (else zero); A is the template over offsets d from its
-    middle, B the window by quintic splines. Inverse compositional method (Baker & Matthews 2004). None if it leaves the
-    limits or the window, does not converge, or the texture does not determine the unknowns.
+    Minimises ``sum (B(c + M d + Q(d)) - gain A(d) - offset)^2`` over the centre c, gain, offset and, depending on
+    `warp`, the matrix M (otherwise the identity) and the quadratic form Q (otherwise zero). A is the template at
+    offsets d from its centre, B the window's quintic spline. Inverse compositional method (Baker & Matthews 2004). None
+    if it leaves the limits or the window, does not converge, or the texture does not determine the unknowns.
     """
     half = 0.5 * (len(template) - 1)
     part = window if isinstance(window, SplinePart) else build_spline(window, corner, len(template))
-    near = np.array(part.near)
-    start = corner - near + half
+    low = np.array(part.start)
+    start = corner - low + half
     bounds = (limits.shift_px, limits.stretch, limits.steps)
-    done, row, column, score = kernels.register(
+    converged, row, column, score = kernels.register(
         template, part.coefficients, start[0], start[1], _ORDERS[warp], bounds, REGISTRATION_TOLERANCE_PX, SINGULAR
     )
-    return Registration(np.array([row, column]) - half + near, score) if done else None
+    return Registration(np.array([row, column]) - half + low, score) if converged else None
 
 
 def similarity_patch(
     image: Raster, centre: Vector2, side: int, magnification: float = 1.0, roll_rad: float = 0.0
 ) -> Float[np.ndarray, "side side"]:
-    """The square of `side` pixels about `centre` of the magnified and rolled image.
+    """Resample a square of `side` pixels around `centre` from the magnified and rolled image.
 
-    - image: Image, mirrored about its last pixels outside
-    - centre: Column and row (u, v) of the middle, within the image
-    - magnification: Scale factor; unfiltered, meant for factors down to about 0.7
-    - roll_rad: Rotation, clockwise as seen
+    - image: Image, mirrored at its outermost pixels
+    - centre: Column and row (u, v) of the square's centre, within the image
+    - magnification: Scale factor; without a low-pass filter, for factors down to about 0.7
+    - roll_rad: Rotation, clockwise in the image
 
     Raises ValueError if the centre is outside the image.
     """
     linear = np.zeros((2, 5))
     linear[:, :2] = [[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]
     linear /= magnification
-    reach = int(np.ceil(0.5 * (side - 1) * np.abs(linear).sum(axis=1).max())) + SURROUND
+    margin = int(np.ceil(0.5 * (side - 1) * np.abs(linear).sum(axis=1).max())) + MARGIN_PX
     position = centre[::-1]
-    near = np.floor(position).astype(int) - reach
-    far = near + 2 * reach + 2
-    inside = image[max(near[0], 0) : max(far[0], 0), max(near[1], 0) : max(far[1], 0)]
-    beyond = [(max(-a, 0), max(b - n, 0)) for a, b, n in zip(near, far, image.shape, strict=True)]
-    region = np.pad(inside, beyond, mode="reflect") if np.any(beyond) else inside
+    start = np.floor(position).astype(int) - margin
+    stop = start + 2 * margin + 2
+    valid_region = image[max(start[0], 0) : max(stop[0], 0), max(start[1], 0) : max(stop[1], 0)]
+    padding = [(max(-a, 0), max(b - n, 0)) for a, b, n in zip(start, stop, image.shape, strict=True)]
+    region = np.pad(valid_region, padding, mode="reflect") if np.any(padding) else valid_region
     values = np.empty(side * side)
-    row, column = position - near
+    row, column = position - start
     if not quintic.sample(spline_coefficients(region), side, row, column, linear, values):
-        raise ValueError(f"the middle of a patch, {centre}, is not in the picture of {image.shape[::-1]} pixels")
+        raise ValueError(f"the centre of a patch, {centre}, is outside the image of {image.shape[::-1]} pixels")
     return values.reshape(side, side)

@@ -1,9 +1,9 @@
-"""Visual target tracking: the rover drives to what it sees (Kim et al., "Targeted Driving Using Visual Tracking")."""
+"""Visual target tracking while a rover drives to the target (Kim et al., "Targeted Driving Using Visual Tracking")."""
 
-from marsyard.algorithms.vtt.accuracy import ArmTarget, GoalReached, HandOff, HandOffOutcome, hand_off
+from marsyard.algorithms.vtt.accuracy import ArmTarget, GoalCriterion, HandOff, HandOffOutcome, hand_off
 from marsyard.algorithms.vtt.lucas_kanade import lucas_kanade_tracker
 from marsyard.algorithms.vtt.options import PURE_NCC, VttOptions
 from marsyard.algorithms.vtt.tracker import VisualTargetTracker, VttDetails
 
-__all__ = ["PURE_NCC", "ArmTarget", "GoalReached", "HandOff", "HandOffOutcome", "VisualTargetTracker", "VttDetails"]
+__all__ = ["PURE_NCC", "ArmTarget", "GoalCriterion", "HandOff", "HandOffOutcome", "VisualTargetTracker", "VttDetails"]
 __all__ += ["VttOptions", "hand_off", "lucas_kanade_tracker"]

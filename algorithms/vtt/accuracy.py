@@ -1,6 +1,6 @@
-"""Approach accuracy (Eqs. 1 to 5 and Table I of the tracking paper), and the hand-over to the arm (sections 3 and 7.4).
+"""Approach accuracy (Eqs. 1 to 5 and Table I of the tracking paper), and the hand-off to the arm (sections 3 and 7.4).
 
-Distances are in metres; 3 sigma where the disparity error is that of 3 sigma (the paper takes 1 pixel).
+Errors are in metres. They are 3-sigma values if the disparity error is a 3-sigma value (paper: 1 pixel).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from marsyard.sim.measurements import MastCalibration
 
 #: Target distances before and after the traverse (section 4.2), metres.
 START_M, GOAL_M = 10.0, 2.0
-#: Wheel and visual odometry together: "roughly 2% of the rover travel distance".
+#: Error of wheel and visual odometry, fraction of the distance: "roughly 2% of the rover travel distance".
 NAVIGATION_ERROR = 0.02
 
 
@@ -37,43 +37,43 @@ class StereoDesign:
         return self.focal_length_m / self.pixel_m
 
 
-#: The two cameras of section 4.2, with the pixel of the manufacturer's specification: it gives the table's digits.
+#: Cameras of section 4.2. The pixel pitch of the manufacturer's specification reproduces the printed digits of Table I.
 PANCAM = StereoDesign("Pancam", 16e-3, 4.65e-6, 0.30)
 NAVCAM = StereoDesign("Navcam", 6e-3, 4.65e-6, 0.20)
 
 
 def stereo_range_error_m(range_m: float, focal_px: float, baseline_m: float, disparity_error_px: float = 1.0) -> float:
-    """Error of a range by stereo, Eq. 1: ``R^2 / (f_p B) * disparity error``."""
+    """Range error of stereo, Eq. 1: ``R^2 / (f_p B) * disparity error``."""
     return range_m * range_m / (focal_px * baseline_m) * disparity_error_px
 
 
 def drift_error_m(range_m: float, focal_px: float, drift_px: float) -> float:
-    """Error across the line of sight of a point that drifted in the picture, Eq. 4."""
+    """Error perpendicular to the line of sight of a point that drifted in the image, Eq. 4."""
     return range_m / focal_px * drift_px
 
 
 def tracked_approach_error_m(stereo_error_m: float, drift_error_m: float) -> float:
-    """Error at the goal with a tracker, Eq. 5: stereo at the goal and drift, root sum square."""
+    """Error at the goal with a tracker, Eq. 5: root sum square of stereo error at the goal and drift error."""
     return float(np.hypot(stereo_error_m, drift_error_m))
 
 
 def round_half_up(value: float, digits: int) -> float:
     """Round half away from zero, as in printed tables.
 
-    Float noise below 1e-9 is removed first: 38.75 cm comes out of the equations as 38.7499...
+    Rounding errors below 1e-9 are removed first: the equations give 38.7499... instead of 38.75 cm.
     """
     return float(Decimal(str(round(value, 9))).quantize(Decimal(1).scaleb(-digits), ROUND_HALF_UP))
 
 
 @dataclass(frozen=True)
 class AccuracyRow:
-    """A row of Table I as printed, centimetres, 3 sigma.
+    """Row of Table I as printed, centimetres, 3 sigma.
 
     - name: Camera
     - designation_cm: Stereo range error at 10 m
-    - untracked_cm: Approach error at 2 m after 8 m by visual odometry, without tracker
+    - untracked_cm: Approach error at 2 m after 8 m with visual odometry, without tracker
     - stereo_cm: Stereo range error at 2 m: the first term of the last column
-    - drift_cm_px: Cross-range error of a pixel of drift at 2 m: the factor of N in the last column
+    - drift_cm_px: Cross-range error per pixel of drift at 2 m: the factor of N in the last column
     """
 
     name: str
@@ -83,19 +83,19 @@ class AccuracyRow:
     drift_cm_px: float
 
     def tracked_cm(self, drift_px: float) -> float:
-        """The last column for a drift of this many pixels."""
+        """Evaluate the last column for a drift in pixels."""
         return tracked_approach_error_m(self.stereo_cm, self.drift_cm_px * drift_px)
 
     @property
     def tracked_formula(self) -> str:
-        """The last column as printed."""
+        """Formula of the last column as printed."""
         return f"sqrt({self.stereo_cm:g}^2 + ({self.drift_cm_px:g} N)^2)"
 
 
 def accuracy_row(design: StereoDesign) -> AccuracyRow:
-    """A row of Table I; without a tracker (Eq. 3) designation and navigation add as a root sum square.
+    """Compute a row of Table I; the error without tracker (Eq. 3) is the root sum square of designation and navigation.
 
-    Each column is rounded before the next is computed, as in the paper: 42.0 cm for the navcam is
+    Each column is rounded before the next one is computed, as in the paper: 42.0 cm for the navcam is
     ``sqrt(38.8^2 + 16^2)``; with 38.75 it would be 41.9.
     """
     designation = round_half_up(100.0 * stereo_range_error_m(START_M, design.focal_px, design.baseline_m), 1)
@@ -110,14 +110,14 @@ def accuracy_row(design: StereoDesign) -> AccuracyRow:
 
 
 def table_1() -> tuple[AccuracyRow, AccuracyRow]:
-    """Table I: pancam and navcam."""
+    """Compute Table I: pancam and navcam."""
     return accuracy_row(PANCAM), accuracy_row(NAVCAM)
 
 
 class HandOffOutcome(Enum):
-    """How a hand-off ended. Every member but HANDED_OVER is an expected failure: the arm gets no target."""
+    """Result of a hand-off. All members except HANDED_OVER are expected failures: the arm receives no target."""
 
-    HANDED_OVER = "the arm has the target"
+    HANDED_OVER = "the arm has received the target"
     NOT_TRACKED = "the target is not tracked"
     NOT_AT_GOAL = "the rover is not at the commanded distance from the target"
 
@@ -132,34 +132,34 @@ class ArmTarget:
 
 @dataclass(frozen=True)
 class HandOff:
-    """The outcome, and the target if it was handed over."""
+    """Outcome of a hand-off, and the target if it was handed over."""
 
     outcome: HandOffOutcome
     target: ArmTarget | None
 
 
 @dataclass(frozen=True)
-class GoalReached:
-    """Goal criterion: the target's horizontal distance from the rover's origin."""
+class GoalCriterion:
+    """Criterion for reaching the goal: the target's horizontal distance from the rover's origin."""
 
     distance_m: float
     tolerance_m: float
 
-    def holds(self, position_rover: Float[np.ndarray, "3"]) -> bool:
-        """Whether a target at this position is at the commanded distance."""
+    def is_met(self, position_rover: Float[np.ndarray, "3"]) -> bool:
+        """Whether a target at this position has the commanded distance, within the tolerance."""
         return abs(float(np.hypot(position_rover[0], position_rover[1])) - self.distance_m) <= self.tolerance_m
 
 
-def hand_off(update: TargetUpdate, goal: GoalReached, mast: MastCalibration, drift_px: float = 2.5) -> HandOff:
-    """Hand the target over to the arm, if it is tracked and the rover is at its goal.
+def hand_off(update: TargetUpdate, goal: GoalCriterion, mast: MastCalibration, drift_px: float = 2.5) -> HandOff:
+    """Hand the target over to the arm if it is tracked and the rover is at its goal.
 
-    `drift_px` is the assumed drift (paper: 2.5 px from 10 m to 2 m). The range for the error is that from the mast's
-    elevation axis.
+    `drift_px` is the assumed drift (paper: 2.5 px from 10 m to 2 m). The error is computed for the range from the
+    mast's elevation axis.
     """
     position = update.position_rover
     if not update.found or position is None:
         return HandOff(HandOffOutcome.NOT_TRACKED, None)
-    if not goal.holds(position):
+    if not goal.is_met(position):
         return HandOff(HandOffOutcome.NOT_AT_GOAL, None)
     axis = mast.geometry.base_m + np.array([0.0, 0.0, mast.geometry.elbow_m[2]])
     range_m = float(np.linalg.norm(position - axis))

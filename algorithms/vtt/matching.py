@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.arrays import Counts, Patch, Vector2, Vector3
 from marsyard.algorithms.image.correlation import Peak, biquadratic_offset, coarse_to_fine_peak, normalized_correlation
-from marsyard.algorithms.image.registration import SURROUND, Warp, build_spline, register_template, similarity_patch
+from marsyard.algorithms.image.registration import MARGIN_PX, Warp, build_spline, register_template, similarity_patch
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import SITE_FROM_WORLD, compose
@@ -21,13 +21,13 @@ from marsyard.sim.measurements import MastImage, RoverTarget, SiteTarget
 
 @dataclass(frozen=True)
 class Sighting:
-    """The last stop with a match: start of the next update.
+    """Images and poses of the last stop with a match, the reference for the next update.
 
-    The template is resampled from the image once magnification and roll are known: one interpolation only, at the
+    The template is resampled from the image when magnification and roll are known: a single interpolation, at the
     target's sub-pixel position.
 
     - image: The left image
-    - pixel: The target in it, full-frame (u, v)
+    - pixel: The target in the left image, full-frame (u, v)
     - position_head: The target in the mast head's frame at that stop, metres
     - camera: The left camera in that frame
     - world_from_head, world_from_rover: Estimated poses of head and rover at that stop
@@ -42,7 +42,7 @@ class Sighting:
 
     @property
     def distance_m(self) -> float:
-        """From the camera's centre to the target."""
+        """Distance from the camera's centre to the target."""
         return float(np.linalg.norm(self.position_head - self.camera.c))
 
     @cached_property
@@ -52,7 +52,7 @@ class Sighting:
 
 
 @dataclass(frozen=True)
-class Change:
+class ViewChange:
     """Change of the target's appearance since the last match: magnification, and clockwise roll."""
 
     magnification: float = 1.0
@@ -65,7 +65,7 @@ class Match:
 
     - pixel: Full-frame (u, v)
     - score: Normalised correlation (Eq. 11) of the template with the image there
-    - template: The old image about the target, magnified and rolled
+    - template: The old image around the target, magnified and rolled
     """
 
     pixel: Vector2
@@ -73,47 +73,47 @@ class Match:
     template: Patch
 
 
-#: Registrations after the shift, in this order.
+#: Registrations after the pure shift, in this order, for each option `warp`.
 _WARPS: dict[Warp, tuple[Warp, ...]] = {"shift": (), "stretch": ("stretch",), "bend": ("stretch", "bend")}
-#: Matches a sighting in a new image near a full-frame pixel; None if the window does not fit.
-Matcher = Callable[[Sighting, MastImage, Vector2, Change, VttOptions], Match | None]
+#: Function that matches the target in a new image near a full-frame pixel; None if the window does not fit.
+Matcher = Callable[[Sighting, MastImage, Vector2, ViewChange, VttOptions], Match | None]
 
 
-def cut_patch(
-    image: MastImage, pixel: Vector2, side: int, change: Change | None = None
+def extract_patch(
+    image: MastImage, pixel: Vector2, side: int, change: ViewChange | None = None
 ) -> Float[np.ndarray, "side side"]:
-    """A square about a full-frame pixel, at its sub-pixel position, magnified and rolled by `change`."""
-    applied = Change() if change is None else change
+    """Resample a square around a full-frame pixel (sub-pixel position), magnified and rolled by `change`."""
+    used = ViewChange() if change is None else change
     # convert only the patch's diagonal and the spline's margin to floating point
-    reach = int(np.ceil(0.75 * side / min(applied.magnification, 1.0))) + SURROUND + 1
+    half = int(np.ceil(0.75 * side / min(used.magnification, 1.0))) + MARGIN_PX + 1
     centre = pixel - np.array(image.corner, dtype=np.float64)
-    near = np.maximum(np.floor(centre).astype(int) - reach, 0)
-    region = image.counts[near[1] : max(int(centre[1]) + reach, 1), near[0] : max(int(centre[0]) + reach, 1)]
-    return similarity_patch(region.astype(np.float64), centre - near, side, applied.magnification, applied.roll_rad)
+    start = np.maximum(np.floor(centre).astype(int) - half, 0)
+    region = image.counts[start[1] : max(int(centre[1]) + half, 1), start[0] : max(int(centre[0]) + half, 1)]
+    return similarity_patch(region.astype(np.float64), centre - start, side, used.magnification, used.roll_rad)
 
 
 def search_window(image: MastImage, pixel: Vector2, side: int) -> tuple[Counts, tuple[int, int]]:
-    """The square of `side` pixels about a full-frame pixel, clipped to the image, and its corner in the frame."""
-    near = np.rint(pixel - 0.5 * (side - 1)).astype(int) - np.array(image.corner)
-    far = np.maximum(near + side, 0)
-    near = np.maximum(near, 0)
-    window = image.counts[near[1] : far[1], near[0] : far[0]]
-    return window, (int(near[0]) + image.corner[0], int(near[1]) + image.corner[1])
+    """Square of `side` pixels around a full-frame pixel, clipped to the image, and its corner in the frame."""
+    start = np.rint(pixel - 0.5 * (side - 1)).astype(int) - np.array(image.corner)
+    end = np.maximum(start + side, 0)
+    start = np.maximum(start, 0)
+    window = image.counts[start[1] : end[1], start[0] : end[0]]
+    return window, (int(start[0]) + image.corner[0], int(start[1]) + image.corner[1])
 
 
-def has_room(image: MastImage, pixel: Vector2, side: int) -> bool:
-    """Whether a square of `side` pixels about a full-frame pixel lies in the image."""
+def window_fits(image: MastImage, pixel: Vector2, side: int) -> bool:
+    """Whether a square of `side` pixels around a full-frame pixel lies inside the image."""
     local = pixel - np.array(image.corner, dtype=np.float64)
     rows, columns = image.counts.shape
-    reach = 0.5 * (side - 1)
-    return bool(np.all(local >= reach) and np.all(local <= np.array([columns, rows]) - 1.0 - reach))
+    half_width = 0.5 * (side - 1)
+    return bool(np.all(local >= half_width) and np.all(local <= np.array([columns, rows]) - 1.0 - half_width))
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """A sub-pixel match.
+    """Sub-pixel match.
 
-    - corner: Row and column of its upper left pixel in the image's counts
+    - corner: Row and column of the template's upper left pixel in the image's counts
     - score: Normalised correlation of the shifted template
     - warped_score: Normalised correlation of the warped template
     """
@@ -124,35 +124,35 @@ class Refinement:
 
 
 def refine_match(
-    template: Patch, image: MastImage, corner: Vector2, offset: Vector2, whole: Peak, options: VttOptions
+    template: Patch, image: MastImage, corner: Vector2, offset: Vector2, integer_peak: Peak, options: VttOptions
 ) -> Refinement:
-    """Refine a match by registration: a shift, then the stretch and bend of the options.
+    """Refine a match by registration: a pure shift, then the affine and quadratic warps that the options select.
 
-    `corner` is that of the best whole pixel, with the correlation of `whole`; `offset` is the top of the fit to the
-    correlation, the result if registration fails. If the bend is not determined the stretch is kept, else the shift.
+    `corner` is that of the integer peak. `offset` is the sub-pixel offset of the peak fit, the result if registration
+    fails. If a warp is not determined by the texture, the result of the previous model is returned.
     """
-    near = np.maximum(corner.astype(int) - SURROUND - 2, 0)
-    far = corner.astype(int) + len(template) + SURROUND + 2
-    region = image.counts[near[0] : far[0], near[1] : far[1]].astype(np.float64)
-    part = build_spline(region, corner + offset - near, len(template))
-    shifted = register_template(template, part, corner + offset - near, "shift")
+    start = np.maximum(corner.astype(int) - MARGIN_PX - 2, 0)
+    end = corner.astype(int) + len(template) + MARGIN_PX + 2
+    region = image.counts[start[0] : end[0], start[1] : end[1]].astype(np.float64)
+    part = build_spline(region, corner + offset - start, len(template))
+    shifted = register_template(template, part, corner + offset - start, "shift")
     if shifted is None:
-        return Refinement(corner + offset, whole.value, whole.value)
+        return Refinement(corner + offset, integer_peak.value, integer_peak.value)
     best = shifted
     for warp in _WARPS[options.warp]:
-        part = build_spline(region, best.corner, len(template), known=part)
+        part = build_spline(region, best.corner, len(template), previous=part)
         warped = register_template(template, part, best.corner, warp)
         if warped is None:
             break
         best = warped
-    return Refinement(best.corner + near, shifted.score, best.score)
+    return Refinement(best.corner + start, shifted.score, best.score)
 
 
 def match_by_correlation(
-    sighting: Sighting, image: MastImage, predicted: Vector2, change: Change, options: VttOptions
+    sighting: Sighting, image: MastImage, predicted: Vector2, change: ViewChange, options: VttOptions
 ) -> Match | None:
-    """The paper's matcher: coarse-to-fine normalised correlation of the magnified, rolled template in a window."""
-    template = cut_patch(sighting.image, sighting.pixel, options.template_px, change)
+    """Match the magnified, rolled template in a window by coarse-to-fine normalised correlation (paper's matcher)."""
+    template = extract_patch(sighting.image, sighting.pixel, options.template_px, change)
     counts, window_corner = search_window(image, predicted, options.search_px)
     if min(counts.shape) < options.template_px:
         return None
@@ -165,8 +165,8 @@ def match_by_correlation(
         offset = np.zeros(2)
         if not peak.on_border:
             row, column = peak.row - 1, peak.column - 1
-            about = window[row : row + options.template_px + 2, column : column + options.template_px + 2]
-            offset = biquadratic_offset(normalized_correlation(template, about), Peak(1, 1, peak.value, False))
+            neighbourhood = window[row : row + options.template_px + 2, column : column + options.template_px + 2]
+            offset = biquadratic_offset(normalized_correlation(template, neighbourhood), Peak(1, 1, peak.value, False))
         best = refine_match(template, image, corner, offset, peak, options)
     return Match(best.corner[::-1] + half + image.corner, best.score, template)
 
@@ -179,14 +179,14 @@ def designated_position_world(target: RoverTarget | SiteTarget, world_from_rover
 
 
 def pose_change(old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform) -> RigidTransform:
-    """The transform from the old frame into the new frame."""
+    """Transform from the old frame to the new frame."""
     return compose(new_world_from_frame.inv(), old_world_from_frame)
 
 
 def predicted_position(
     position: Vector3, old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform
 ) -> Vector3:
-    """Position of a static point in a frame that moved (rover or mast head), from its old position there."""
+    """Position of a static point in a moving frame (rover or mast head), from its old position in that frame."""
     return np.asarray(pose_change(old_world_from_frame, new_world_from_frame).apply(position.copy()))
 
 
@@ -196,9 +196,9 @@ def bearing_rad(direction_world: Vector3) -> float:
 
 
 def magnification(old_position: Vector3, old_centre: Vector3, new_position: Vector3, new_centre: Vector3) -> float:
-    """Scale factor, Eq. 6: the target's old distance from the camera over its new one.
+    """Scale factor, Eq. 6: the target's old distance from the camera divided by the new one.
 
-    Positions and camera centres are each in the rover frame of their own stop.
+    Each position and camera centre is in the rover frame of its stop.
     """
     return float(np.linalg.norm(old_position - old_centre) / np.linalg.norm(new_position - new_centre))
 
@@ -210,24 +210,24 @@ def horizontal_axis(camera: CameraModel) -> Vector3:
     return np.asarray((camera.h - hc * camera.a) / hs)
 
 
-def lever_pixels(
+def roll_points(
     old_position: Vector3,
     old_camera: CameraModel,
     new_camera: CameraModel,
     new_from_old: RigidTransform,
-    lever_m: float,
+    offset_m: float,
 ) -> Float[np.ndarray, "2 2"] | None:
-    """Pixels (u, v) in the new image of the target and of a point `lever_m` along the old image's x axis (before Eq.
-    10).
+    """Pixels (u, v) in the new image of the target and of an auxiliary point, which define the roll (before Eq. 10).
 
-    Each camera is in the frame of its own stop. None if the new camera cannot image one of the points.
+    The auxiliary point is at a distance `offset_m` (k in the paper) along the old image's x axis. Each camera is in the
+    frame of its stop. None if the new camera cannot image one of the points.
     """
-    points = np.stack([old_position, old_position + lever_m * horizontal_axis(old_camera)])
+    points = np.stack([old_position, old_position + offset_m * horizontal_axis(old_camera)])
     pixels, visible = new_camera.project(np.asarray(new_from_old.apply(points)))
     return pixels if np.all(visible) else None
 
 
-def roll_angle(lever_px: Float[np.ndarray, "2 2"]) -> float:
-    """Clockwise roll of the target's image, radians, from `lever_pixels`: Eq. 10 and the text after it."""
-    across, down = lever_px[1] - lever_px[0]
-    return float(np.arctan2(down, across))
+def roll_angle(reference_px: Float[np.ndarray, "2 2"]) -> float:
+    """Clockwise roll of the target's image, radians, from `roll_points`: Eq. 10 and the text after it."""
+    delta_u, delta_v = reference_px[1] - reference_px[0]
+    return float(np.arctan2(delta_v, delta_u))

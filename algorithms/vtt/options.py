@@ -18,32 +18,32 @@ class VttOptions:
     - scale, roll: Whether the template is magnified (Eq. 6) and rolled (Eqs. 7 to 10) before it is matched. Without
       both this is the paper's pure NCC.
     - roll_lever_m: Distance k of the hypothetical point next to the target (paper: 5 cm, "arbitrary, small")
-    - coarse_levels: How often template and window are halved for the coarse search; 0 searches all places at full
-      resolution
-    - coarse_candidates: Local maxima of the coarse correlation that are followed to full resolution
-    - subpixel: Whether the matches, left and right, are refined below a pixel (not stated in the paper). Later steps
-      magnify each step's error: 16 steps from 10 m to 2 m turn 0.3 px, the error of whole pixels, into 3 px.
-    - warp: Model of the refinement: a shift (``shift``), with a stretch of the image (``stretch``), or with a quadratic
-      bend (``bend``). The paper's tracker used none. Approaching a slanted surface stretches the image and approaching
-      a round one bends it: a match by a simpler model has the same bias at each step (docs/adr/0010). The score stays
-      that of the shifted template.
-    - epipolar_tolerance_px: Search range across the epipolar curve of the right image (paper: 2, default)
-    - stereo_search_share: Range of searched disparities, as a fraction of `search_px`, about the predicted one (paper:
+    - coarse_levels: Number of pyramid levels below full resolution; 0 searches all positions at full resolution
+    - coarse_candidates: Number of local maxima of the coarse correlation that are refined at full resolution
+    - subpixel: Whether the left and right matches are refined to sub-pixel accuracy (not specified in the paper). The
+      error of one step is magnified by the following steps: 16 steps from 10 m to 2 m turn 0.3 px, the error of whole
+      pixels, into 3 px.
+    - warp: Model of the refinement: a shift (``shift``), also an affine distortion (``stretch``), or also a quadratic
+      distortion (``bend``). The paper's tracker used none. The approach to a slanted surface causes an affine
+      distortion, to a round one a quadratic distortion. A simpler model has the same bias at each step (docs/adr/0010).
+      The score is that of the shifted template.
+    - epipolar_tolerance_px: Search range perpendicular to the epipolar curve of the right image (paper: 2, default)
+    - stereo_search_fraction: Range of searched disparities around the prediction, as a fraction of `search_px` (paper:
       one half)
-    - seed_range_m: Smallest and largest range of a target given by a pixel, for its first stereo search
-    - aim_pair: Whether the mast centres the target between the two cameras rather than in the left one (as in the
-      paper). A pancam at 2 m sees 512 px of disparity: with the target centred in the left image it leaves the right
-      one.
-    - min_match_score, min_stereo_score: Least NCC of the match and of point stereo (paper: 0.7, "set empirically")
-    - stereo_disparity_error_px: Disparity error of 3 sigma in the tolerances (paper: 1 pixel)
+    - seed_range_m: Smallest and largest range of a target designated by a pixel, for its first stereo search
+    - aim_pair: Whether the mast centres the target between the two cameras instead of in the left one (as in the
+      paper). The disparity of a pancam at 2 m is 512 px: a target centred in the left image is outside the right one.
+    - min_match_score, min_stereo_score: Minimum NCC of the template match and of the stereo match (paper: 0.7, "set
+      empirically")
+    - stereo_disparity_error_px: 3-sigma disparity error in the tolerances (paper: 1 pixel)
     - pose_error: Error of the estimated position in the tolerances, as a fraction of the distance driven. 0.2 covers
-      the same wheel slip, as on gentle slopes. Visual odometry needs less (paper: "roughly 2%"), steep ground without
-      it more, up to 1.
+      20 % wheel slip, typical of gentle slopes. Visual odometry requires less (paper: "roughly 2%"), steep ground
+      without it more, up to 1.
     - direction_error_rad: Error of the direction to the target, from attitude and mast, in the tolerance of the
       position: 1.7 deg
-    - tolerance_floor_m: Part of both tolerances that does not depend on distance: relief under a drifting match, mast
-      pointing
-    - max_lost_updates: Consecutive updates after a loss in which the target may be recovered (paper: N, default 2)
+    - min_tolerance_m: Part of both tolerances that does not depend on distance: terrain relief seen by a drifted
+      match, and mast pointing
+    - max_lost_updates: Consecutive updates after a loss in which the target can be recovered (paper: N, default 2)
     """
 
     template_px: int = 21
@@ -56,7 +56,7 @@ class VttOptions:
     subpixel: bool = True
     warp: Warp = "bend"
     epipolar_tolerance_px: float = 2.0
-    stereo_search_share: float = 0.5
+    stereo_search_fraction: float = 0.5
     seed_range_m: tuple[float, float] = (1.0, 100.0)
     aim_pair: bool = False
     min_match_score: float = 0.7
@@ -64,7 +64,7 @@ class VttOptions:
     stereo_disparity_error_px: float = 1.0
     pose_error: float = 0.2
     direction_error_rad: float = 0.03
-    tolerance_floor_m: float = 0.05
+    min_tolerance_m: float = 0.05
     max_lost_updates: int = 2
 
     def __post_init__(self) -> None:
@@ -74,24 +74,24 @@ class VttOptions:
             raise ValueError(f"search_px is {self.search_px}; it must exceed template_px ({self.template_px}) by 2")
         if self.coarse_levels < 0 or self.template_px >> self.coarse_levels < 2:
             raise ValueError(
-                f"coarse_levels is {self.coarse_levels}; from 0 on, and a template of {self.template_px} pixels must "
-                "keep 2 of them after as many halvings"
+                f"coarse_levels is {self.coarse_levels}; it must be at least 0, and a template of {self.template_px} "
+                "pixels must keep at least 2 pixels at the coarsest level"
             )
         if self.coarse_candidates < 1:
             raise ValueError(f"coarse_candidates is {self.coarse_candidates}; it must be at least 1")
         if self.max_lost_updates < 0:
             raise ValueError(f"max_lost_updates is {self.max_lost_updates}; it must not be negative")
         if not 0.0 < self.seed_range_m[0] < self.seed_range_m[1]:
-            raise ValueError(f"seed_range_m is {self.seed_range_m}; it must be two ranges above 0, the smaller first")
-        for name in ("roll_lever_m", "epipolar_tolerance_px", "stereo_search_share"):
+            raise ValueError(f"seed_range_m is {self.seed_range_m}; it must be two positive ranges in ascending order")
+        for name in ("roll_lever_m", "epipolar_tolerance_px", "stereo_search_fraction"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")
 
     @property
     def disparity_search_px(self) -> float:
         """Disparities searched on each side of the predicted one, pixels."""
-        return 0.5 * self.stereo_search_share * self.search_px
+        return 0.5 * self.stereo_search_fraction * self.search_px
 
 
-#: The paper's baseline: normalised correlation of the template as it was cut (section 5.1).
+#: The paper's baseline: normalised correlation of the unwarped template (section 5.1).
 PURE_NCC = VttOptions(scale=False, roll=False, warp="shift")

@@ -21,8 +21,8 @@ class StereoMatch:
     """The target in the right image.
 
     - pixel: (u, v) in the right full frame
-    - score: Normalised correlation of the warped template. The other camera sees a slanted face stretched: at 63 to 76
-      deg the unwarped template correlates by 0.66 to 0.70 at the correct position, the stretched one by over 0.9.
+    - score: Normalised correlation of the warped template. A slanted face is stretched in the right image. At 63 to 76
+      deg the correlation at the correct position is 0.66 to 0.70 without the warp, and above 0.9 with it.
     - band: The searched part of the right image, counts
     - band_corner: (u, v) of the band's upper left pixel in the full frame
     """
@@ -40,54 +40,52 @@ Sight = tuple[Vector3, Vector3]
 def epipolar_pixels(sight: Sight, left: CameraModel, right: CameraModel, ranges_m: tuple[float, float]) -> Points2:
     """Right pixels of the points along a left pixel's line of sight, from far to near; both cameras in one frame.
 
-    Points are about half a pixel of disparity apart; those invisible to the right camera are omitted. Lens distortion
-    bends the curve.
+    The points have a spacing of about half a pixel of disparity; those invisible to the right camera are omitted. With
+    lens distortion the curve is not straight.
     """
     origin, direction = sight
-    near, far = (1.0 / ranges_m[0], 1.0 / ranges_m[1])
-    count = max(int(np.ceil(2.0 * disparity_px_m(left, right) * (near - far))) + 1, 2)
-    points = origin + direction / np.linspace(far, near, count)[:, None]
+    max_inverse, min_inverse = (1.0 / ranges_m[0], 1.0 / ranges_m[1])
+    count = max(int(np.ceil(2.0 * disparity_px_m(left, right) * (max_inverse - min_inverse))) + 1, 2)
+    points = origin + direction / np.linspace(min_inverse, max_inverse, count)[:, None]
     pixels, visible = right.project(points)
     return np.asarray(pixels[visible])
 
 
 @lru_cache(maxsize=32)
 def disparity_px_m(left: CameraModel, right: CameraModel) -> float:
-    """Focal length times baseline: disparity times range, pixels metres. Cached for repeated use in an update."""
+    """Focal length times baseline, which equals disparity times range, pixels times metres. Cached."""
     return right.focal_lengths[0] * float(np.linalg.norm(right.c - left.c))
 
 
 def search_ranges(left: CameraModel, right: CameraModel, range_m: float, disparity_px: float) -> tuple[float, float]:
     """Smallest and largest range whose disparity differs by at most `disparity_px` from that of `range_m`."""
-    step = disparity_px / disparity_px_m(left, right)
+    inverse_step = disparity_px / disparity_px_m(left, right)
     inverse = 1.0 / range_m
-    return 1.0 / (inverse + step), 1.0 / max(inverse - step, 1e-6)
+    return 1.0 / (inverse + inverse_step), 1.0 / max(inverse - inverse_step, 1e-6)
 
 
 def point_stereo(
     template: Patch, image: MastImage, curve: Float[np.ndarray, "points 2"], options: VttOptions
 ) -> StereoMatch | None:
-    """Match the left template near the epipolar `curve` (full-frame pixels) of the right image; None if it does not
-    fit.
-    """
+    """Match the left template near the epipolar `curve` (full-frame pixels) of the right image; None if none fits."""
     half, tolerance = (len(template) - 1) // 2, options.epipolar_tolerance_px
     local = curve - np.array(image.corner, dtype=np.float64)
     rows, columns = image.counts.shape
     local = local[(local[:, 0] > half - 1.0) & (local[:, 0] < columns - half)]
     if len(local) == 0:
         return None
-    reach = half + int(np.ceil(tolerance))
-    near = np.maximum(np.ceil(local.min(axis=0)).astype(int) - np.array([half, reach]), 0)
-    far = np.minimum(np.floor(local.max(axis=0)).astype(int) + np.array([half, reach]) + 1, [columns, rows])
-    if np.any(far - near < len(template)):
+    half_height = half + int(np.ceil(tolerance))
+    start = np.maximum(np.ceil(local.min(axis=0)).astype(int) - np.array([half, half_height]), 0)
+    end = np.minimum(np.floor(local.max(axis=0)).astype(int) + np.array([half, half_height]) + 1, [columns, rows])
+    if np.any(end - start < len(template)):
         return None
-    band = image.counts[near[1] : far[1], near[0] : far[0]].astype(np.float64)
+    band = image.counts[start[1] : end[1], start[0] : end[0]].astype(np.float64)
     surface = normalized_correlation(template, band)
-    # only positions within the tolerance above or below the curve
-    columns_px, rows_px = (local[np.argsort(local[:, 0])] - near - half).T
-    along = np.interp(np.arange(surface.shape[1]), columns_px, rows_px)
-    peak = highest_peak(np.where(np.abs(np.arange(surface.shape[0])[:, None] - along) > tolerance, -1.0, surface))
-    corner = near[::-1] + np.array([peak.row, peak.column], dtype=np.float64)
+    # accept only positions within the tolerance above or below the curve
+    columns_px, rows_px = (local[np.argsort(local[:, 0])] - start - half).T
+    curve_rows = np.interp(np.arange(surface.shape[1]), columns_px, rows_px)
+    peak = highest_peak(np.where(np.abs(np.arange(surface.shape[0])[:, None] - curve_rows) > tolerance, -1.0, surface))
+    corner = start[::-1] + np.array([peak.row, peak.column], dtype=np.float64)
     best = Refinement(corner, peak.value, peak.value)
     if options.subpixel:
         best = refine_match(template, image, corner, biquadratic_offset(surface, peak), peak, options)
@@ -95,27 +93,27 @@ def point_stereo(
         pixel=best.corner[::-1] + half + image.corner,
         score=best.warped_score,
         band=band,
-        band_corner=(int(near[0]) + image.corner[0], int(near[1]) + image.corner[1]),
+        band_corner=(int(start[0]) + image.corner[0], int(start[1]) + image.corner[1]),
     )
 
 
 def triangulate(left: CameraModel, right: CameraModel, left_pixel: Vector2, right_pixel: Vector2) -> Vector3 | None:
-    """The midpoint of the shortest segment between two pixels' lines of sight: see `nearest_point`."""
+    """Triangulate the lines of sight of two pixels by `nearest_point`."""
     return nearest_point(left.rays(left_pixel), right.rays(right_pixel))
 
 
 def nearest_point(left: Sight, right: Sight) -> Vector3 | None:
-    """The midpoint of the shortest segment between two lines of sight, in their frame, metres.
+    """Midpoint of the shortest segment between two lines of sight, in their frame, metres.
 
-    None if they are parallel or meet behind a camera.
+    None if they are parallel or the segment is behind a camera.
     """
     (a, d), (b, e) = left, right
-    between, cosine = b - a, float(d @ e)
-    across = 1.0 - cosine * cosine
-    if not across > 1e-14:
+    offset, cosine = b - a, float(d @ e)
+    determinant = 1.0 - cosine * cosine
+    if not determinant > 1e-14:
         return None
-    along_left = float(between @ (d - cosine * e)) / across
-    along_right = float(between @ (cosine * d - e)) / across
-    if not (along_left > 0.0 and along_right > 0.0):
+    left_range_m = float(offset @ (d - cosine * e)) / determinant
+    right_range_m = float(offset @ (cosine * d - e)) / determinant
+    if not (left_range_m > 0.0 and right_range_m > 0.0):
         return None
-    return np.asarray(0.5 * (a + along_left * d + b + along_right * e))
+    return np.asarray(0.5 * (a + left_range_m * d + b + right_range_m * e))

@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.validation.image_statistics import ImageStatistics, image_statistics
 from benchmarks.validation.records import Check, Measure
-from marsyard.cli.pictures import Shot, take
+from marsyard.cli.pictures import ImageRequest, render_images
 
 #: Altitudes of two of Spirit's descent pictures, metres.
 ALTITUDES_M = (1433.0, 1983.0)
@@ -21,8 +21,8 @@ AZIMUTHS_DEG, ELEVATION_DEG = (0.0, 90.0, 180.0, 270.0), -35.0
 
 
 def _measure(site: str, camera: str, **settings: float | int) -> ImageStatistics:
-    image = take(Shot.usual(site, camera, **settings), both=False)[0]
-    return image_statistics(image.sixteen_bit().astype(np.float64))
+    image = render_images(ImageRequest.from_defaults(site, camera, **settings), both=False)[0]
+    return image_statistics(image.to_uint16().astype(np.float64))
 
 
 def run_descent(quick: bool) -> Iterator[Measure]:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from marsyard.scenarios.algorithm_run import Handover
+from marsyard.scenarios.algorithm_run import InputCopy
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 
@@ -115,10 +115,10 @@ def _close_stream() -> None:
 
 
 def _spoil_inputs() -> None:
-    handover = Handover([np.ones(9)])
-    handover.given[0].flags.writeable = True
-    handover.given[0][:] = 0.0
-    handover.check()
+    input_copy = InputCopy([np.ones(9)])
+    input_copy.inputs[0].flags.writeable = True
+    input_copy.inputs[0][:] = 0.0
+    input_copy.check()
 
 
 #: Mark of a process whose state a case has changed.

@@ -79,11 +79,11 @@ def errors(number: int) -> dict[str, dict[str, Scalar]]:
     """Errors of one pair with both sets of options; the sites alternate."""
     streams = Streams(SEED, "landing checks", number)
     p = exact(SITES[number % len(SITES)], streams.generator("pair"))
-    world = World.of(p)
-    flight = Flight.of(p, world.ground.surface, streams)
+    world = World.from_parameters(p)
+    flight = Flight.from_parameters(p, world.ground.surface, streams)
     pair = take_pictures(p, world, flight, camera_optics(p.optics), streams)
     measurements = measure(p, flight, pair, streams)
-    truth = GroundTruth.of(world, flight, pair, p.lander.limits)
+    truth = GroundTruth.from_pictures(world, flight, pair, p.lander.limits)
     rows: dict[str, dict[str, Scalar]] = {}
     for name, options in (("paper", PAPER), ("ours", OPTIONS)):
         estimate = HdaEstimator(options).estimate(measurements)

@@ -7,7 +7,15 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from marsyard.reports.history import FINISHED, Comparison, History, NightCampaign, NightFigure, changes, compare_night
+from marsyard.reports.history import (
+    FINISHED,
+    Comparison,
+    History,
+    NightCampaign,
+    NightFigure,
+    find_changes,
+    list_comparisons,
+)
 from marsyard.reports.statistics.changes import Sample
 
 #: Assignments of cases to terrains.
@@ -72,7 +80,7 @@ def quiet_nights(nights: int, seed: int) -> int:
             night = history.begin(None)
             for kind in KINDS:
                 history.add(night, NightCampaign(kind, "", "", "PASS", 0, ""), yard.night(kind))
-            flagged = changes(compare_night(history, night))
+            flagged = find_changes(list_comparisons(history, night))
             history.finish(night, FINISHED, [(one.campaign, one.figure, one.p_value, one.worse) for one in flagged])
             alarms += bool(flagged)
     return alarms
@@ -87,5 +95,5 @@ def planted_found(worsened: str, nights: int, seed: int) -> int:
             before = [yard.night(kind) for _ in range(BEFORE)]
             for place, figure in enumerate(yard.night(kind, WORSE if kind == worsened else 1.0)):
                 comparisons.append(Comparison(kind, figure, [night[place].sample for night in before]))
-        named += (worsened, "error (m)") in {(one.campaign, one.figure) for one in changes(comparisons)}
+        named += (worsened, "error (m)") in {(one.campaign, one.figure) for one in find_changes(comparisons)}
     return named

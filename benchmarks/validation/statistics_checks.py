@@ -162,7 +162,7 @@ def _simulate_decision(
         order = rng.permutation(success.size)
         success, terrain = success[order][:max_cases], terrain[order][:max_cases]
     for look in planned_looks(max_cases):
-        confidence, first = confidence_at(CONFIDENCE, look.share), success[: look.cases]
+        confidence, first = confidence_at(CONFIDENCE, look.risk_fraction), success[: look.cases]
         if correlation is None:
             seen = int(first.sum()), look.cases, confidence
             lower, upper = proportion_lower(*seen), proportion_upper(*seen)

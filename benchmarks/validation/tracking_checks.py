@@ -15,7 +15,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.run import Run, run_case
-from marsyard.scenarios.rover.score import fixed_conditions, run_conditions, score
+from marsyard.scenarios.rover.score import fixed_conditions, run_conditions, score_run
 from marsyard.sim.sensor.odometry import EXACT
 from marsyard.sim.streams import Streams
 
@@ -53,7 +53,7 @@ def driven(number: int, camera: str) -> dict[str, Scalar]:
     """Row of a run without errors."""
     p = exact(number, camera)
     run = run_case(p, Streams(SEED, "validation tracking", number))
-    return {**score(p, run), **fixed_conditions(p, run), **run_conditions(p, run)}
+    return {**score_run(p, run), **fixed_conditions(p, run), **run_conditions(p, run)}
 
 
 def drift(quick: bool) -> Iterator[Measure]:

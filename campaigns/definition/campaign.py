@@ -1,4 +1,4 @@
-"""A campaign and the parameters of each of its cases: the campaign's parameters with the drawn values inserted."""
+"""A campaign, and the parameters of each case: the campaign's parameters with the sampled values inserted."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.sampling.design import (
     MIN_DRAW,
     build_stratified_design,
-    compute_grid_probabilities,
+    compute_grid_quantiles,
     correlate_uniform,
     locate_case,
 )
@@ -30,9 +30,9 @@ from marsyard.sim.streams import Streams
 class Campaign:
     """A campaign ready to run.
 
-    configuration: statements of its file and of the command line's options, with complete parameters.
-    scenario: the scenario that its cases run.
-    command: words of the command that runs it again; empty where it was not started by a command.
+    configuration: contents of the campaign file and of the command-line options, with complete parameters.
+    scenario: scenario of the campaign's cases.
+    command: words of the command that repeats the campaign; empty if no command started it.
     """
 
     configuration: CampaignConfiguration
@@ -44,10 +44,10 @@ class Campaign:
         return Streams(seed=self.configuration.seed, campaign=self.configuration.name, case=case)
 
     def draws(self, case: int) -> dict[str, Any]:
-        """Drawn values of a case, by the path of the parameter, in the file's order.
+        """Sampled values of a case by parameter path, in the order of the file.
 
-        The nominal case draws nothing: its values are the campaign's parameters, except derived ones.
-        Raises ValueError where a formula has no value for the drawn values, or gives an invalid distribution.
+        The nominal case samples nothing: its values are the campaign's parameters, except derived ones.
+        Raises ValueError if a formula is undefined for the sampled values or yields an invalid distribution.
         """
         parameters = self.configuration.parameters
         probabilities = self.probabilities(case)
@@ -57,43 +57,43 @@ class Campaign:
             if probabilities is None and not isinstance(dispersion, Fixed | Derived):
                 values[path] = value_at(parameters, path)
                 continue
-            named = {name: values[name] if name in values else value_at(parameters, name) for name in dispersion.names}
-            given = dispersion.insert_values(named)
-            if isinstance(given, InTurn):
-                values[path] = given.value(case)
+            inputs = {name: values[name] if name in values else value_at(parameters, name) for name in dispersion.names}
+            distribution = dispersion.insert_values(inputs)
+            if isinstance(distribution, InTurn):
+                values[path] = distribution.value(case)
             else:
-                values[path] = given.quantile(0.5 if probabilities is None else probabilities.get(path, 0.5))
+                values[path] = distribution.quantile(0.5 if probabilities is None else probabilities.get(path, 0.5))
         return {path: values[path] for path in self.marginals}
 
     def probabilities(self, case: int) -> dict[str, float] | None:
-        """Uniform number of each dispersion that is drawn or swept in a case; None for the nominal case."""
-        stated, paths = self.configuration, self.drawn_paths
-        position = locate_case(stated.design, stated.blocks, stated.grid_size, case)
+        """Uniform number of each sampled or swept dispersion of a case; None for the nominal case."""
+        setup, paths = self.configuration, self.drawn_paths
+        position = locate_case(setup.design, setup.blocks, setup.grid_size, case)
         if position is None:
             return None
         grid_point, first, size, index = position
-        if stated.design.kind == "random":
+        if setup.design.kind == "random":
             streams = self.streams(case)
             uniform = {path: streams.generator(f"dispersion:{stream_name(path)}").random() for path in paths}
-            drawn = {path: max(float(number), MIN_DRAW) for path, number in uniform.items()}
-            for group in stated.correlations:
-                mixed = correlate_uniform(np.array([drawn[path] for path in group.parameters]), group.factor)
-                drawn.update(zip(group.parameters, mixed.tolist(), strict=True))
+            numbers = {path: max(float(value), MIN_DRAW) for path, value in uniform.items()}
+            for group in setup.correlations:
+                mixed = correlate_uniform(np.array([numbers[path] for path in group.parameters]), group.factor)
+                numbers.update(zip(group.parameters, mixed.tolist(), strict=True))
         else:
             groups = tuple(
                 (tuple(map(paths.index, group.parameters)), tuple(map(tuple, group.factor.tolist())))
-                for group in stated.correlations
+                for group in setup.correlations
             )
             design = build_stratified_design(
-                stated.design.kind, stated.seed, stated.name, first, size, tuple(map(stream_name, paths)), groups
+                setup.design.kind, setup.seed, setup.name, first, size, tuple(map(stream_name, paths)), groups
             )
-            drawn = dict(zip(paths, design[index].tolist(), strict=True))
-        grids = {path: len(grid.points) for path, grid in stated.grids.items()}
-        return {**drawn, **compute_grid_probabilities(grids, grid_point)}
+            numbers = dict(zip(paths, design[index].tolist(), strict=True))
+        grids = {path: len(grid.points) for path, grid in setup.grids.items()}
+        return {**numbers, **compute_grid_quantiles(grids, grid_point)}
 
     @cached_property
     def marginals(self) -> Mapping[str, Dispersion]:
-        """Dispersions by path; those in a covariance with the standard deviations that it states."""
+        """Dispersions by path; members of a covariance have its standard deviations."""
         marginals: dict[str, Dispersion] = dict(self.configuration.dispersions)
         for group in self.configuration.correlations:
             for index, row in enumerate(group.covariance or ()):
@@ -103,33 +103,33 @@ class Campaign:
 
     @cached_property
     def drawn_paths(self) -> tuple[str, ...]:
-        """Dispersions that take a random number, in the file's order."""
+        """Paths of the dispersions that use a random number, in the order of the file."""
         dispersions = self.configuration.dispersions.items()
-        return tuple(path for path, one in dispersions if not isinstance(one, Grid | Fixed | Derived | InTurn))
+        return tuple(path for path, item in dispersions if not isinstance(item, Grid | Fixed | Derived | InTurn))
 
     @cached_property
     def order(self) -> tuple[str, ...]:
-        """Dispersions, each after those that its formulas name. Raises ValueError where formulas form a cycle."""
-        needs = {path: one.names for path, one in self.configuration.dispersions.items()}
-        done: dict[str, None] = {}
-        while len(done) < len(needs):
-            cycle = [path for path in needs if path not in done]
-            ready = [path for path in cycle if all(one in done for one in needs[path] if one in needs)]
+        """Paths of the dispersions; each follows those in its formulas. Raises ValueError if formulas form a cycle."""
+        needs = {path: dispersion.names for path, dispersion in self.configuration.dispersions.items()}
+        sequence: dict[str, None] = {}
+        while len(sequence) < len(needs):
+            cycle = [path for path in needs if path not in sequence]
+            ready = [path for path in cycle if all(name in sequence for name in needs[path] if name in needs)]
             if not ready:
-                raise ValueError(f"formulas depend on one another in a circle: {', '.join(cycle)}")
-            done.update(dict.fromkeys(ready))
-        return tuple(done)
+                raise ValueError(f"formulas depend on each other in a cycle: {', '.join(cycle)}")
+            sequence.update(dict.fromkeys(ready))
+        return tuple(sequence)
 
     def base_parameters(self) -> BaseModel:
-        """Parameters before any draw."""
+        """Parameters of the campaign without sampled values."""
         return self.scenario.parameters_type.model_validate(self.configuration.parameters)
 
     def parameters(self, case: int) -> BaseModel:
-        """Parameters of a case. Raises ValueError where values cannot be drawn, or the scenario refuses them."""
+        """Parameters of a case. Raises ValueError if sampling fails or the scenario rejects the values."""
         return self.with_values(self.draws(case))
 
     def with_values(self, values: Mapping[str, Any]) -> BaseModel:
-        """Campaign's parameters with other values at some paths."""
+        """Campaign's parameters with the given values at some paths."""
         tree: Any = self.configuration.parameters
         for path, value in values.items():
             tree = replace_value(tree, path.split("."), value)
@@ -137,18 +137,18 @@ class Campaign:
 
 
 def replace_value(tree: Any, path: Sequence[str], value: Any) -> Any:
-    """Copy nested tables and lists with another value at a path."""
+    """Copy nested tables and lists with a new value at one path."""
     if not path:
         return value
-    head, *rest = path
+    key, *subpath = path
     if isinstance(tree, list):
-        index = int(head)
-        return [*tree[:index], replace_value(tree[index], rest, value), *tree[index + 1 :]]
-    return {**tree, head: replace_value(tree[head], rest, value)}
+        index = int(key)
+        return [*tree[:index], replace_value(tree[index], subpath, value), *tree[index + 1 :]]
+    return {**tree, key: replace_value(tree[key], subpath, value)}
 
 
 def value_at(tree: Any, path: str) -> Any:
-    """Value at a dotted path in nested tables and lists. Raises ValueError where there is none."""
+    """Value at a dotted path in nested tables and lists. Raises ValueError if there is no such path."""
     node = tree
     for part in path.split("."):
         try:
@@ -159,7 +159,7 @@ def value_at(tree: Any, path: str) -> Any:
 
 
 def find_value(tree: Any, path: str) -> Any:
-    """Value at a dotted path in nested tables and lists; an empty tuple where there is none."""
+    """Value at a dotted path in nested tables and lists; an empty tuple if there is no such path."""
     try:
         return value_at(tree, path)
     except ValueError:

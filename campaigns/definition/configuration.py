@@ -1,4 +1,4 @@
-"""Contents of a campaign file: scenario, cases, parameters, dispersions, requirements, limits; former names in it."""
+"""Contents of a campaign file: scenario, cases, parameters, dispersions, requirements, limits; renamed keys."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from marsyard.sim.files import check_regular
 from marsyard.sim.parameters import Parameters, RenamedWarning, current_column, current_key
 
 Model = TypeVar("Model", bound=BaseModel)
-#: A key in nested tables and lists, part by part.
+#: Location of a key in nested tables and lists: names and indices.
 Key = tuple[str | int, ...]
 #: Maximum number of cases of a campaign.
 MAX_CASES = 1_000_000_000
@@ -32,19 +32,19 @@ _Count = Annotated[int, Field(strict=True, ge=1)]
 _Amount = Annotated[float, Field(strict=True, gt=0.0, allow_inf_nan=False)]
 _Fraction = Annotated[float, Field(strict=True, gt=0.0, lt=1.0)]
 _Text = Annotated[str, Field(min_length=1)]
-#: Populations of every campaign; any other name in a population is a column of true and false.
+#: Populations of every campaign; any other name in a population is a boolean column.
 POPULATIONS = ("all", "completed", "valid")
 
 
 class Requirement(Parameters):
-    """A condition on a stated fraction of a population of cases, at a stated confidence.
+    """A condition on a minimum fraction of a population of cases, at a confidence level.
 
-    With a `bound`, the metric's absolute value must not exceed it; a case without a number fails. Without one, the
-    metric is a column of true and false (`answered`, for example) that must be true.
+    With a `bound`, the metric's absolute value must not exceed it; a case without a number fails. Without a bound, the
+    metric is a boolean column (`answered`, for example) that must be true.
 
-    `population` is `all`, `completed`, `valid` (cases with an answer) or a column of true and false; several are joined
-    by " and ". A metric with a bound may be a sum of columns, joined by " + "; it is multiplied by `scale` before the
-    comparison. `decide_by = "estimate"` compares the observed rate with the probability, regardless of its interval,
+    `population` is `all`, `completed`, `valid` (answered cases) or a boolean column; several are joined by " and ". A
+    metric with a bound may be a sum of columns, joined by " + "; it is multiplied by `scale` before the comparison.
+    `decide_by = "estimate"` compares the observed rate with the probability, regardless of its interval,
     for requirements without a confidence. Its best verdict is MET BY RATE, with exit status 3, or 0 with `accept_rate`.
     """
 
@@ -73,17 +73,17 @@ class Requirement(Parameters):
 
     @property
     def metric_columns(self) -> tuple[str, ...]:
-        """Columns of the metric: one of true and false, or the summands."""
+        """Columns of the metric: one boolean column, or the summands."""
         return (self.metric,) if self.bound is None else tuple(self.metric.split(" + "))
 
     @property
     def population_columns(self) -> tuple[str, ...]:
-        """Columns of true and false that define the population."""
+        """Boolean columns that define the population."""
         return tuple(part for part in self.population.split(" and ") if part not in POPULATIONS)
 
 
 class Retain(Parameters):
-    """Cases that keep their products (histories, pictures, intermediate results); rows are always kept.
+    """Cases that keep their products (histories, images, intermediate results); rows are always kept.
 
     `showcase` is the case shown in the report: the answered case with the worst metric of the first requirement, the
     first case, or none.
@@ -98,12 +98,12 @@ class Retain(Parameters):
     worst: _Count = 10
     every: _Count = 100
     budget_gb: Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False)] = Field(
-        default=10.0, description="disk that kept products may take; when it is used up no more are kept"
+        default=10.0, description="maximum disk space of the kept products; no more are kept once it is used"
     )
 
 
 class Limits(Parameters):
-    """Limits of one case. A case that exceeds one is ended, and its outcome names the limit."""
+    """Limits of one case. A case that exceeds a limit is terminated, and its outcome names the limit."""
 
     case_time_s: _Amount = Field(default=600.0, description="wall-clock time of a case")
     prepare_time_s: _Amount = Field(default=3600.0, description="wall-clock time of building a shared input")
@@ -111,11 +111,11 @@ class Limits(Parameters):
         default=None,
         description="memory that a worker has to itself; by default an equal fraction of 80 % of the free memory",
     )
-    output_mb: _Amount = Field(default=10.0, description="what a case may write to standard output and error")
+    output_mb: _Amount = Field(default=10.0, description="maximum size of a case's standard output and error")
 
 
 class CampaignConfiguration(Parameters):
-    """Everything on which a campaign's rows depend, apart from the program and the machine."""
+    """All inputs that determine a campaign's rows, apart from the program and the machine."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
     scenario: _Text
@@ -131,11 +131,11 @@ class CampaignConfiguration(Parameters):
     limits: Limits = Limits()
     max_cases: _Cases | None = Field(
         default=None,
-        description="cases of the last look at a campaign that stops itself when its verdicts are decided; set by "
+        description="cases at the last interim analysis of a campaign that stops when its verdicts are decided; set by "
         "--until-decided",
     )
     appended: tuple[_Cases, ...] = Field(
-        default=(), strict=False, description="sizes of the blocks of cases that were added behind the first"
+        default=(), strict=False, description="sizes of the blocks of cases that were added after the first"
     )
 
     @property
@@ -153,12 +153,12 @@ class CampaignConfiguration(Parameters):
 
     @property
     def grids(self) -> dict[str, Grid]:
-        """Swept dispersions, in the file's order."""
-        return {path: one for path, one in self.dispersions.items() if isinstance(one, Grid)}
+        """Swept dispersions, in the order of the file."""
+        return {path: item for path, item in self.dispersions.items() if isinstance(item, Grid)}
 
     @property
     def grid_size(self) -> int:
-        """Number of points of the full factorial over the grids; 1 where there are none."""
+        """Number of points of the full factorial of the grids; 1 without grids."""
         return math.prod(len(grid.points) for grid in self.grids.values())
 
     @property
@@ -169,29 +169,29 @@ class CampaignConfiguration(Parameters):
     def find_sampling_problems(self) -> list[tuple[Key, str]]:
         """Problems of the design, the correlated groups and their dispersions: keys and messages."""
         problems: list[tuple[Key, str]] = []
-        if (problem := self.design.find_problem(self.blocks, self.grid_size)) is not None:
+        if (problem := self.design.find_invalid_block(self.blocks, self.grid_size)) is not None:
             block, message = problem
             problems.append((("appended", block - 1) if block else ("cases",), message))
-        grouped: dict[str, int] = {}
+        group_indices: dict[str, int] = {}
         for number, group in enumerate(self.correlations):
             for index, path in enumerate(group.parameters):
-                wrong = self._check_member(group, path)
-                if path in grouped:
-                    wrong = f"'{path}' is in correlations[{grouped[path]}] already"
-                if wrong:
-                    problems.append((("correlations", number, "parameters", index), wrong))
-                grouped[path] = number
-        stated = {path for group in self.correlations if group.covariance for path in group.parameters}
+                reason = self._check_member(group, path)
+                if path in group_indices:
+                    reason = f"'{path}' is in correlations[{group_indices[path]}] already"
+                if reason:
+                    problems.append((("correlations", number, "parameters", index), reason))
+                group_indices[path] = number
+        with_covariance = {path for group in self.correlations if group.covariance for path in group.parameters}
         for path, dispersion in self.dispersions.items():
-            if isinstance(dispersion, Normal) and dispersion.sd is None and path not in stated:
+            if isinstance(dispersion, Normal) and dispersion.sd is None and path not in with_covariance:
                 problems.append((("dispersions", path, "sd"), "required, but missing"))
-            inside = next((other for other in self.dispersions if path.startswith(f"{other}.")), None)
-            if inside is not None:
-                problems.append((("dispersions", path), f"lies within '{inside}', which is dispersed as a whole"))
+            parent = next((table for table in self.dispersions if path.startswith(f"{table}.")), None)
+            if parent is not None:
+                problems.append((("dispersions", path), f"its table '{parent}' is already dispersed as a whole"))
         return problems
 
     def _check_member(self, group: Correlation, path: str) -> str:
-        """Reason why a dispersion cannot be correlated; empty if it can."""
+        """Reason why a dispersion cannot be correlated; empty if it can be."""
         dispersion = self.dispersions.get(path)
         if dispersion is None:
             return f"'{path}' is not dispersed{near_match(path, self.dispersions)}"
@@ -202,14 +202,14 @@ class CampaignConfiguration(Parameters):
         if group.rank is not None:
             return ""
         if not isinstance(dispersion, Normal) or dispersion.truncate is not None:
-            return f"'{path}' is not normal and uncut, as {group.kind} asks; state the group's rank correlation instead"
+            return f"'{path}' is not an untruncated normal, as {group.kind} requires; use the group's rank correlation"
         if group.covariance is not None and dispersion.sd is not None:
-            return f"'{path}' has an sd, which the covariance states already; leave one of them out"
+            return f"'{path}' has an sd, but the covariance already defines it; remove one of them"
         return ""
 
 
 def read_tables(path: Path) -> dict[str, Any]:
-    """Read the tables of a TOML file. Raises ConfigurationError where it cannot be read, or is not valid."""
+    """Read the tables of a TOML file. Raises ConfigurationError if it is unreadable or invalid."""
     try:
         check_regular(path)
         return tomllib.loads(path.read_text(encoding="utf-8"))
@@ -220,7 +220,7 @@ def read_tables(path: Path) -> dict[str, Any]:
 
 
 def read_table(path: Path, model: type[Model]) -> Model:
-    """Read a whole TOML file into a model. Raises ConfigurationError, every problem with its key."""
+    """Read a complete TOML file into a model. Raises ConfigurationError; each problem has its key."""
     try:
         return model.model_validate(read_tables(path))
     except ValidationError as error:
@@ -229,20 +229,20 @@ def read_table(path: Path, model: type[Model]) -> Model:
 
 
 def validation_problems(error: ValidationError, model: type[BaseModel]) -> list[tuple[Key, str]]:
-    """Problems of a validation: keys as written in the file, and messages with the allowed values."""
+    """Problems of a validation: keys as in the file, and messages with the allowed values."""
     problems: list[tuple[Key, str]] = []
     for detail in error.errors(include_url=False):
-        location, given, message = detail["loc"], detail["input"], str(detail["msg"])
+        location, value, message = detail["loc"], detail["input"], str(detail["msg"])
         if detail["type"] == "extra_forbidden":
-            below = _list_models(reduce(_find_inner_type, location[:-1], model))
-            allowed = sorted({name for kind in below for name in kind.model_fields})
+            models = _list_models(reduce(_find_inner_type, location[:-1], model))
+            allowed = sorted({name for option in models for name in option.model_fields})
             message = f"unknown key{near_match(str(location[-1]), allowed)}; allowed: {', '.join(allowed)}"
         elif detail["type"] == "missing":
             message = "required, but missing"
         elif detail["type"] == "value_error":
             message = message.removeprefix("Value error, ")
         else:
-            value_text = repr(given) if isinstance(given, str | int | float | bool) else type(given).__name__
+            value_text = repr(value) if isinstance(value, str | int | float | bool) else type(value).__name__
             message = f"{message[:1].lower()}{message[1:]}, got {value_text}"
         key: Key = ()
         node: Any = model
@@ -258,7 +258,7 @@ def validation_problems(error: ValidationError, model: type[BaseModel]) -> list[
 
 
 def key_text(key: Iterable[str | int]) -> str:
-    """A key in TOML's notation: ``dispersions."wind.east_m_s".low`` or ``requirements[0].bound``."""
+    """A key in TOML syntax: ``dispersions."wind.east_m_s".low`` or ``requirements[0].bound``."""
     text = ""
     for part in key:
         if isinstance(part, int):
@@ -270,46 +270,46 @@ def key_text(key: Iterable[str | int]) -> str:
 
 
 def description_at(model: type[BaseModel], path: str) -> str:
-    """Description of a model's field at a dotted path; empty where it has none."""
+    """Description of a model's field at a dotted path; empty if it has none."""
     *tables, name = path.split(".")
-    below = _list_models(reduce(_find_inner_type, (int(part) if part.isdigit() else part for part in tables), model))
-    return next((kind.model_fields[name].description or "" for kind in below if name in kind.model_fields), "")
+    models = _list_models(reduce(_find_inner_type, (int(part) if part.isdigit() else part for part in tables), model))
+    return next((option.model_fields[name].description or "" for option in models if name in option.model_fields), "")
 
 
 def current_path(model: type[BaseModel], path: str) -> str:
-    """Dotted path of a model's field by its current names; the path itself where the model has no such field."""
+    """Dotted path of a model's field in its current names; unchanged if the model has no such field."""
     kind: Any = model
     parts = []
     for part in path.split("."):
-        fields = {name for one in _list_models(kind) for name in one.model_fields}
+        fields = {name for option in _list_models(kind) for name in option.model_fields}
         parts.append(current_key(part, fields))
         kind = _find_inner_type(kind, int(part) if part.isdigit() else parts[-1])
     return ".".join(parts)
 
 
 def _find_inner_type(kind: Any, part: str | int) -> Any:
-    """Type below one part of a location."""
-    types_below: list[Any] = []
+    """Type at one part of a location."""
+    inner_types: list[Any] = []
     for choice in _list_alternatives(kind):
         if isinstance(choice, type) and issubclass(choice, BaseModel):
             if part in choice.model_fields:
-                types_below.append(choice.model_fields[str(part)].annotation)
+                inner_types.append(choice.model_fields[str(part)].annotation)
             elif choice.__name__ == part or (part in BUILT_IN and choice is BUILT_IN[str(part)]):
-                types_below.append(choice)
+                inner_types.append(choice)
         elif get_origin(choice) in (list, tuple, set, frozenset) and isinstance(part, int):
-            types_below.append(get_args(choice)[0])
+            inner_types.append(get_args(choice)[0])
         elif get_origin(choice) in (dict, Mapping) and isinstance(part, str):
-            types_below.append(get_args(choice)[1])
-    return Union[tuple(types_below)] if types_below else None  # noqa: UP007
+            inner_types.append(get_args(choice)[1])
+    return Union[tuple(inner_types)] if inner_types else None  # noqa: UP007
 
 
 def _list_models(kind: Any) -> list[type[BaseModel]]:
-    """Models among the alternatives of a type."""
-    return [one for one in _list_alternatives(kind) if isinstance(one, type) and issubclass(one, BaseModel)]
+    """Pydantic models among the alternatives of a type."""
+    return [item for item in _list_alternatives(kind) if isinstance(item, type) and issubclass(item, BaseModel)]
 
 
 def _list_alternatives(kind: Any) -> list[Any]:
-    """Members of a union, through annotations."""
+    """Members of a union; annotations are removed."""
     origin = get_origin(kind)
     if origin is Annotated:
         return _list_alternatives(get_args(kind)[0])
@@ -319,14 +319,14 @@ def _list_alternatives(kind: Any) -> list[Any]:
 
 
 _NAME = re.compile(r"[A-Za-z_]\w*(?:\.\w+)*")
-#: Keys of a dispersion whose texts are no formulas.
+#: Keys of a dispersion whose texts are not formulas.
 _TEXTS = ("distribution", "source", "description", "unit")
 
 
 def use_current_names(tables: Mapping[str, Any], selected: Scenario) -> dict[str, Any]:
-    """Tables of a campaign file with the current names of dispersed parameters and columns; warns of former ones.
+    """Tables of a campaign file with the current names of dispersed parameters and columns; warn of former names.
 
-    Keys of the parameters themselves are renamed by their model.
+    The parameter models rename the keys of the parameters themselves.
     """
     path = partial(current_path, selected.parameters_type)
     column = _column_names(str(tables.get("scenario")))
@@ -334,21 +334,21 @@ def use_current_names(tables: Mapping[str, Any], selected: Scenario) -> dict[str
     dispersions, correlations = tables.get("dispersions"), tables.get("correlations")
     if isinstance(dispersions, Mapping):
         current["dispersions"] = {
-            path(name): {key: _replace(value, path) if key not in _TEXTS else value for key, value in stated.items()}
-            if isinstance(stated, Mapping)
-            else stated
-            for name, stated in dispersions.items()
+            path(name): {key: _replace(value, path) if key not in _TEXTS else value for key, value in table.items()}
+            if isinstance(table, Mapping)
+            else table
+            for name, table in dispersions.items()
         }
     if isinstance(correlations, list):
         current["correlations"] = [_rename_entries(group, ("parameters",), path) for group in correlations]
     if isinstance(tables.get("requirements"), list):
         keys = ("metric", "population")
-        current["requirements"] = [_rename_entries(stated, keys, column) for stated in tables["requirements"]]
+        current["requirements"] = [_rename_entries(entry, keys, column) for entry in tables["requirements"]]
     return current
 
 
-def stored_configuration_now(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Configuration of a stored campaign by the current names, without a warning."""
+def update_stored_configuration(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Configuration of a stored campaign in the current names, without a warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RenamedWarning)
         stored = {current_key(key, CampaignConfiguration.model_fields): value for key, value in stored.items()}
@@ -361,8 +361,8 @@ def stored_configuration_now(stored: Mapping[str, Any]) -> dict[str, Any]:
         return {**current, "parameters": parameters.model_dump(mode="json", round_trip=True, exclude_unset=True)}
 
 
-def stored_columns_now(names: Iterable[str], scenario_name: str) -> dict[str, str]:
-    """Stored columns with a former name, each with its current one; without a warning."""
+def find_renamed_columns(names: Iterable[str], scenario_name: str) -> dict[str, str]:
+    """Stored columns with a former name, each with its current name; without a warning."""
     column = _column_names(scenario_name)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RenamedWarning)
@@ -376,17 +376,17 @@ def _column_names(scenario_name: str) -> Callable[[str], str]:
         columns = None
     if columns is None:
         return lambda name: name
-    return lambda name: current_column(name, lambda one: columns.has_flag(one) or columns.has_number(one))
+    return lambda name: current_column(name, lambda key: columns.has_flag(key) or columns.has_number(key))
 
 
 def _replace(value: Any, rename: Callable[[str], str]) -> Any:
-    """Value with the names in its formulas, or in its list of names, renamed."""
+    """Value with renamed names in its formula or in its list of names."""
     if isinstance(value, str):
         return _NAME.sub(lambda match: rename(match[0]), value)
-    return [_replace(one, rename) for one in value] if isinstance(value, list) else value
+    return [_replace(item, rename) for item in value] if isinstance(value, list) else value
 
 
-def _rename_entries(stated: Any, keys: Iterable[str], rename: Callable[[str], str]) -> Any:
-    if not isinstance(stated, Mapping):
-        return stated
-    return {key: _replace(value, rename) if key in keys else value for key, value in stated.items()}
+def _rename_entries(entry: Any, keys: Iterable[str], rename: Callable[[str], str]) -> Any:
+    if not isinstance(entry, Mapping):
+        return entry
+    return {key: _replace(value, rename) if key in keys else value for key, value in entry.items()}

@@ -1,4 +1,4 @@
-"""Identity of a campaign: hashes and versions of everything except the case number on which its rows depend.
+"""Identity of a campaign: hashes and versions of all inputs, except the case number, that determine its rows.
 
 The record also describes the algorithms under test: class, version, options, and a hash of the sources.
 """
@@ -30,7 +30,7 @@ from marsyard.scenarios.offline import answers_file, is_offline
 from marsyard.scenarios.systems import UnknownScenarioError, scenario, scenario_source
 from marsyard.scenarios.user_files import import_object, input_files, relative_to, source_files
 
-#: Packages on whose code rows depend; reports and commands change no row.
+#: Packages whose code determines rows; reports and commands change no row.
 _CODE = ("sim", "algorithms", "scenarios", "campaigns")
 #: Keys of a configuration that change no row of a finished case.
 _KEYS_WITHOUT_EFFECT = frozenset({"appended", "description", "limits", "max_cases", "requirements", "retain"})
@@ -39,14 +39,12 @@ _HOME = Path(__file__).resolve().parents[2]
 
 @dataclass(frozen=True)
 class Identity:
-    """Everything that must be equal for two runs of a case to give the same row, on one machine.
+    """All values that must be equal for two runs of a case to give the same row, on one machine.
 
-    configuration: hash of the statements about cases.
-    code: hash of the sources of `sim`, `algorithms`, `scenarios`, `campaigns`, and of custom scenarios, algorithms and
-    parts.
-    versions: of Python, Marsyard and the packages that it requires.
-    inputs: hashes of the files that the parameters name, by path as stated; missing files are left out. None where an
-    earlier version stored none, so that changes are unknown.
+    configuration: hash of the keys that determine the cases. code: hash of the sources of `sim`, `algorithms`,
+    `scenarios`, `campaigns`, and of custom scenarios, algorithms and parts. versions: versions of Python, Marsyard and
+    the packages that it requires. inputs: hashes of the parameters' input files, by path as written; missing files are
+    omitted. None if the record of an earlier version contains none, so that changes are unknown.
     """
 
     configuration: str
@@ -73,7 +71,7 @@ class Identity:
 def create_identity(configuration: CampaignConfiguration) -> Identity:
     """Identity of a campaign if it were run now.
 
-    Raises CampaignError where a file that the parameters name cannot be used any more.
+    Raises CampaignError if an input file is no longer valid.
     """
     custom = (*list_algorithms(configuration), *list_parts(configuration))
     code = hash_code((scenario_source(configuration.scenario), *custom))
@@ -81,22 +79,21 @@ def create_identity(configuration: CampaignConfiguration) -> Identity:
 
 
 def hash_inputs(configuration: CampaignConfiguration) -> dict[str, str]:
-    """SHA-256 of each file that the parameters or their dispersions name, by path.
+    """SHA-256 of each input file of the parameters or their dispersions, by path.
 
-    Raises CampaignError where the scenario refuses the parameters, for example because a file is missing or has
-    changed.
+    Raises CampaignError if the scenario rejects the parameters, for example because a file is missing or has changed.
     """
     try:
         parameters = scenario(configuration.scenario).parameters_type.model_validate(configuration.parameters)
     except UnknownScenarioError:
         return {}
     except ValidationError as error:
-        reasons = "; ".join(one["msg"].removeprefix("Value error, ") for one in error.errors(include_url=False))
-        raise CampaignError(f"the campaign's parameters cannot be used any more: {reasons}") from error
-    dispersed = [one for one in configuration.dispersions.values() if isinstance(one, Choice | Fixed | Grid)]
-    stated = [value for one in dispersed for extreme in one.extremes() for _, value in leaves(extreme)]
+        reasons = "; ".join(detail["msg"].removeprefix("Value error, ") for detail in error.errors(include_url=False))
+        raise CampaignError(f"the campaign's parameters are no longer valid: {reasons}") from error
+    dispersed = [item for item in configuration.dispersions.values() if isinstance(item, Choice | Fixed | Grid)]
+    values = [value for item in dispersed for extreme in item.extremes() for _, value in leaves(extreme)]
     hashes: dict[str, str] = {}
-    for name in dict.fromkeys((*input_files(parameters), *(value for value in stated if isinstance(value, str)))):
+    for name in dict.fromkeys((*input_files(parameters), *(value for value in values if isinstance(value, str)))):
         if Path(name).is_file():
             try:
                 with Path(name).open("rb") as file:
@@ -107,40 +104,40 @@ def hash_inputs(configuration: CampaignConfiguration) -> dict[str, str]:
 
 
 def list_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
-    """Algorithms under test that a configuration or its dispersions name."""
-    used = find_scenario(configuration.scenario)
-    if not isinstance(used, HasAlgorithms):
+    """Algorithms under test in a configuration or its dispersions."""
+    selected = find_scenario(configuration.scenario)
+    if not isinstance(selected, HasAlgorithms):
         return ()
-    tested, compared = (".".join((*used.algorithm_table, name)) for name in ("algorithm", "compared"))
-    stated = [find_value(configuration.parameters, tested), *find_value(configuration.parameters, compared)]
+    tested, compared = (".".join((*selected.algorithm_table, name)) for name in ("algorithm", "compared"))
+    specs = [find_value(configuration.parameters, tested), *find_value(configuration.parameters, compared)]
     if tested in configuration.dispersions:
-        stated += configuration.dispersions[tested].extremes()
-    return tuple(dict.fromkeys(str(spec) for spec in stated if spec))
+        specs += configuration.dispersions[tested].extremes()
+    return tuple(dict.fromkeys(str(spec) for spec in specs if spec))
 
 
 def list_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
-    """Import paths (``module:name``) of the custom parts that a configuration or its dispersions name."""
-    used = find_scenario(configuration.scenario)
-    if not isinstance(used, HasParts):
+    """Import paths (``module:name``) of the custom parts in a configuration or its dispersions."""
+    selected = find_scenario(configuration.scenario)
+    if not isinstance(selected, HasParts):
         return ()
     trees = [configuration.parameters]
     for path, dispersion in configuration.dispersions.items():
-        if any(f"{key}.".startswith(f"{path}.") for key in used.part_keys):
+        if any(f"{key}.".startswith(f"{path}.") for key in selected.part_keys):
             for tree in dispersion.extremes():
                 for name in reversed(path.split(".")):
                     tree = {name: tree}
                 trees.append(tree)
     paths: dict[str, None] = {}
     for tree in trees:
-        for key, kind in used.part_keys.items():
-            named = find_value(tree, key)
-            specs = [named] if isinstance(named, str) else [str(one) for one in named or ()]
+        for key, kind in selected.part_keys.items():
+            value = find_value(tree, key)
+            specs = [value] if isinstance(value, str) else [str(item) for item in value or ()]
             paths.update(dict.fromkeys(map(kind.path, specs)))
     return tuple(paths)
 
 
 def find_scenario(name: object) -> Scenario | None:
-    """Scenario of a name; None where it is no name, or unknown."""
+    """Scenario of a name; None if the name is invalid or unknown."""
     try:
         return scenario(name) if isinstance(name, str) and name else None
     except UnknownScenarioError:
@@ -148,19 +145,19 @@ def find_scenario(name: object) -> Scenario | None:
 
 
 def configuration_hash(configuration: CampaignConfiguration) -> str:
-    """Hash of a configuration's statements about cases."""
-    stated = configuration.model_dump(mode="json", exclude=set(_KEYS_WITHOUT_EFFECT))
-    return hashlib.sha256(json.dumps(stated, sort_keys=True).encode()).hexdigest()
+    """Hash of the configuration keys that determine the cases."""
+    values = configuration.model_dump(mode="json", exclude=set(_KEYS_WITHOUT_EFFECT))
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 @cache
-def hash_code(named: tuple[str, ...]) -> str:
-    """Hash of the sources on which rows depend; `named` are the scenario, algorithms and parts."""
+def hash_code(components: tuple[str, ...]) -> str:
+    """Hash of the sources that determine rows; `components` are the scenario, algorithms and parts."""
     sources: list[tuple[str, Path]] = []
     for folder in _CODE:
         for pattern in ("*.py", "*.json"):
             sources += relative_to(_HOME, sorted((_HOME / folder).rglob(pattern)))
-    return hash_sources((*sources, *(source for one in named for source in custom_sources(one))))
+    return hash_sources((*sources, *(source for name in components for source in custom_sources(name))))
 
 
 def hash_sources(sources: Iterable[tuple[str, Path]]) -> str:
@@ -173,20 +170,20 @@ def hash_sources(sources: Iterable[tuple[str, Path]]) -> str:
     return digest.hexdigest()
 
 
-def custom_sources(named: str) -> Iterator[tuple[str, Path]]:
+def custom_sources(spec: str) -> Iterator[tuple[str, Path]]:
     """Source files of a custom scenario, algorithm or part: package or module, program, or table of answers."""
-    table = answers_file(named)
+    table = answers_file(spec)
     try:
-        command = None if table is not None else parse_command(named)
+        command = None if table is not None else parse_command(spec)
     except ValueError:
         return
     if table is not None:
         yield table.name, table
     elif command is None:
-        yield from algorithm_sources(named)
+        yield from algorithm_sources(spec)
     else:
-        words = [Path(word) for word in (shutil.which(command.words[0]), *command.words[1:]) if word is not None]
-        yield from ((path.name, path) for path in words if path.is_file())
+        paths = [Path(word) for word in (shutil.which(command.words[0]), *command.words[1:]) if word is not None]
+        yield from ((path.name, path) for path in paths if path.is_file())
 
 
 def read_versions() -> dict[str, str]:
@@ -208,33 +205,33 @@ def _distribution_version(name: str) -> str | None:
 
 
 def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
-    """Describe the algorithms that a campaign runs, the one under test first; empty where the scenario takes none.
+    """Describe the algorithms of a campaign, the one under test first; empty if the scenario has none.
 
-    Keys of each entry: `spec` (the campaign's name for it), `role` (`tested` or `compared`), `path` (class as
+    Keys of each entry: `spec` (name in the campaign), `role` (`tested` or `compared`), `path` (class as
     ``module:name``, or the file of the program or table), `version` (of the installed distribution, or the class's
-    `version` attribute; None where there is neither), `options` and `source_hash` (SHA-256, 16 digits; None where no
-    source can be read).
+    `version` attribute; None if there is neither), `options` and `source_hash` (SHA-256, 16 digits; None without a
+    readable source).
     """
-    tested = campaign.scenario
-    if not isinstance(tested, HasAlgorithms):
+    selected = campaign.scenario
+    if not isinstance(selected, HasAlgorithms):
         return []
-    compared = find_value(campaign.configuration.parameters, ".".join((*tested.algorithm_table, "compared")))
+    compared = find_value(campaign.configuration.parameters, ".".join((*selected.algorithm_table, "compared")))
     parameters: Any = campaign.base_parameters()
-    for name in tested.algorithm_table:
+    for name in selected.algorithm_table:
         parameters = getattr(parameters, name)
-    described = []
+    entries = []
     for spec in list_algorithms(campaign.configuration):
-        shipped = spec in tested.task.shipped
+        shipped = spec in selected.task.shipped
         sources = list(source_files("algorithms:") if shipped else custom_sources(spec))
         if shipped:
-            stated = (value for _, value in parameters if isinstance(value, tested.task.options))
-            algorithm = tested.task.shipped[spec](next(stated, tested.task.options()))
+            options_given = (value for _, value in parameters if isinstance(value, selected.task.options))
+            algorithm = selected.task.shipped[spec](next(options_given, selected.task.options()))
             kind, version = type(algorithm), _distribution_version("marsyard")
             path = f"{kind.__module__}:{kind.__qualname__}"
             options = _plain_options(getattr(algorithm, "options", None))
         else:
             path, version, options = _describe_custom(spec)
-        described.append(
+        entries.append(
             {
                 "spec": spec,
                 "role": "compared" if spec in compared else "tested",
@@ -244,7 +241,7 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
                 "source_hash": hash_sources(sources)[:16] if sources else None,
             }
         )
-    return described
+    return entries
 
 
 def _describe_custom(spec: str) -> tuple[str, str | None, dict[str, Any]]:
@@ -254,20 +251,20 @@ def _describe_custom(spec: str) -> tuple[str, str | None, dict[str, Any]]:
         return (spec.partition(":")[2] if command is None else command.words[0]), None, {}
     point = list_installed().get(spec)
     path, target = (spec, import_object(spec)) if point is None else (point.value, point.load())
-    top = path.partition(":")[0].partition(".")[0]
-    versions = map(_distribution_version, metadata.packages_distributions().get(top, []))
-    version = next((one for one in versions if one is not None), None) or getattr(target, "version", None)
+    package = path.partition(":")[0].partition(".")[0]
+    versions = map(_distribution_version, metadata.packages_distributions().get(package, []))
+    version = next((text for text in versions if text is not None), None) or getattr(target, "version", None)
     return path, version if isinstance(version, str) else None, _plain_options(getattr(target, "options", None))
 
 
 def _plain_options(options: object) -> dict[str, Any]:
-    """Options as JSON values; empty where there are none, or JSON cannot hold them."""
+    """Options as JSON values; empty without options, or if JSON cannot represent them."""
     try:
         if isinstance(options, BaseModel):
             options = options.model_dump(mode="json")
         elif is_dataclass(options) and not isinstance(options, type):
             options = asdict(options)
-        stated = {str(key): value for key, value in options.items()} if isinstance(options, Mapping) else {}
-        return dict(json.loads(json.dumps(stated, default=str)))
+        values = {str(key): value for key, value in options.items()} if isinstance(options, Mapping) else {}
+        return dict(json.loads(json.dumps(values, default=str)))
     except Exception:  # custom values may raise anything, and the record must not stop a campaign
         return {}

@@ -1,6 +1,6 @@
-"""Loading of a campaign: read its file, apply the options of the command line, and report all problems at once.
+"""Loading of a campaign: read its file, apply the command-line options, and report all problems at once.
 
-Dispersions, and the columns that requirements name, are checked against the scenario before any case runs.
+Dispersions, and columns of requirements, are checked against the scenario before any case runs.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ from marsyard.scenarios.systems import RowColumns, UnknownScenarioError, row_col
 
 
 def catalogue() -> dict[str, Path]:
-    """The campaign files of all systems, by their campaigns' names in order."""
+    """Campaign files of all systems by campaign name, sorted."""
     return dict(sorted((name, path) for system in systems() for name, path in system.campaigns.items()))
 
 
-#: Keys of the file that `--set` may name; any other key is one of the parameters.
+#: Keys of the file that `--set` accepts; any other key is a parameter.
 _FILE_KEYS = (
     *("parameters", "dispersions", "design", "retain", "limits"),
     *("cases", "seed", "name", "description", "scenario", "correlations"),
 )
-#: Cases whose draws are validated before a campaign starts; the range of each dispersion is checked in full.
+#: Number of cases whose sampled values are validated before the campaign starts; ranges are checked in full.
 _CHECKED_CASES = 32
-#: Maximum number of dispersed parameters in the formulas of one dispersion: all combinations of extremes are checked.
+#: Maximum number of varying parameters in the formulas of one dispersion: all combinations of extremes are checked.
 _MAX_VARYING = 8
-#: Kinds of columns that requirements name.
+#: Kinds of columns in requirements.
 FLAGS, NUMBERS = "column of true and false", "column of numbers"
 #: Columns that the engine writes.
 _ENGINE_FLAGS, _ENGINE_NUMBERS = ("answered",), ("wall_time_s", "cpu_time_s")
@@ -63,7 +63,7 @@ Model = TypeVar("Model", bound=BaseModel)
 def find_campaign(name_or_path: str) -> Path:
     """File of a campaign given by its name in the catalogue or by the path of a TOML file.
 
-    Raises ConfigurationError where there is none.
+    Raises ConfigurationError if there is no such file.
     """
     path = Path(name_or_path)
     if path.suffix == ".toml" or len(path.parts) > 1:
@@ -86,12 +86,11 @@ def load_campaign(
 ) -> Campaign:
     """Read a campaign and check it as a whole.
 
-    name_or_path: a name from the catalogue, or the path of a TOML file.
-    overrides: ``KEY=VALUE`` each. KEY is a dotted path into the parameters or one of the file's own keys (`cases`,
-    `seed`), VALUE is in TOML's notation or plain text. An overridden parameter is no longer dispersed.
-    cases, seed: replace those of the file.
-    algorithms: replace those of the file: the algorithm under test, then those compared with it.
-    Raises ConfigurationError that lists every problem by file (or option), key and allowed values.
+    name_or_path: a name from the catalogue, or the path of a TOML file. overrides: ``KEY=VALUE`` each. KEY is a dotted
+    path into the parameters or a top-level key of the file (`cases`, `seed`); VALUE is in TOML syntax or plain text. An
+    overridden parameter is no longer dispersed. cases, seed: replace those of the file. algorithms: replace those of
+    the file: the algorithm under test, then those compared with it. Raises ConfigurationError with every problem: file
+    (or option), key and allowed values.
     """
     path = find_campaign(name_or_path)
     tables = read_tables(path)
@@ -99,7 +98,7 @@ def load_campaign(
     if selected is not None:
         tables = use_current_names(tables, selected)
     overridden: dict[tuple[str, ...], str] = {}
-    words = ["marsyard", "run", name_or_path]
+    command = ["marsyard", "run", name_or_path]
     for override in overrides:
         option = f"--set {override}"
         tables = _apply_option(tables, _parse_override(override, option, selected), option, overridden)
@@ -109,10 +108,10 @@ def load_campaign(
         if value is not None:
             tables[key] = value
             overridden[(key,)] = f"{option} {value}"
-            words += [option, str(value)]
+            command += [option, str(value)]
     for option, values in (("--algorithm", algorithms), ("--set", overrides)):
-        words += [word for value in values for word in (option, value)]
-    return replace(_validate(str(path), tables, overridden), command=tuple(words))
+        command += [word for value in values for word in (option, value)]
+    return replace(_validate(str(path), tables, overridden), command=tuple(command))
 
 
 def _parse_override(override: str, option: str, selected: Scenario | None) -> dict[str, Any]:
@@ -123,29 +122,29 @@ def _parse_override(override: str, option: str, selected: Scenario | None) -> di
         key = current_path(selected.parameters_type, key.strip())
     try:
         try:
-            stated = tomllib.loads(f"{key} = {value.strip()}")
+            values = tomllib.loads(f"{key} = {value.strip()}")
         except ValueError:
-            stated = tomllib.loads(f"{key} = {json.dumps(value.strip())}")
+            values = tomllib.loads(f"{key} = {json.dumps(value.strip())}")
     except (ValueError, RecursionError) as error:
         raise ConfigurationError([Problem(option, "", f"'{key}' is not a dotted key: {error}")]) from error
-    return stated if next(iter(stated)) in _FILE_KEYS else {"parameters": stated}
+    return values if next(iter(values)) in _FILE_KEYS else {"parameters": values}
 
 
 def _select_algorithms(
-    tables: dict[str, Any], algorithms: Sequence[str], where: str, overridden: dict[tuple[str, ...], str]
+    tables: dict[str, Any], algorithms: Sequence[str], source: str, overridden: dict[tuple[str, ...], str]
 ) -> dict[str, Any]:
-    """Tables with other algorithms; unchanged for an unknown scenario, which is reported later."""
+    """Tables with the given algorithms; unchanged for an unknown scenario, which is reported later."""
     options = [f"--algorithm {spec}" for spec in algorithms]
     selected = find_scenario(tables.get("scenario"))
     if selected is None:
         return tables
     if not isinstance(selected, HasAlgorithms):
-        raise ConfigurationError([Problem(options[0], "", f"the scenario of {where} has no choice of algorithms")])
-    stated: tuple[tuple[str, Any, str], ...] = (
+        raise ConfigurationError([Problem(options[0], "", f"the scenario of {source} has no selectable algorithms")])
+    settings: tuple[tuple[str, Any, str], ...] = (
         ("algorithm", algorithms[0], options[0]),
         ("compared", list(algorithms[1:]), " ".join(options[1:]) or options[0]),
     )
-    for key, value, option in stated:
+    for key, value, option in settings:
         inner: dict[str, Any] = {key: value}
         for part in reversed(("parameters", *selected.algorithm_table)):
             inner = {part: inner}
@@ -154,20 +153,18 @@ def _select_algorithms(
 
 
 def _apply_option(
-    tables: Mapping[str, Any], stated: Mapping[str, Any], option: str, overridden: dict[tuple[str, ...], str]
+    tables: Mapping[str, Any], settings: Mapping[str, Any], option: str, overridden: dict[tuple[str, ...], str]
 ) -> dict[str, Any]:
-    """Tables merged with those of an option; parameters that it sets are no longer dispersed."""
-    merged = _merge(tables, stated)
-    paths = _list_paths(stated)
+    """Tables merged with those of an option; parameters set by the option are no longer dispersed."""
+    merged = _merge(tables, settings)
+    paths = _list_paths(settings)
     overridden.update(dict.fromkeys(paths, option))
     fixed = [".".join(path[1:]) for path in paths if path[0] == "parameters"]
     dispersions = merged.get("dispersions")
     if isinstance(dispersions, dict):
-        related = ((path, other) for path in dispersions for other in fixed)
-        removed = {
-            path for path, other in related if f"{path}.".startswith(f"{other}.") or other.startswith(f"{path}.")
-        }
-        merged["dispersions"] = {path: one for path, one in dispersions.items() if path not in removed}
+        related = ((path, key) for path in dispersions for key in fixed)
+        removed = {path for path, key in related if f"{path}.".startswith(f"{key}.") or key.startswith(f"{path}.")}
+        merged["dispersions"] = {path: item for path, item in dispersions.items() if path not in removed}
         if removed and isinstance(merged.get("correlations"), list):
             groups = [_remove_members(group, removed) for group in merged["correlations"]]
             merged["correlations"] = [group for group in groups if group != {}]
@@ -175,16 +172,18 @@ def _apply_option(
 
 
 def _remove_members(group: Any, removed: set[str]) -> Any:
-    """Correlated group without removed dispersions; empty where none is left; unchanged where it is not valid."""
+    """Correlated group without removed dispersions; empty if none remains; unchanged if it is invalid."""
     names = group.get("parameters") if isinstance(group, Mapping) else None
     if not isinstance(names, list):
         return group
-    kept = [index for index, name in enumerate(names) if name not in removed]
+    indices = [index for index, name in enumerate(names) if name not in removed]
     try:
-        matrices = {kind: [[rows[i][j] for j in kept] for i in kept] for kind in MATRICES if (rows := group.get(kind))}
+        matrices = {
+            kind: [[rows[i][j] for j in indices] for i in indices] for kind in MATRICES if (rows := group.get(kind))
+        }
     except (IndexError, KeyError, TypeError):
         return group
-    return {**group, "parameters": [names[index] for index in kept], **matrices} if kept else {}
+    return {**group, "parameters": [names[index] for index in indices], **matrices} if indices else {}
 
 
 def _list_paths(tables: Mapping[str, Any]) -> list[tuple[str, ...]]:
@@ -195,25 +194,25 @@ def _list_paths(tables: Mapping[str, Any]) -> list[tuple[str, ...]]:
     return paths
 
 
-def _merge(tables: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
+def _merge(tables: Mapping[str, Any], updates: Mapping[str, Any]) -> dict[str, Any]:
     merged = dict(tables)
-    for name, value in other.items():
-        mine = merged.get(name)
-        merged[name] = _merge(mine, value) if isinstance(mine, Mapping) and isinstance(value, Mapping) else value
+    for name, value in updates.items():
+        current = merged.get(name)
+        merged[name] = _merge(current, value) if isinstance(current, Mapping) and isinstance(value, Mapping) else value
     return merged
 
 
-def _validate(where: str, tables: Mapping[str, Any], overridden: Mapping[tuple[str, ...], str]) -> Campaign:
-    """Campaign of the tables of a file, its parameters completed with their defaults."""
+def _validate(source: str, tables: Mapping[str, Any], overridden: Mapping[tuple[str, ...], str]) -> Campaign:
+    """Campaign from the tables of a file; defaults complete its parameters."""
     problems: list[Problem] = []
 
-    def note(new_problems: Iterable[tuple[Key, str]], prefix: Key = ()) -> None:
-        """Note problems at keys, located in the file or in the option of the command line that sets the key."""
+    def add_problems(new_problems: Iterable[tuple[Key, str]], prefix: Key = ()) -> None:
+        """Append problems at keys, located in the file or in the command-line option that sets the key."""
         for key, message in new_problems:
-            key, location = (*prefix, *key), where
+            key, location = (*prefix, *key), source
             for path, option in overridden.items():
-                shared = min(len(key), len(path))
-                if shared and key[:shared] == path[:shared]:
+                common_length = min(len(key), len(path))
+                if common_length and key[:common_length] == path[:common_length]:
                     location = option
                     break
             problems.append(Problem(location, key_text(key), message))
@@ -222,11 +221,11 @@ def _validate(where: str, tables: Mapping[str, Any], overridden: Mapping[tuple[s
         try:
             return model.model_validate(tables)
         except ValidationError as error:
-            note(validation_problems(error, model), prefix)
+            add_problems(validation_problems(error, model), prefix)
             return None
 
     tables, unresolved = fill_requirements(tables)
-    note(unresolved)
+    add_problems(unresolved)
     if problems:
         raise ConfigurationError(problems)
     configuration, selected, parameters = validate(CampaignConfiguration, tables), None, None
@@ -234,15 +233,15 @@ def _validate(where: str, tables: Mapping[str, Any], overridden: Mapping[tuple[s
         if isinstance(name := tables.get("scenario"), str) and name:
             selected = scenario(name)
     except UnknownScenarioError as error:
-        note([(("scenario",), str(error))])
-    stated = tables.get("parameters", {})
-    if selected is not None and isinstance(stated, Mapping):
-        parameters = validate(selected.parameters_type, stated, ("parameters",))
+        add_problems([(("scenario",), str(error))])
+    values = tables.get("parameters", {})
+    if selected is not None and isinstance(values, Mapping):
+        parameters = validate(selected.parameters_type, values, ("parameters",))
     if configuration is None or selected is None or parameters is None:
         raise ConfigurationError(problems)
     complete = parameters.model_dump(mode="json", round_trip=True)
     campaign = Campaign(configuration.model_copy(update={"parameters": complete}), selected)
-    note([*_check_sampling(campaign), *_check_metrics(campaign)])
+    add_problems([*_check_sampling(campaign), *_check_metrics(campaign)])
     if problems:
         raise ConfigurationError(problems)
     return campaign
@@ -255,31 +254,31 @@ def _check_sampling(campaign: Campaign) -> list[tuple[Key, str]]:
         return problems
     for case in range(min(campaign.configuration.cases, _CHECKED_CASES)):
         try:
-            refused = _find_refusal(campaign, campaign.draws(case))
+            error_text = _find_validation_error(campaign, campaign.draws(case))
         except ValueError as error:
-            refused = _extract_message(error)
-        if refused:
-            return [(("dispersions",), f"the draws of case {case} are refused together: {refused}")]
+            error_text = _extract_message(error)
+        if error_text:
+            return [(("dispersions",), f"the sampled values of case {case} are invalid in combination: {error_text}")]
     return []
 
 
 def _check_names(campaign: Campaign) -> list[tuple[Key, str]]:
-    """Unknown parameters that dispersions or formulas name, and cycles of formulas."""
+    """Unknown parameters in dispersions or formulas, and cycles of formulas."""
     parameters = dict(leaves(campaign.configuration.parameters))
     dispersions = campaign.configuration.dispersions
     problems: list[tuple[Key, str]] = []
     for path, dispersion in dispersions.items():
-        listed = not isinstance(dispersion, Grid) or dispersion.values is not None
-        takes_tables = isinstance(dispersion, Choice | Fixed | Grid) and listed
+        has_values = not isinstance(dispersion, Grid) or dispersion.values is not None
+        allows_tables = isinstance(dispersion, Choice | Fixed | Grid) and has_values
         if path not in parameters and not any(leaf.startswith(f"{path}.") for leaf in parameters):
             problems.append((("dispersions", path), _describe_unknown(path, parameters)))
-        elif path not in parameters and not takes_tables:
-            message = "is a table; disperse one of its values, or choose between tables"
+        elif path not in parameters and not allows_tables:
+            message = "is a table; disperse one of its values, or use 'choice' or 'grid' over tables"
             problems.append((("dispersions", path), message))
         for key, name in ((key, name) for key, formula in dispersion.formulas.items() for name in formula.names):
-            parent = next((other for other in dispersions if name.startswith(f"{other}.")), None)
+            parent = next((table for table in dispersions if name.startswith(f"{table}.")), None)
             if parent is not None:
-                message = f"'{name}' lies within '{parent}', which is dispersed as a whole"
+                message = f"'{name}' cannot be used: its table '{parent}' is dispersed as a whole"
             else:
                 message = "" if name in parameters else _describe_unknown(name, parameters)
             problems += [(("dispersions", path, *key), message)] if message else []
@@ -292,26 +291,26 @@ def _check_names(campaign: Campaign) -> list[tuple[Key, str]]:
 
 
 def _describe_unknown(path: str, parameters: Iterable[str]) -> str:
-    """Message that lists the parameters in the innermost existing table of a path; its subtables by name only."""
+    """Message that lists the parameters in the innermost existing table of a path; subtables by name only."""
     allowed = names = list(parameters)
     table = path
     while table:
         table = table.rpartition(".")[0]
         prefix = f"{table}." if table else ""
-        inside = [name.removeprefix(prefix).partition(".") for name in names if name.startswith(prefix)]
-        if inside:
-            allowed = list(dict.fromkeys(f"{prefix}{head}{'.*' if rest else ''}" for head, rest, _ in inside))
+        entries = [name.removeprefix(prefix).partition(".") for name in names if name.startswith(prefix)]
+        if entries:
+            allowed = list(dict.fromkeys(f"{prefix}{key}{'.*' if dot else ''}" for key, dot, _ in entries))
             break
     return unknown_name_message("parameter", path, names, allowed)
 
 
 def _check_ranges(campaign: Campaign) -> list[tuple[Key, str]]:
-    """Values that a parameter refuses, and formulas without a value, at the extremes of the dispersions."""
+    """Invalid parameter values and undefined formulas at the limits of the dispersions."""
     problems: list[tuple[Key, str]] = []
     extremes: dict[str, list[Any]] = {}
     for path in campaign.order:
         if any(name in campaign.marginals and name not in extremes for name in campaign.marginals[path].names):
-            continue  # a dispersion that it depends on has a problem already
+            continue  # a dispersion in its formulas has a problem already
         try:
             values = _check_extremes(campaign, path, extremes)
         except ValueError as error:
@@ -324,31 +323,31 @@ def _check_ranges(campaign: Campaign) -> list[tuple[Key, str]]:
 
 
 def _check_extremes(campaign: Campaign, path: str, extremes: Mapping[str, list[Any]]) -> list[Any]:
-    """Extreme values of a dispersion at all combinations of the extremes that its formulas name.
+    """Extreme values of a dispersion at all combinations of the extremes of the parameters in its formulas.
 
-    Raises ValueError for the first that is not valid.
+    Raises ValueError for the first invalid value.
     """
     dispersion, parameters = campaign.marginals[path], campaign.configuration.parameters
     varying = [name for name in dispersion.names if name in extremes]
     if len(varying) > _MAX_VARYING:
-        raise ValueError(f"its formulas name {len(varying)} parameters that vary; allowed: up to {_MAX_VARYING}")
+        raise ValueError(f"its formulas contain {len(varying)} varying parameters; allowed: up to {_MAX_VARYING}")
     fixed = {name: value_at(parameters, name) for name in dispersion.names if name not in varying}
-    checked: list[Any] = []
+    limits: list[Any] = []
     for corner in itertools.product(*(extremes[name] for name in varying)):
         values = dict(zip(varying, corner, strict=True))
-        given = dispersion.insert_values({**fixed, **values})
-        for value in given.extremes():
-            refused = _find_refusal(campaign, {**values, path: value})
-            if refused:
-                where = "".join(f" where {name} = {one}" for name, one in values.items())
-                text = f"{given.describe()} reaches {value!r}{where}, which the parameter does not take: {refused}"
+        distribution = dispersion.insert_values({**fixed, **values})
+        for value in distribution.extremes():
+            error_text = _find_validation_error(campaign, {**values, path: value})
+            if error_text:
+                condition = "".join(f" where {name} = {number}" for name, number in values.items())
+                text = f"{distribution.describe()} includes {value!r}{condition}, which is not valid: {error_text}"
                 raise ValueError(text)
-            checked.append(value)
-    return checked
+            limits.append(value)
+    return limits
 
 
-def _find_refusal(campaign: Campaign, values: Mapping[str, Any]) -> str:
-    """Reason why the scenario refuses its parameters with these values; empty where it accepts them."""
+def _find_validation_error(campaign: Campaign, values: Mapping[str, Any]) -> str:
+    """Validation error of the parameters with these values; empty if valid."""
     infinite = [path for path, value in values.items() if isinstance(value, float) and not math.isfinite(value)]
     if infinite:
         return f"{infinite[0]} must be finite"
@@ -367,10 +366,10 @@ def _extract_message(error: ValueError) -> str:
 
 
 def _check_metrics(campaign: Campaign) -> list[tuple[Key, str]]:
-    """Columns that requirements name and the scenario does not state: keys, and messages with the allowed columns.
+    """Columns used by requirements but not declared by the scenario: keys, and messages with the allowed columns.
 
-    Columns of custom scores are accepted by their prefix. Columns of a custom scenario are unknown here: its first
-    finished case is checked instead (`marsyard.campaigns.running.engine.check_metrics`).
+    Columns of custom scores are accepted by their prefix. Columns of a custom scenario are unknown before a run: its
+    first finished case is checked instead (`marsyard.campaigns.running.engine.check_metrics`).
     """
     try:
         columns = _collect_columns(campaign)
@@ -381,7 +380,7 @@ def _check_metrics(campaign: Campaign) -> list[tuple[Key, str]]:
     compared = labels(list_algorithms(campaign.configuration))[1:]
 
     def is_known(name: str, kind: str) -> bool:
-        unlabelled = next((name.removeprefix(f"{one}.") for one in compared if name.startswith(f"{one}.")), name)
+        unlabelled = next((name.removeprefix(f"{spec}.") for spec in compared if name.startswith(f"{spec}.")), name)
         return columns.has_number(unlabelled) if kind == NUMBERS else columns.has_flag(unlabelled)
 
     return find_unknown_columns(campaign.configuration.requirements, columns.flags, columns.numbers, is_known)
@@ -393,23 +392,23 @@ def find_unknown_columns(
     numbers: Sequence[str],
     is_known: Callable[[str, str], bool],
 ) -> list[tuple[Key, str]]:
-    """Columns of requirements that are not known by their name and kind: keys, and messages with the allowed ones."""
+    """Columns of requirements with an unknown name or kind: keys, and messages with the allowed columns."""
     problems: list[tuple[Key, str]] = []
     for index, requirement in enumerate(requirements):
         kind, allowed = (FLAGS, flags) if requirement.bound is None else (NUMBERS, numbers)
-        named = [("metric", name, kind, allowed) for name in requirement.metric_columns]
-        named += [("population", name, FLAGS, (*POPULATIONS, *flags)) for name in requirement.population_columns]
-        for key, name, wanted, listed in named:
-            if not is_known(name, wanted):
-                problems.append((("requirements", index, key), unknown_name_message(wanted, name, listed)))
+        columns = [("metric", name, kind, allowed) for name in requirement.metric_columns]
+        columns += [("population", name, FLAGS, (*POPULATIONS, *flags)) for name in requirement.population_columns]
+        for key, name, required_kind, choices in columns:
+            if not is_known(name, required_kind):
+                problems.append((("requirements", index, key), unknown_name_message(required_kind, name, choices)))
     return problems
 
 
 def _collect_columns(campaign: Campaign) -> RowColumns | None:
-    """Columns of the scenario and of the campaign's parameters; None where they are not known."""
+    """Columns of the scenario and of the campaign's parameters; None if unknown."""
     configuration = campaign.configuration
-    stated = row_columns(configuration.scenario)
-    if stated is None:
+    columns = row_columns(configuration.scenario)
+    if columns is None:
         return None
     scores: list[str] = []
     keys = campaign.scenario.part_keys if isinstance(campaign.scenario, HasParts) else {}
@@ -417,9 +416,9 @@ def _collect_columns(campaign: Campaign) -> RowColumns | None:
         if path in configuration.dispersions:
             return None
         scores += [f"{label}_*" for label in labels(find_value(configuration.parameters, path))]
-    flags = find_value(configuration.parameters, stated.named_flags) if stated.named_flags else ()
+    flags = find_value(configuration.parameters, columns.named_flags) if columns.named_flags else ()
     return replace(
-        stated,
-        flags=(*stated.flags, *_ENGINE_FLAGS, *(str(one["name"]) for one in flags), *scores),
-        numbers=(*stated.numbers, *_ENGINE_NUMBERS, *scores),
+        columns,
+        flags=(*columns.flags, *_ENGINE_FLAGS, *(str(flag["name"]) for flag in flags), *scores),
+        numbers=(*columns.numbers, *_ENGINE_NUMBERS, *scores),
     )

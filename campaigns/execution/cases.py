@@ -17,7 +17,7 @@ from typing import Any
 from marsyard.algorithms.answers import describe_error
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, Requirement
-from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, UNFINISHED, CaseEndedError
+from marsyard.campaigns.errors import CRASHED, ENGINE_FAILURES, OUT_OF_MEMORY, WorkerExitError
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.worker_process import Executor, TaskResult, Work, WorkLimits
 from marsyard.campaigns.store.products import Keep, PackedProducts, pack_products
@@ -34,9 +34,9 @@ _MAX_TEXT = 8000
 
 @dataclass(frozen=True)
 class CompletedCase:
-    """Row of a case and, where they are kept, the products of its scenario.
+    """Row of a case and, if kept, the products of its scenario.
 
-    `note` states why products could not be kept, and changes of the worker process by the case.
+    `note` gives the reason if products could not be kept, and changes of the worker process by the case.
     """
 
     row: Row
@@ -51,14 +51,14 @@ def configuration_text(configuration: CampaignConfiguration) -> str:
 
 @lru_cache(maxsize=1)
 def _load_campaign(configuration: str) -> Campaign:
-    """Campaign of a configuration, cached since loading takes time."""
+    """Campaign of a configuration, cached because loading is slow."""
     worker_process.start_clock(grace_s=worker_process.LOADING_S)
-    stated = CampaignConfiguration.model_validate_json(configuration)
-    scenario_class = scenario(stated.scenario)
+    contents = CampaignConfiguration.model_validate_json(configuration)
+    selected = scenario(contents.scenario)
     worker_process.limit_threads()
     worker_process.accept_process_state()
     worker_process.start_clock()
-    return Campaign(stated, scenario_class)
+    return Campaign(contents, selected)
 
 
 def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
@@ -72,7 +72,7 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
 
     def record(columns: Mapping[str, Scalar]) -> None:
         conditions.update(_convert_columns(columns))
-        worker_process.leave_note(json.dumps({"case": case, "conditions": conditions}))
+        worker_process.record_note(json.dumps({"case": case, "conditions": conditions}))
 
     try:
         campaign = _load_campaign(configuration)
@@ -96,12 +96,12 @@ def run_case(configuration: str, keep: Keep, case: int) -> CompletedCase:
 
 
 def prepare_input(configuration: str, shared_input: int) -> str:
-    """Build or verify one input that cases share; return the warnings of the cache, empty if there are none."""
+    """Build or verify an input shared by cases; return the warnings of the cache, empty if there are none."""
     campaign = _load_campaign(configuration)
-    with warnings.catch_warnings(record=True) as caught:
+    with warnings.catch_warnings(record=True) as cache_warnings:
         warnings.simplefilter("always", CacheWarning)
         campaign.scenario.prepare(campaign.base_parameters(), shared_input)
-    return "; ".join(str(one.message) for one in caught if issubclass(one.category, CacheWarning))
+    return "; ".join(str(item.message) for item in cache_warnings if issubclass(item.category, CacheWarning))
 
 
 def run_cases(
@@ -112,48 +112,48 @@ def run_cases(
     keep: Keep,
     total: int | None = None,
 ) -> Iterator[list[CompletedCase]]:
-    """Run cases, and yield them as they end; a case whose worker died or was ended has a row as well."""
+    """Run cases and yield them as they end; a case whose worker died or was terminated has a row as well."""
     task: Callable[[int], CompletedCase] = partial(run_case, configuration_text(configuration), keep)
-    noted: Counter[str] = Counter()
+    note_counts: Counter[str] = Counter()
     limits = work_limits(configuration.limits, configuration.limits.case_time_s)
-    for ended in executor.run(Work(task, cases, limits, total)):
+    for results in executor.run(Work(task, cases, limits, total)):
         completed = []
-        for done in ended:
+        for finished in results:
             times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}
-            case_result = done.result or CompletedCase({**_build_lost_row(done.item, done.error), **times})
-            note = "; ".join(filter(None, (case_result.note, *_describe_changes(done, noted))))
+            case_result = finished.result or CompletedCase({**_build_lost_row(finished.item, finished.error), **times})
+            note = "; ".join(filter(None, (case_result.note, *_describe_changes(finished, note_counts))))
             completed.append(replace(case_result, note=note))
         yield completed
 
 
 def work_limits(limits: Limits, time_s: float) -> WorkLimits:
-    """Limits of one case, or of building one shared input, with its limit of time."""
+    """Limits of one case, or of building one shared input, with a time limit."""
     memory = None if limits.memory_gb is None else limits.memory_gb * 1e9
     return WorkLimits(time_s, memory, limits.output_mb * 1e6)
 
 
 def _build_lost_row(case: int, error: Exception | None) -> Row:
-    """Row of a case that did not return, with the conditions that it recorded before its process ended."""
-    if not isinstance(error, CaseEndedError):
+    """Row of a case that did not return, with the conditions recorded before its process ended."""
+    if not isinstance(error, WorkerExitError):
         return make_unfinished_row(case, CRASHED, describe_error(error), "")
     trace, conditions = error.trace, {}
     lines = trace.splitlines()
     call = next((index for index, line in enumerate(lines) if line.endswith(" in run_case")), None)
     if call is not None:
-        # without the frames above the engine's call of the scenario
-        after = next((k for k in range(call + 1, len(lines)) if not lines[k].startswith("  File ")), len(lines))
-        trace = "\n".join([*lines[: call + 1], *lines[after:]])
-    # the process may have ended while writing, and other code may have written there
+        # remove the frames above the engine's call of the scenario
+        next_thread = next((k for k in range(call + 1, len(lines)) if not lines[k].startswith("  File ")), len(lines))
+        trace = "\n".join([*lines[: call + 1], *lines[next_thread:]])
+    # the process may have ended while writing, and other code may have written to the file
     with suppress(ValueError, TypeError, LookupError, AttributeError, RecursionError):
-        left = json.loads(error.note)
-        conditions = _convert_columns(left["conditions"]) if left["case"] == case else {}
+        recorded = json.loads(error.note)
+        conditions = _convert_columns(recorded["conditions"]) if recorded["case"] == case else {}
     return make_unfinished_row(case, error.outcome, str(error), trace, conditions)
 
 
 def make_unfinished_row(
     case: int, outcome: str, error: str, trace: str, conditions: Mapping[str, Scalar] | None = None
 ) -> Row:
-    """Row of an unfinished case, with the conditions that it had recorded."""
+    """Row of an unfinished case, with the conditions that it recorded."""
     return {
         "case": case,
         "outcome": outcome,
@@ -165,10 +165,10 @@ def make_unfinished_row(
 
 
 def _clean_text(text: str) -> str:
-    """Text in UTF-8, shortened, without object addresses, which change from run to run."""
+    """Shortened text in UTF-8, without object addresses, which change from run to run."""
     if len(text) > _MAX_TEXT:
         half = _MAX_TEXT // 2
-        text = f"{text[:half]}\n... {len(text) - 2 * half} characters left out ...\n{text[-half:]}"
+        text = f"{text[:half]}\n... {len(text) - 2 * half} characters omitted ...\n{text[-half:]}"
     text = re.sub(r"\b0x[0-9a-fA-F]{4,}\b", "0x...", text)
     return _replace_surrogates(text)
 
@@ -176,12 +176,12 @@ def _clean_text(text: str) -> str:
 def _build_finished_row(case: int, result: CaseResult, requirements: Sequence[Requirement]) -> Row:
     """Row of a finished case, in plain Python values.
 
-    Raises TypeError or ValueError where a column cannot be stored, or a metric or population column has another type in
-    this case: one such value would make the whole stored column text, and the requirement undecidable.
+    Raises TypeError or ValueError if a column cannot be stored, or a metric or population column has another type in
+    this case: one such value would turn the stored column into text, and the requirement could not be decided.
     """
     failure = result.failure
-    if (result.outcome in UNFINISHED) != (failure is not None):
-        raise ValueError(f"the outcome {result.outcome} is kept for cases that do not come to an end")
+    if (result.outcome in ENGINE_FAILURES) != (failure is not None):
+        raise ValueError(f"the outcome {result.outcome} is reserved for cases that do not finish")
     columns = _convert_columns(result.row)
     for requirement in requirements:
         metrics, has_bound = requirement.metric_columns, requirement.bound is not None
@@ -192,46 +192,46 @@ def _build_finished_row(case: int, result: CaseResult, requirements: Sequence[Re
             if type(columns.get(name, 0.0)) is str:
                 raise TypeError(f"column {name} holds {columns[name]!r:.100}; {requirement.id} needs a number")
     error, trace = ("", "") if failure is None else (_clean_text(failure.error), _clean_text(failure.trace))
-    head: Row = {"case": case, "outcome": _replace_surrogates(str(result.outcome)), "answered": bool(result.answered)}
-    return {**head, **columns, "error": error, "traceback": trace}
+    engine: Row = {"case": case, "outcome": _replace_surrogates(str(result.outcome)), "answered": bool(result.answered)}
+    return {**engine, **columns, "error": error, "traceback": trace}
 
 
 def _convert_columns(row: Mapping[str, Any]) -> dict[str, Scalar]:
     """Columns of a scenario in plain Python values; NumPy scalars are unwrapped.
 
-    Raises ValueError or TypeError where they cannot be stored.
+    Raises ValueError or TypeError if they cannot be stored.
     """
     clashes = sorted({*LEADING_COLUMNS, *TRAILING_COLUMNS}.intersection(row))
     if clashes:
         raise ValueError(f"the scenario's row has columns that the engine writes: {', '.join(clashes)}")
     columns: dict[str, Scalar] = {}
     for name, value in row.items():
-        plain = value.item() if hasattr(value, "item") and getattr(value, "ndim", 0) == 0 else value
-        if type(plain) not in (float, int, bool, str):
+        scalar = value.item() if hasattr(value, "item") and getattr(value, "ndim", 0) == 0 else value
+        if type(scalar) not in (float, int, bool, str):
             raise TypeError(f"column {name} holds a {type(value).__name__}; allowed: float, int, str, bool")
-        if type(plain) is int and plain.bit_length() > _MAX_INT_BITS:
-            bits = plain.bit_length()
-            raise ValueError(f"column {name} holds an integer of {bits} bits, beyond what a float can hold")
-        columns[_replace_surrogates(str(name))] = _replace_surrogates(plain) if isinstance(plain, str) else plain
+        if type(scalar) is int and scalar.bit_length() > _MAX_INT_BITS:
+            bits = scalar.bit_length()
+            raise ValueError(f"column {name} holds an integer of {bits} bits, beyond the range of a float")
+        columns[_replace_surrogates(str(name))] = _replace_surrogates(scalar) if isinstance(scalar, str) else scalar
     return columns
 
 
 def _replace_surrogates(text: str) -> str:
-    """Text without lone surrogates."""
+    """Text with lone surrogates replaced."""
     return text.encode("utf-8", errors="replace").decode("utf-8")
 
 
-#: Maximum number of cases that are named for each kind of change.
-_MAX_NOTED = 3
+#: Maximum number of cases listed for each kind of change.
+_MAX_NOTES = 3
 
 
-def _describe_changes(done: TaskResult[Any], noted: Counter[str]) -> Iterator[str]:
-    """Yield notes on a case that changed its worker process; `noted` limits the notes of each kind in one run."""
-    notes = [(name.partition(" (")[0], f"case {done.item} changed its worker process: {name}") for name in done.changed]
-    if done.spoiled_by is not None:
-        text = f"case {done.item} crashed in the worker that had run case {done.spoiled_by}, and not in a fresh one"
+def _describe_changes(run: TaskResult[Any], note_counts: Counter[str]) -> Iterator[str]:
+    """Yield notes on a case that changed its worker process; `note_counts` limits the notes of each kind in one run."""
+    notes = [(part.partition(" (")[0], f"case {run.item} changed its worker process: {part}") for part in run.changed]
+    if run.spoiled_by is not None:
+        text = f"case {run.item} crashed in the worker of case {run.spoiled_by}, but not in a fresh worker"
         notes.append(("spoiled", f"{text}: an earlier case changed the state of that worker"))
     for kind, text in notes:
-        noted[kind] += 1
-        if noted[kind] <= _MAX_NOTED:
-            yield f"{text} (further cases of this kind are not named)" if noted[kind] == _MAX_NOTED else text
+        note_counts[kind] += 1
+        if note_counts[kind] <= _MAX_NOTES:
+            yield f"{text} (further cases of this kind are not listed)" if note_counts[kind] == _MAX_NOTES else text

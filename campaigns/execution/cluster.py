@@ -2,9 +2,9 @@
 
 A Dask worker runs no case in its own process. It monitors one worker process per thread, and runs its batches there
 with the same limits (`marsyard.campaigns.execution.workers`). A case that hangs, exhausts memory or kills its process
-thus affects that process only, and its cause is identified as on one machine. Where a Dask worker itself is lost, Dask
-gives its batches to others. A batch that lost several (Dask's `allowed-failures`, by default 3) is divided into single
-cases; a case that fails in this way again counts as crashed.
+thus affects that process only, and its cause is identified as on one machine. If a Dask worker itself is lost, Dask
+gives its batches to other workers. A batch that lost several workers (Dask's `allowed-failures`, by default 3) is
+divided into single cases; a case that fails in this way again counts as crashed.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from marsyard.campaigns.definition.identity import hash_code, read_versions
-from marsyard.campaigns.errors import CRASHED, CampaignError, CaseEndedError
+from marsyard.campaigns.errors import CRASHED, CampaignError, WorkerExitError
 from marsyard.campaigns.execution.worker_process import TaskResult, Work
 from marsyard.campaigns.execution.workers import Batches, LocalExecutor
 
 Result = TypeVar("Result")
 #: Seconds to wait for a scheduler, and for a first worker.
-_REACH_S = 30
-#: Batches queued at each Dask worker, so that none waits for the network.
+_TIMEOUT_S = 30
+#: Batches queued at each Dask worker, so that no worker waits for the network.
 _QUEUED_BATCHES = 2
 _thread_state = threading.local()
 
@@ -35,8 +35,8 @@ _thread_state = threading.local()
 class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
     """Workers of a Dask cluster, as a context.
 
-    address: of a scheduler (`tcp://host:8786`), or `local:N` for a cluster of N workers on this machine.
-    Raises CampaignError where Dask is missing, the cluster cannot be reached, or its workers run other code.
+    address: address of a scheduler (`tcp://host:8786`), or `local:N` for a cluster of N workers on this machine.
+    Raises CampaignError if Dask is missing, the cluster cannot be reached, or its workers run other code.
     """
 
     def __init__(self, address: str) -> None:
@@ -50,29 +50,29 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
             try:
                 cluster: Any = None
                 if number == address:
-                    # Checked first: Dask leaves a client with a bad address to garbage collection, which can deadlock
-                    # with the next client for 10 s.
+                    # Dask leaves a client with an invalid address to garbage collection, which can block the next
+                    # client for 10 s: the address is checked first.
                     distributed.comm.get_address_host_port(address)
                 else:
                     cluster = _local_cluster(address, number)
                     stack.callback(cluster.close)
-                self._client = distributed.Client(cluster or address, timeout=_REACH_S, set_as_default=False)
+                self._client = distributed.Client(cluster or address, timeout=_TIMEOUT_S, set_as_default=False)
                 stack.callback(self._client.close)
             except (OSError, ValueError, ImportError) as error:
-                raise CampaignError(f"--cluster {address}: no scheduler answers: {error}") from error
+                raise CampaignError(f"--cluster {address}: no scheduler responds: {error}") from error
             try:
-                self._client.wait_for_workers(1, timeout=_REACH_S)
+                self._client.wait_for_workers(1, timeout=_TIMEOUT_S)
                 identities = self._client.run(_identify_code)
             except TimeoutError as error:
                 raise CampaignError(f"--cluster {address}: the scheduler has no workers") from error
-            own_code, own = _identify_code()
+            local_code, local_versions = _identify_code()
             for worker, (code, versions) in identities.items():
-                if code != own_code:
-                    raise CampaignError(f"worker {worker} has other code of Marsyard than this program")
-                differing = sorted(name for name in own if own[name] != versions.get(name))
+                if code != local_code:
+                    raise CampaignError(f"worker {worker} runs a different Marsyard source code than this program")
+                differing = sorted(name for name in local_versions if local_versions[name] != versions.get(name))
                 if differing:
-                    stated = ", ".join(f"{name} {versions.get(name)} (here {own[name]})" for name in differing)
-                    raise CampaignError(f"worker {worker} has other versions: {stated}")
+                    pairs = (f"{name} {versions.get(name)} (here {local_versions[name]})" for name in differing)
+                    raise CampaignError(f"worker {worker} has different versions: {', '.join(pairs)}")
             self._stack = stack.pop_all()
 
     def __exit__(self, *_: object) -> None:
@@ -83,7 +83,7 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
         machines: Counter[str] = Counter()
         for worker in self._client.scheduler_info(n_workers=-1)["workers"].values():
             machines[worker["host"]] += worker["nthreads"]
-        # largest number of threads that share the memory of one machine
+        # maximum number of threads that share the memory of one machine
         executors = max(machines.values(), default=1)
         threads = sum(self._client.nthreads().values())
         batches = Batches(work.items, work.total, threads)
@@ -92,8 +92,8 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
 
         def send(batch: Sequence[int]) -> None:
             if batch:
-                part = replace(work, items=tuple(batch), total=len(batch))
-                future = self._client.submit(_run_batch_isolated, part, executors, pure=False)
+                batch_work = replace(work, items=tuple(batch), total=len(batch))
+                future = self._client.submit(_run_batch_isolated, batch_work, executors, pure=False)
                 sent[future] = batch
                 pending.add(future)
 
@@ -103,31 +103,31 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
             while sent:
                 future = next(pending)
                 batch = sent.pop(future)
-                done = self._collect(future, batch, batches)
-                if done is None:
+                results = self._collect(future, batch, batches)
+                if results is None:
                     for item in batch:
                         send((item,))
                 else:
                     send(batches.next())
                 future.release()
-                if done:
-                    yield done
+                if results:
+                    yield results
         finally:
             self._client.cancel(list(sent))
 
     def _collect(self, future: Any, batch: Sequence[int], batches: Batches) -> list[TaskResult[Any]] | None:
-        """Results of a batch; None where it was lost with its workers and must be divided into single cases."""
-        error = future.exception() if future.status != "cancelled" else CancelledError("the cluster gave it up")
+        """Results of a batch; None if it was lost with its workers and must be divided into single cases."""
+        error = future.exception() if future.status != "cancelled" else CancelledError("the cluster abandoned it")
         if error is None:
-            seconds, done = future.result()
+            seconds, results = future.result()
             batches.record_time(len(batch), seconds)
-            return list(done)
+            return list(results)
         if isinstance(error, CampaignError):
             raise error
         if len(batch) > 1:
             return None
         if isinstance(error, (self._distributed.scheduler.KilledWorker, CancelledError)):
-            error = CaseEndedError(CRASHED, "its Dask workers died one after another", "")
+            error = WorkerExitError(CRASHED, "its Dask workers died in succession", "")
         return [TaskResult(batch[0], None, error if isinstance(error, Exception) else RuntimeError(repr(error)))]
 
 
@@ -136,7 +136,7 @@ def _local_cluster(address: str, number: str) -> Any:
 
     if not (number.isdecimal() and int(number) >= 1):
         raise CampaignError(f"--cluster {address}: expected local:N, with N at least 1")
-    # no limit of memory for the Dask workers: that of cases is limited in their worker processes
+    # the memory limit applies to the worker processes of the cases, not to the Dask workers
     processes: dict[str, Any] = {"n_workers": int(number), "threads_per_worker": 1, "processes": True}
     return LocalCluster(**processes, dashboard_address=None, memory_limit=0, silence_logs="ERROR")
 
@@ -147,12 +147,12 @@ def _identify_code() -> tuple[str, dict[str, str]]:
 
 def _run_batch_isolated(work: Work[Result], executors: int) -> tuple[float, list[TaskResult[Result]]]:
     """Run a batch in the worker process of this Dask thread; return the seconds and the results."""
-    began = time.perf_counter()
+    start_s = time.perf_counter()
     workers: LocalExecutor | None = getattr(_thread_state, "workers", None)
     if workers is None:
-        # Dask's workers are daemons of `multiprocessing`, which may not have children. The kernel ends ours with the
-        # thread that started them.
+        # Dask's workers are daemons of `multiprocessing`, which may not have children. The kernel terminates their
+        # children with the thread that started them.
         multiprocessing.process.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
         workers = _thread_state.workers = LocalExecutor(1, executors)
-    done = [one for ended in workers.run(work) for one in ended]
-    return time.perf_counter() - began, done
+    results = [result for batch in workers.run(work) for result in batch]
+    return time.perf_counter() - start_s, results

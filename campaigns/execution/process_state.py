@@ -1,7 +1,7 @@
-"""State of a worker process that one case could leave to the next: compared after each case, restored, and reported.
+"""State of a worker process that one case could pass to the next: compared after each case, restored, and reported.
 
-Changes that cannot be restored (a thread, a child process, a signal handler) cost the worker: the next case runs in a
-fresh one. The global random generators of Python, NumPy and OpenCV are seeded before each case.
+If a change cannot be restored (a thread, a child process, a signal handler), the next case runs in a fresh worker.
+The global random generators of Python, NumPy and OpenCV are seeded before each case.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _SIGNALS = tuple(range(1, signal.SIGSYS + 1))
 
 
 class _Part(NamedTuple):
-    """A part of the state: its name, a function that reads it, and one that sets it."""
+    """A part of the state: its name, a function that reads it, and a function that sets it."""
 
     name: str
     read: Callable[[], Any]
@@ -50,12 +50,12 @@ def _read_folder() -> str:
         return ""
 
 
-#: Variable that the first picture sets for the rest of the process.
+#: Variable that the first rendered image sets for the rest of the process.
 _OPENGL = b"PYOPENGL_PLATFORM"
 
 
 def _read_environment() -> dict[bytes, bytes]:
-    # the mapping behind `os.environ`: ten times as fast, since nothing is decoded
+    # the mapping behind `os.environ`: ten times as fast, because nothing is decoded
     variables: dict[bytes, bytes] = dict(os.environ._data)  # type: ignore[attr-defined]
     variables.pop(_OPENGL, None)
     return variables
@@ -68,7 +68,7 @@ def _set_environment(saved: dict[bytes, bytes]) -> None:
 
 
 def _set_filters(saved: list[Any]) -> None:
-    # clears the module's cache of the former filters
+    # clears the cache of the module's previous filters
     warnings.resetwarnings()
     warnings.filters[:] = saved  # type: ignore[index]
 
@@ -81,12 +81,12 @@ def _read_umask() -> int:
 
 def _read_decimals() -> tuple[Any, ...]:
     context = decimal.getcontext()
-    traps = [kind for kind, wanted in context.traps.items() if wanted]
+    traps = [kind for kind, is_enabled in context.traps.items() if is_enabled]
     return context.prec, context.rounding, context.Emin, context.Emax, context.capitals, context.clamp, [], traps
 
 
 def _read_opencv() -> tuple[bool, int]:
-    """OpenCV's optimisation flag and threads; those of a fresh worker where it is not loaded."""
+    """OpenCV's optimisation flag and threads; those of a fresh worker if OpenCV is not loaded."""
     cv2: Any = sys.modules.get("cv2")
     return (True, 1) if cv2 is None else (cv2.useOptimized(), cv2.getNumThreads())
 
@@ -98,10 +98,10 @@ def _set_opencv(saved: tuple[bool, int]) -> None:
 
 
 def _read_arithmetic() -> tuple[bool, ...]:
-    """How floating-point numbers are rounded, and whether subnormal ones are flushed to zero."""
-    # sums with less than half the distance from 1 to the next number show how the processor rounds
-    one, little, small = float("1"), 2.0**-60, sys.float_info.min
-    return one + little == one, -one - little == -one, one - little == one, small * 0.5 > 0.0
+    """Rounding mode of floating-point numbers, and whether subnormal numbers are flushed to zero."""
+    # sums with less than half the distance from 1 to the next number reveal the rounding mode
+    unit, increment, min_normal = float("1"), 2.0**-60, sys.float_info.min
+    return unit + increment == unit, -unit - increment == -unit, unit - increment == unit, min_normal * 0.5 > 0.0
 
 
 def _set_arithmetic(_: object) -> None:
@@ -116,34 +116,34 @@ _PARTS = (
     _Part("the working folder", _read_folder, os.chdir),
     _Part("environment variables", _read_environment, _set_environment),
     _Part("sys.path", lambda: list(sys.path), lambda saved: sys.path.__setitem__(slice(None), saved)),
-    _Part("the filters of warnings", lambda: list(warnings.filters), _set_filters),
-    _Part("NumPy's handling of errors (numpy.seterr)", np.geterr, lambda saved: np.seterr(**saved)),
+    _Part("the warning filters", lambda: list(warnings.filters), _set_filters),
+    _Part("NumPy's error handling (numpy.seterr)", np.geterr, lambda saved: np.seterr(**saved)),
     _Part("the locale", partial(locale.setlocale, locale.LC_ALL), partial(locale.setlocale, locale.LC_ALL)),
-    _Part("the mask of new files (umask)", _read_umask, os.umask),
-    _Part("the limit of recursion", sys.getrecursionlimit, sys.setrecursionlimit),
-    _Part("the context of decimal numbers", _read_decimals, lambda saved: decimal.setcontext(decimal.Context(*saved))),
+    _Part("the file mode mask (umask)", _read_umask, os.umask),
+    _Part("the recursion limit", sys.getrecursionlimit, sys.setrecursionlimit),
+    _Part("the decimal context", _read_decimals, lambda saved: decimal.setcontext(decimal.Context(*saved))),
     _Part("OpenCV's settings (optimised code, threads)", _read_opencv, _set_opencv),
-    _Part("the arithmetic of floating-point numbers (rounding)", _read_arithmetic, _set_arithmetic),
-    _Part("the collection of garbage", gc.isenabled, lambda enabled: (gc.enable if enabled else gc.disable)()),
+    _Part("the floating-point rounding mode", _read_arithmetic, _set_arithmetic),
+    _Part("garbage collection", gc.isenabled, lambda enabled: (gc.enable if enabled else gc.disable)()),
 )
 #: Indices of the parts that imports of modules change: environment, `sys.path` and warning filters.
 _CHANGED_BY_IMPORTS = (1, 2, 3)
 
 
 def _read_signals() -> tuple[Any, ...]:
-    """Handlers, blocked signals and timers; `_signal` avoids building enumerations, which takes most of the time."""
+    """Handlers, blocked signals and timers; `_signal` avoids building enumerations, which is slow."""
     handlers = tuple(_signal.getsignal(number) for number in _SIGNALS)
     return handlers, _signal.pthread_sigmask(_signal.SIG_BLOCK, ()), _signal.getitimer(_signal.ITIMER_REAL)
 
 
 def _read_streams() -> tuple[Any, ...]:
-    """Standard output and error, whether they are closed, and the files behind them."""
+    """Standard output and error, whether they are closed, and their files."""
     objects = [(stream, getattr(stream, "closed", True)) for stream in (sys.stdout, sys.stderr)]
     return (*objects, file_identity(1), file_identity(2))
 
 
 class ProcessState:
-    """State of this process at a moment, as a reference; an import hook excludes the changes by imports."""
+    """Reference state of this process at one moment; an import hook excludes the changes by imports."""
 
     def __init__(self) -> None:
         self._parts = [part.read() for part in _PARTS]
@@ -155,12 +155,12 @@ class ProcessState:
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Find a top-level import by the other finders, and execute it so that its changes are accepted."""
+        """Find a top-level import with the other finders, and execute it so that its changes are accepted."""
         if self._importing:
             return None
-        finders = [one for one in sys.meta_path if one is not self and hasattr(one, "find_spec")]
+        finders = [finder for finder in sys.meta_path if finder is not self and hasattr(finder, "find_spec")]
         specs = (finder.find_spec(fullname, path, target) for finder in finders)
-        spec = next((one for one in specs if one is not None), None)
+        spec = next((candidate for candidate in specs if candidate is not None), None)
         # loaders of built-in modules are classes, shared by all modules
         if spec is not None and spec.loader is not None and not isinstance(spec.loader, type):
             spec.loader.exec_module = partial(self._import, spec.loader.exec_module)  # type: ignore[method-assign]
@@ -169,15 +169,15 @@ class ProcessState:
     def _import(self, execute: Callable[[ModuleType], None], module: ModuleType) -> None:
         """Execute an imported module and accept its changes to the environment, `sys.path` and warning filters.
 
-        An import happens once per process, in whichever case comes first: its changes are not attributed to the case.
+        An import happens once per process, in the case that needs it first: its changes are not attributed to the case.
         """
-        before = {index: _PARTS[index].read() for index in _CHANGED_BY_IMPORTS}
+        earlier = {index: _PARTS[index].read() for index in _CHANGED_BY_IMPORTS}
         self._importing = True
         try:
             execute(module)
         finally:
             self._importing = False
-            for index, old in before.items():
+            for index, old in earlier.items():
                 new, saved = _PARTS[index].read(), self._parts[index]
                 if isinstance(saved, dict):
                     kept = {name: value for name, value in saved.items() if name in new or name not in old}
@@ -186,47 +186,47 @@ class ProcessState:
                     self._parts[index] = new
 
     def restore(self) -> tuple[list[str], list[str]]:
-        """Restore what has changed since then; return the names of the restored parts, and of the lasting changes."""
+        """Restore all changed parts; return the names of the restored parts, and of the lasting changes."""
         restored: list[str] = []
         lasting = self._find_leftovers()
-        for part, before in zip(_PARTS, self._parts, strict=True):
-            if part.read() == before:
+        for part, reference in zip(_PARTS, self._parts, strict=True):
+            if part.read() == reference:
                 continue
             with suppress(Exception):
-                part.set(before)
-            (restored if part.read() == before else lasting).append(part.name)
+                part.set(reference)
+            (restored if part.read() == reference else lasting).append(part.name)
         return restored, lasting
 
     def _find_leftovers(self) -> list[str]:
-        """Lasting changes: signals, streams, threads that keep a process from ending, and child processes."""
+        """Lasting changes: signals, streams, threads that prevent a process from ending, and child processes."""
         signals, streams = self._lasting
         names = ["handlers of signals, or timers"] if _read_signals() != signals else []
         if _read_streams() != streams:
             names.append("standard output or error")
-        end = time.monotonic() + _ENDING_S
+        deadline = time.monotonic() + _ENDING_S
         while True:
-            threads = [one.name for one in threading.enumerate() if one not in self._threads and not one.daemon]
-            running = {"threads": threads, "child processes": _name_other_children()}
-            if not any(running.values()) or time.monotonic() >= end:
-                left = {kind: ", ".join(sorted(set(found))) for kind, found in running.items() if found}
-                return [*names, *(f"{kind} that it left running ({found})" for kind, found in left.items())]
+            threads = [item.name for item in threading.enumerate() if item not in self._threads and not item.daemon]
+            running = {"threads": threads, "child processes": _list_child_processes()}
+            if not any(running.values()) or time.monotonic() >= deadline:
+                leftovers = {kind: ", ".join(sorted(set(items))) for kind, items in running.items() if items}
+                return [*names, *(f"{kind} that are still running ({items})" for kind, items in leftovers.items())]
             # finalizers of unreferenced objects end their processes
             gc.collect()
             time.sleep(0.01)
 
 
-def _name_other_children() -> list[str]:
-    """Names of the child processes, except idle programs under test; ended ones are reaped."""
+def _list_child_processes() -> list[str]:
+    """Names of the child processes, except idle programs under test; ended processes are reaped."""
     try:
-        # a microsecond where there are none
+        # takes a microsecond without child processes
         os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
     except ChildProcessError:
         return []
     serving: Any = sys.modules.get("marsyard.algorithms.exchange.serving")
-    waiting = serving.waiting_processes() if serving is not None else ()
+    idle = serving.idle_processes() if serving is not None else ()
     names = []
     for child in children(os.getpid()):
-        if child in waiting:
+        if child in idle:
             continue
         with suppress(OSError):
             if os.waitpid(child, os.WNOHANG)[0] == 0:
@@ -244,22 +244,22 @@ def seed_generators(item: int) -> None:
 
 
 def generators_were_used(item: int) -> bool:
-    """Whether Python's or NumPy's generator was used since it was seeded; seeds them again."""
-    drawn = random.random(), np.random.random_sample()  # noqa: NPY002, S311
+    """Whether Python's or NumPy's generator was used after seeding; the generators are seeded again."""
+    numbers = random.random(), np.random.random_sample()  # noqa: NPY002, S311
     seed_generators(item)
-    return drawn != (random.random(), np.random.random_sample())  # noqa: NPY002, S311
+    return numbers != (random.random(), np.random.random_sample())  # noqa: NPY002, S311
 
 
 def open_files() -> dict[int, FileIdentity]:
-    """Descriptors that a worker needs: its output, and the pipes to its parent; without the standard streams."""
-    numbers = [int(one.name) for one in Path("/proc/self/fd").glob("*")]
+    """Descriptors that a worker needs: its output and the pipes to its parent, without the standard streams."""
+    numbers = [int(path.name) for path in Path("/proc/self/fd").glob("*")]
     identities = {number: file_identity(number) for number in numbers if number > 2}
-    # without the listing itself
+    # without the descriptor of the listing itself
     return {number: identity for number, identity in identities.items() if identity is not None}
 
 
 def file_identity(number: int) -> FileIdentity:
-    """Device and inode behind a file descriptor; None where it is closed."""
+    """Device and inode of a file descriptor; None if it is closed."""
     try:
         status = os.fstat(number)
     except OSError:

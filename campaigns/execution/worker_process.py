@@ -1,4 +1,4 @@
-"""Work of the worker processes and its results; and the code inside a worker: its setup, batches and status."""
+"""Work of the worker processes and its results; code inside a worker: setup, batches and status."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Result = TypeVar("Result")
 _OOM_SCORE = 800
 #: Time for loading a campaign's code, in addition to the case's limit.
 LOADING_S = 300.0
-#: Duration of items that are checked together for changes of their process: a check takes 0.1 ms.
+#: Duration of items whose process state is checked together: a check takes 0.1 ms.
 _CHECKED_TOGETHER_S = 0.005
 #: Exit status of a worker whose files were closed by an item.
 FILES_CLOSED = 97
@@ -36,10 +36,9 @@ _NOTHING = -1
 class TaskResult(Generic[Result]):
     """Result of a task for one item, or the error that prevented it.
 
-    changed: names of the parts of the process state that the task changed.
-    crashed: whether the task requested a fresh worker (`request_fresh_worker`).
-    before: item that ran before it in the same process; None where it was the first.
-    spoiled_by: item after which it crashed, where it did not crash in a fresh process; its result is from there.
+    changed: names of the parts of the process state that the task changed. crashed: whether the task requested a fresh
+    worker (`request_fresh_worker`). previous_item: item that ran before it in the same process; None for the first
+    item. spoiled_by: item after which it crashed, if it did not crash in a fresh process, which gave its result.
     """
 
     item: int
@@ -47,7 +46,7 @@ class TaskResult(Generic[Result]):
     error: Exception | None
     changed: tuple[str, ...] = ()
     crashed: bool = False
-    before: int | None = None
+    previous_item: int | None = None
     spoiled_by: int | None = None
 
 
@@ -55,9 +54,8 @@ class TaskResult(Generic[Result]):
 class WorkLimits:
     """Limits of one task.
 
-    time_s: wall-clock time.
-    memory_bytes: private memory of its worker and of the processes that it started, without mapped files and shared
-    libraries; None for an equal fraction of 80 % of the free memory when work begins.
+    time_s: wall-clock time. memory_bytes: private memory of its worker and of the processes that it started, without
+    mapped files and shared libraries; None for an equal fraction of 80 % of the free memory at the start of the work.
     output_bytes: bytes on standard output and standard error.
     """
 
@@ -70,10 +68,8 @@ class WorkLimits:
 class Work(Generic[Result]):
     """A task to be run on many items.
 
-    task: a pure function of the item that can be pickled.
-    items: taken only as workers need them.
-    limits: limits of the task for one item.
-    total: number of items, as far as known.
+    task: a pure, picklable function of the item. items: consumed only when workers need them. limits: limits of the
+    task for one item. total: number of items, if known.
     """
 
     task: Callable[[int], Result]
@@ -88,7 +84,7 @@ class Executor(Protocol):
     def run(self, work: Work[Result]) -> Iterator[list[TaskResult[Result]]]:
         """Run the task on every item, and yield results as they arrive, in no particular order.
 
-        An error is the exception that the task raised, or a `CaseEndedError`.
+        An error is the exception that the task raised, or a `WorkerExitError`.
         """
 
 
@@ -96,24 +92,22 @@ class Executor(Protocol):
 class BatchResult(Generic[Result]):
     """Results of a batch.
 
-    seconds: duration.
-    done: results of the items that ended.
-    alone: items to be run again one by one: they were checked together, and one of them changed their process.
-    rest: items that were not begun.
-    spent: whether the process must run no further item.
+    seconds: duration. results: results of the finished items. to_isolate: items to be run again one by one: they were
+    checked together, and one of them changed their process. not_started: items that were not started. must_replace:
+    whether the process must run no further item.
     """
 
     seconds: float
-    done: list[TaskResult[Result]]
-    alone: Sequence[int] = ()
-    rest: Sequence[int] = ()
-    spent: bool = False
+    results: list[TaskResult[Result]]
+    to_isolate: Sequence[int] = ()
+    not_started: Sequence[int] = ()
+    must_replace: bool = False
 
 
 class StatusBoard:
-    """Shared memory that a worker writes and its parent reads, also when the worker hangs or has died.
+    """Shared memory that a worker writes and its parent reads, even if the worker hangs or has died.
 
-    It holds the item that the worker runs (None between items), and its start time (monotonic).
+    It contains the item that the worker runs (None between items), and its start time (monotonic).
     """
 
     def __init__(self, path: Path) -> None:
@@ -122,7 +116,7 @@ class StatusBoard:
 
     @staticmethod
     def create(path: Path) -> StatusBoard:
-        """Board of an idle worker."""
+        """Create the board of an idle worker."""
         path.write_bytes(_LAYOUT.pack(_NOTHING, math.inf))
         return StatusBoard(path)
 
@@ -131,7 +125,7 @@ class StatusBoard:
         self._bytes[:] = _LAYOUT.pack(_NOTHING if item is None else item, since_s)
 
     def read(self) -> tuple[int | None, float]:
-        """Worker's status; read until two readings agree, as the worker may be writing."""
+        """Worker's status; reads until two readings agree, because the worker may be writing."""
         first = bytes(self._bytes)
         while (second := bytes(self._bytes)) != first:
             first = second
@@ -145,7 +139,7 @@ class StatusBoard:
 
 @dataclass
 class _WorkerContext:
-    """Context of this worker process: status board, output and trace files, and reference of the process state."""
+    """Context of this worker process: status board, output and trace files, and reference process state."""
 
     board: StatusBoard
     trace: Path
@@ -154,7 +148,7 @@ class _WorkerContext:
     files: Mapping[int, process_state.FileIdentity]
     item: int | None = None
     state: process_state.ProcessState = field(default_factory=process_state.ProcessState)
-    checks_each: bool = False
+    checks_each_item: bool = False
     crashed: bool = False
 
 
@@ -164,9 +158,8 @@ _context: _WorkerContext | None = None
 def start_worker(parent: int, folder: str) -> None:
     """Set up a fresh worker process.
 
-    It leads a process group of its own, below a supervisor (`marsyard.campaigns.execution.supervisor`) that ends with
-    the parent and kills the worker's descendants. A fatal signal makes it write its stack trace. Its output goes to a
-    file.
+    It leads a process group below a supervisor (`marsyard.campaigns.execution.supervisor`), which ends with the parent
+    and kills the worker's descendants. A fatal signal makes it write its stack trace. Its output goes to a file.
     """
     from joblib.externals.loky import process_executor
 
@@ -181,10 +174,10 @@ def start_worker(parent: int, folder: str) -> None:
         os.setpgid(0, 0)
         Path("/proc/self/oom_score_adj").write_text(str(_OOM_SCORE))
     trace = Path(folder, "trace")
-    written = os.open(trace, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
-    faulthandler.enable(written)
-    faulthandler.register(DUMP_SIGNAL, written, all_threads=False, chain=False)
-    # loky would end workers that grow by 300 MB: cached terrains take more, and the parent enforces limits
+    trace_descriptor = os.open(trace, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
+    faulthandler.enable(trace_descriptor)
+    faulthandler.register(DUMP_SIGNAL, trace_descriptor, all_threads=False, chain=False)
+    # loky would end workers that grow by 300 MB: cached terrains need more, and the parent enforces limits
     process_executor._USE_PSUTIL = False
     _context = _WorkerContext(
         StatusBoard(Path(folder, "board")), trace, output, Path(folder, "note"), process_state.open_files()
@@ -193,71 +186,72 @@ def start_worker(parent: int, folder: str) -> None:
 
 
 def run_batch(task: Callable[[int], Result], items: Sequence[int]) -> BatchResult[Result]:
-    """Run a task on each item, until all end or the process is spent.
+    """Run a task on each item, until all are finished or the process must be replaced.
 
-    After each item the process state is compared with its earlier state. Items of some milliseconds are checked
-    together, and run again one by one where the check shows a change.
+    After each item, the process state is compared with its earlier state. Items of some milliseconds are checked
+    together, and run again one by one if the check shows a change.
     """
-    began = checked = time.perf_counter()
-    done: list[TaskResult[Result]] = []
+    start_s = checked_s = time.perf_counter()
+    results: list[TaskResult[Result]] = []
     group: list[TaskResult[Result]] = []
     for index, item in enumerate(items):
         if not group:
             process_state.seed_generators(item)
         group.append(_run_item(task, item))
-        must_check = _context is not None and (_context.checks_each or _context.crashed)
-        if not must_check and index + 1 < len(items) and time.perf_counter() - checked <= _CHECKED_TOGETHER_S:
+        must_check = _context is not None and (_context.checks_each_item or _context.crashed)
+        if not must_check and index + 1 < len(items) and time.perf_counter() - checked_s <= _CHECKED_TOGETHER_S:
             continue
-        spent, changed = _check_state([one.item for one in group])
+        must_replace, changed = _check_state([result.item for result in group])
         if changed is None:
-            alone = [one.item for one in group]
-            return BatchResult(time.perf_counter() - began, done, alone, items[index + 1 :], spent)
-        done += [replace(group[0], changed=changed)] if changed else group
-        if spent:
-            return BatchResult(time.perf_counter() - began, done, (), items[index + 1 :], spent)
-        group, checked = [], time.perf_counter()
+            to_isolate = [result.item for result in group]
+            return BatchResult(time.perf_counter() - start_s, results, to_isolate, items[index + 1 :], must_replace)
+        results += [replace(group[0], changed=changed)] if changed else group
+        if must_replace:
+            return BatchResult(time.perf_counter() - start_s, results, (), items[index + 1 :], must_replace)
+        group, checked_s = [], time.perf_counter()
     if _context is not None:
         _context.board.write(None, math.inf)
-    return BatchResult(time.perf_counter() - began, done)
+    return BatchResult(time.perf_counter() - start_s, results)
 
 
 def _check_state(group: Sequence[int]) -> tuple[bool, tuple[str, ...] | None]:
-    """Whether the process is spent after some items, and the changes; None where it is open which item made them."""
+    """Whether the process must be replaced after some items, and the changes; None if their item is unknown."""
     if _context is None:
         return False, ()
     if any(process_state.file_identity(number) != identity for number, identity in _context.files.items()):
-        # no result can be delivered any more: the status board names the item
+        # results can no longer be delivered: the status board identifies the item
         _context.trace.write_text("Fatal: the files that the worker process needs were closed\n")
         os._exit(FILES_CLOSED)
     restored, lasting = _context.state.restore()
-    spent = bool(lasting) or _context.crashed
+    must_replace = bool(lasting) or _context.crashed
     names = (*restored, *lasting)
     if len(group) > 1 and (names or process_state.generators_were_used(group[0])):
-        _context.checks_each = True
-        return spent, None
-    return spent, names
+        _context.checks_each_item = True
+        return must_replace, None
+    return must_replace, names
 
 
 def _run_item(task: Callable[[int], Result], item: int) -> TaskResult[Result]:
-    """Run a task on one item, with an empty output file, whose size is then that of the item's output."""
-    before = None
+    """Run a task on one item; the output file is emptied first, so that its size is that of the item's output."""
+    previous_item = None
     if _context is not None:
         for stream in (sys.stdout, sys.stderr):
             if stream is not None and not stream.closed:
                 stream.flush()
         if os.fstat(_context.output).st_size > 0:
             os.ftruncate(_context.output, 0)
-        before, _context.item, _context.crashed = _context.item, item, False
+        previous_item, _context.item, _context.crashed = _context.item, item, False
     start_clock()
     try:
-        done = TaskResult(item, task(item), None)
+        result = TaskResult(item, task(item), None)
     except Exception as error:
-        done = TaskResult(item, None, error)
-    return replace(done, crashed=True, before=before) if _context is not None and _context.crashed else done
+        result = TaskResult(item, None, error)
+    has_crashed = _context is not None and _context.crashed
+    return replace(result, crashed=True, previous_item=previous_item) if has_crashed else result
 
 
 def request_fresh_worker() -> None:
-    """Run no further item in this process: the current one crashed, and the process state is unknown."""
+    """Request a fresh process for the next item: the current item crashed, and the process state is unknown."""
     if _context is not None:
         _context.crashed = True
 
@@ -268,16 +262,16 @@ def start_clock(grace_s: float = 0.0) -> None:
         _context.board.write(_context.item, time.monotonic() + grace_s)
 
 
-def leave_note(text: str) -> None:
-    """Leave a text for the parent in case the task ends with its process; it replaces the previous one."""
+def record_note(text: str) -> None:
+    """Record a text for the parent in case the process ends during the task; it replaces the previous text."""
     if _context is not None:
         _context.note.write_text(text)
 
 
 def accept_process_state() -> None:
-    """Take the current process state as the reference that items must preserve.
+    """Use the current process state as the reference that items must preserve.
 
-    Loaded objects are excluded from garbage collection, which would cost 5 % of short cases.
+    Loaded objects are excluded from garbage collection, which would take 5 % of short cases.
     """
     gc.collect()
     gc.freeze()
@@ -286,7 +280,7 @@ def accept_process_state() -> None:
 
 
 def limit_threads() -> None:
-    """Limit the loaded numerical libraries to one thread; the environment limits later ones."""
+    """Limit the loaded numerical libraries to one thread; environment variables limit libraries loaded later."""
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(1)

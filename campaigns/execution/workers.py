@@ -1,8 +1,8 @@
 """Isolated worker processes: a crash, hang or memory overrun of one case cannot affect another.
 
-Each worker is a loky executor (joblib's) of one process, also for `jobs=1`. If it breaks, its batch is known from the
-executor and the case from the worker's status board, and the other workers continue. The parent checks every worker
-about twenty times a second, and ends one whose case exceeds a limit.
+Each worker is a loky executor (joblib's) of one process, also for `jobs=1`. If a worker breaks, the executor identifies
+its batch and the worker's status board identifies the case; the other workers continue. The parent checks every worker
+about twenty times a second, and terminates a worker whose case exceeds a limit.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from joblib.externals.loky import ProcessPoolExecutor
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
 from marsyard.algorithms.processes import descendants, used_memory
-from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CampaignError, CaseEndedError
+from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CampaignError, WorkerExitError
 from marsyard.campaigns.execution import supervisor, worker_process
 from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, END_SIGNAL, kill, marked_processes
 from marsyard.campaigns.execution.worker_process import BatchResult, Executor, TaskResult, Work, WorkLimits, run_batch
@@ -43,23 +43,23 @@ _THREAD_VARIABLES = (
 _WORKER_ENVIRONMENT = dict.fromkeys(_THREAD_VARIABLES, "1") | {"PYTHONHASHSEED": "0", "PYTHONOPTIMIZE": ""}
 #: Seconds between two checks of a worker.
 _POLL_INTERVAL_S = 0.05
-#: Bytes kept of the last output of a dead process, and bytes read of a task's note.
+#: Maximum bytes of the last output of a dead process, and of a task's note.
 _MAX_OUTPUT, _MAX_NOTE = 2000, 1_000_000
-#: Seconds that a worker has to write its stack trace.
+#: Maximum seconds for a worker to write its stack trace.
 _DUMP_S = 0.3
-#: Seconds that a worker has to end by itself after all work, and that its supervisor has to kill everything.
+#: Maximum seconds for a worker to end after all work, and for its supervisor to kill all descendants.
 _EXIT_S, _KILLING_S = 5.0, 2.0
 #: Environment variable of a worker, which identifies its descendants even without their supervisor.
 _MARK = "MARSYARD_WORKER"
 #: Attempts before a crash or lack of memory is attributed to the task, the last in a fresh worker: an earlier task may
-#: have damaged or filled the worker, or it was killed from outside.
+#: have damaged or filled the worker, or an external process may have killed it.
 _MAX_ATTEMPTS = 2
-#: Maximum number of consecutive deaths of workers before they begin a task.
+#: Maximum number of consecutive deaths of workers before they start a task.
 _MAX_START_DEATHS = 3
 _PREFIX = "marsyard-"
-#: Locked by the owner of a folder while it lives.
+#: Lock file, held by the owner of a folder while it runs.
 _LOCK = "lock"
-#: Fraction of the free memory at the start that all workers share, where no limit is stated.
+#: Fraction of the free memory at the start that all workers share, without a given limit.
 _MEMORY_FRACTION = 0.8
 
 
@@ -68,7 +68,7 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
-#: Target duration of a batch: sending one costs 3 ms, and a worker that dies loses at most one.
+#: Target duration of a batch: sending one costs 3 ms, and a worker that dies loses at most one batch.
 _BATCH_S = 1.0
 #: Maximum number of items in a batch.
 MAX_BATCH = 1000
@@ -79,31 +79,30 @@ _WEIGHT = 0.3
 class Batches:
     """Batches of items, sized by the measured time per item.
 
-    items: taken only as batches are requested.
-    total: number of items, as far as known: the last batches are then small, so that all workers end together.
-    workers: number of workers that share the items.
+    items: consumed only when batches are requested. total: number of items, if known: the last batches are then small,
+    so that all workers end together. workers: number of workers that share the items.
     """
 
     def __init__(self, items: Iterable[int], total: int | None, workers: int) -> None:
         self._source = iter(items)
-        self._left = math.inf if total is None else total
+        self._remaining = math.inf if total is None else total
         self._workers = workers
         self._size = 1
         self._item_s = math.nan
 
     def next(self) -> list[int]:
-        """Next batch; empty where no items are left."""
-        size = max(1, int(min(self._size, self._left / (2 * self._workers))))
+        """Next batch; empty if no items remain."""
+        size = max(1, int(min(self._size, self._remaining / (2 * self._workers))))
         batch = list(itertools.islice(self._source, size))
-        self._left -= len(batch)
+        self._remaining -= len(batch)
         return batch
 
     def record_time(self, items: int, seconds: float) -> None:
-        """Update the time per item from a finished batch; a batch is at most twice as large as the one before."""
+        """Update the time per item from a finished batch; a batch is at most twice as large as the previous one."""
         latest, mean = seconds / items, self._item_s
         self._item_s = latest if math.isnan(mean) else mean + _WEIGHT * (latest - mean)
-        wanted = MAX_BATCH if self._item_s <= 0.0 else int(_BATCH_S / self._item_s)
-        self._size = max(1, min(wanted, 2 * self._size, MAX_BATCH))
+        target_size = MAX_BATCH if self._item_s <= 0.0 else int(_BATCH_S / self._item_s)
+        self._size = max(1, min(target_size, 2 * self._size, MAX_BATCH))
 
 
 class WatchedWorker:
@@ -119,13 +118,13 @@ class WatchedWorker:
         self._start()
 
     def _start(self) -> None:
-        """Prepare another process, with a folder of its own; loky starts it with the first batch."""
+        """Prepare a new process with its own folder; loky starts it with the first batch."""
         self._generation += 1
         self._folder = self._home / str(self._generation)
         (self._folder / "tmp").mkdir(parents=True)
         self._mark = f"{_MARK}={self._folder}"
         self._board = worker_process.StatusBoard.create(self._folder / "board")
-        self._ended: tuple[int, CaseEndedError] | None = None
+        self._termination: tuple[int, WorkerExitError] | None = None
         self._checked_s = -math.inf
         self._process: Any = None
         self._executor: Any = ProcessPoolExecutor(
@@ -136,7 +135,7 @@ class WatchedWorker:
         )
 
     def submit(self, task: Callable[[int], Result], batch: Sequence[int]) -> Future[BatchResult[Result]]:
-        """Submit a batch; start a fresh process where the last one died while idle."""
+        """Submit a batch; start a fresh process if the last one died while idle."""
         try:
             future: Future[Any] = self._executor.submit(run_batch, task, batch)
         except BrokenProcessPool:
@@ -147,13 +146,13 @@ class WatchedWorker:
         return future
 
     def enforce_limits(self, limits: WorkLimits, memory_bytes: float) -> None:
-        """End the process where its task exceeds a limit."""
+        """Terminate the process if its task exceeds a limit."""
         now = time.monotonic()
-        if self._ended is not None or now - self._checked_s < _POLL_INTERVAL_S:
+        if self._termination is not None or now - self._checked_s < _POLL_INTERVAL_S:
             return
         self._checked_s = now
         if not self._alive():
-            # loky waits for a pipe that any process that outlived its supervisor holds open
+            # loky waits for a pipe that stays open in any process that outlived its supervisor
             kill(marked_processes(self._mark))
             return
         item, since_s = self._board.read()
@@ -163,26 +162,26 @@ class WatchedWorker:
         if now - since_s > limits.time_s:
             self._end(item, TIMED_OUT, f"took longer than its limit of {limits.time_s:g} s")
         elif used_memory(descendants(self._process.pid), memory_bytes) > memory_bytes:
-            limit = "its share" if limits.memory_bytes is None else f"its limit of {memory_bytes / 1e9:g} GB"
-            self._end(item, OUT_OF_MEMORY, f"took more memory than {limit}")
+            limit = "its default limit" if limits.memory_bytes is None else f"its limit of {memory_bytes / 1e9:g} GB"
+            self._end(item, OUT_OF_MEMORY, f"used more memory than {limit}")
         elif output.exists() and output.stat().st_size > limits.output_bytes:
             self._end(item, TOO_MUCH_OUTPUT, f"wrote more than its limit of {limits.output_bytes / 1e6:g} MB")
 
     def _end(self, item: int, outcome: str, reason: str) -> None:
-        """Have the process write its stack trace, and kill it."""
+        """Make the process write its stack trace, then kill it."""
         trace = self._folder / "trace"
         self._signal(DUMP_SIGNAL)
         deadline = time.monotonic() + _DUMP_S
         while not (trace.exists() and trace.stat().st_size > 0) and time.monotonic() < deadline:
             time.sleep(0.01)
-        self._ended = (item, CaseEndedError(outcome, reason, self._last_trace(with_output=False)))
+        self._termination = (item, WorkerExitError(outcome, reason, self._last_trace(with_output=False)))
         self._kill()
 
     def _alive(self) -> bool:
         return self._process is not None and self._process.is_alive()
 
     def _signal(self, number: int) -> None:
-        """Signal the supervisor; its number cannot be reused before the executor's object has seen its end."""
+        """Signal the supervisor; its number cannot be reused before the executor's object has registered its end."""
         if self._alive():
             with suppress(ProcessLookupError):
                 os.kill(self._process.pid, number)
@@ -200,19 +199,19 @@ class WatchedWorker:
             time.sleep(0.005)
         return not self._alive()
 
-    def handle_death(self, error: BaseException) -> tuple[int | None, CaseEndedError]:
-        """Identify the task that the process died of (None if it had none) and the cause; prepare another process."""
+    def handle_death(self, error: BaseException) -> tuple[int | None, WorkerExitError]:
+        """Identify the task of the dead process (None without a task) and the cause of death; prepare a new process."""
         item: int | None
-        if self._ended is not None:
-            item, cause = self._ended
+        if self._termination is not None:
+            item, cause = self._termination
         else:
-            # loky's message names the exit status: ``SIGABRT(-6)``
+            # loky's message contains the exit status: ``SIGABRT(-6)``
             codes = re.findall(r"([A-Z]+)\((-?\d+)\)", str(error))
             status = ", ".join(f"{name} ({code})" for name, code in codes) or "exit status unknown"
             reason = f"the worker process died: {status}"
             if status == f"EXIT ({worker_process.FILES_CLOSED})":
                 reason = "the case closed or replaced the worker's file descriptors"
-            item, cause = self._board.read()[0], CaseEndedError(CRASHED, reason, self._last_trace(with_output=True))
+            item, cause = (self._board.read()[0], WorkerExitError(CRASHED, reason, self._last_trace(with_output=True)))
         self._kill()
         note = self._folder / "note"
         cause.note = note.read_bytes()[:_MAX_NOTE].decode(errors="replace") if note.exists() else ""
@@ -220,7 +219,7 @@ class WatchedWorker:
         return item, cause
 
     def _last_trace(self, *, with_output: bool) -> str:
-        """Fatal error, stack of the thread in which it happened, and last output of the process."""
+        """Fatal error, stack of the failed thread, and last output of the process."""
         trace, output = (self._folder / name for name in ("trace", "output"))
         text = trace.read_text(errors="replace") if trace.exists() else ""
         parts = [part.strip() for part in text.split("\n\n") if part.strip()]
@@ -234,7 +233,7 @@ class WatchedWorker:
         return "\n".join(lines)
 
     def replace(self) -> None:
-        """Kill the process, if it lives, and prepare another."""
+        """Kill the process, if it is running, and prepare a new one."""
         self._kill()
         self._executor.shutdown(wait=False)
         self._board.close()
@@ -242,7 +241,7 @@ class WatchedWorker:
         self._start()
 
     def stop(self, *, kill: bool) -> None:
-        """End the process, which has some seconds to do so by itself, and wait for its end."""
+        """End the process, after some seconds by force, and wait for its end."""
         manager = self._executor._executor_manager_thread
         if kill:
             self._kill()
@@ -258,10 +257,10 @@ class WatchedWorker:
 
 
 class LocalExecutor(AbstractContextManager["LocalExecutor"]):
-    """Worker processes on this machine, as a context: they end at its exit, and are killed at an exit by an exception.
+    """Worker processes on this machine, as a context: they end at its exit, and are killed after an exception.
 
     jobs: number of workers.
-    executors: number of such executors, this one included, that use the memory of the machine.
+    executors: number of such executors, including this one, that use the memory of the machine.
     """
 
     def __init__(self, jobs: int, executors: int = 1) -> None:
@@ -269,20 +268,20 @@ class LocalExecutor(AbstractContextManager["LocalExecutor"]):
         try:
             _remove_abandoned_folders()
             self._folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
-            # renamed only once it is locked
+            # renamed after it is locked
             partial = self._folder / "lock.partial"
             self._lock = os.open(partial, os.O_RDWR | os.O_CREAT, 0o600)
             fcntl.flock(self._lock, fcntl.LOCK_EX)
             partial.rename(self._folder / _LOCK)
             self._workers = [WatchedWorker(self._folder / str(number)) for number in range(jobs)]
         except OSError as error:
-            raise CampaignError(f"temporary files cannot be written (TMPDIR says where they go): {error}") from error
+            raise CampaignError(f"temporary files cannot be written (TMPDIR defines their folder): {error}") from error
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.stop(kill=kind is not None)
 
     def stop(self, *, kill: bool) -> None:
-        """End the processes, and remove their folder."""
+        """End the processes and remove their folder."""
         with ThreadPoolExecutor(len(self._workers)) as pool:
             list(pool.map(lambda worker: worker.stop(kill=kill), self._workers))
         os.close(self._lock)
@@ -301,7 +300,7 @@ class _Run:
         self._batches = Batches(work.items, work.total, len(workers))
         self._memory_bytes = memory_bytes
         self._idle = deque(workers)
-        self._again: deque[list[int]] = deque()
+        self._retries: deque[list[int]] = deque()
         self._attempts: dict[int, int] = {}
         self._spoilers: dict[int, int | None] = {}
         self._running: dict[Future[Any], tuple[WatchedWorker, Sequence[int]]] = {}
@@ -313,18 +312,18 @@ class _Run:
             self._submit_batches()
             if not self._running:
                 return
-            ended, _ = wait(self._running, timeout=_POLL_INTERVAL_S, return_when=FIRST_COMPLETED)
-            done = [one for future in ended for one in self._collect(future)]
+            futures, _ = wait(self._running, timeout=_POLL_INTERVAL_S, return_when=FIRST_COMPLETED)
+            results = [result for future in futures for result in self._collect(future)]
             for worker, _ in self._running.values():
                 worker.enforce_limits(self._work.limits, self._memory_bytes)
-            if done:
-                # before the caller stores the results, so that no worker waits
+            if results:
+                # done before the caller stores the results, so that no worker waits
                 self._submit_batches()
-                yield done
+                yield results
 
     def _submit_batches(self) -> None:
         while self._idle:
-            batch = self._again.popleft() if self._again else self._batches.next()
+            batch = self._retries.popleft() if self._retries else self._batches.next()
             if not batch:
                 return
             self._submit(self._idle.popleft(), batch)
@@ -343,67 +342,68 @@ class _Run:
         self._idle.append(worker)
         if len(batch) > 1:
             # one of its results cannot be pickled
-            self._again.extend([item] for item in batch)
+            self._retries.extend([item] for item in batch)
             return []
         return [TaskResult(batch[0], None, error if isinstance(error, Exception) else RuntimeError(repr(error)))]
 
-    def _handle_batch_result(self, worker: WatchedWorker, end: BatchResult[Any]) -> list[TaskResult[Any]]:
-        self._again.extend([item] for item in end.alone)
-        if end.rest:
-            self._again.append(list(end.rest))
-        if end.done:
-            self._batches.record_time(len(end.done), end.seconds)
-        if end.spent:
+    def _handle_batch_result(self, worker: WatchedWorker, batch_result: BatchResult[Any]) -> list[TaskResult[Any]]:
+        self._retries.extend([item] for item in batch_result.to_isolate)
+        if batch_result.not_started:
+            self._retries.append(list(batch_result.not_started))
+        if batch_result.results:
+            self._batches.record_time(len(batch_result.results), batch_result.seconds)
+        if batch_result.must_replace:
             worker.replace()
-        suspects = [one for one in end.done if one.crashed and one.before is not None]
-        for one in suspects:
+        suspects = [result for result in batch_result.results if result.crashed and result.previous_item is not None]
+        for suspect in suspects:
             # at most one, the last of the batch; it runs again in the fresh process
-            self._spoilers[one.item] = one.before
-            self._submit(worker, [one.item])
+            self._spoilers[suspect.item] = suspect.previous_item
+            self._submit(worker, [suspect.item])
         if not suspects:
             self._idle.append(worker)
-        others = [(one, self._spoilers.pop(one.item, None)) for one in end.done if one not in suspects]
-        # an item that does not crash in a fresh process was spoiled by the one before it
-        return [one if one.crashed else replace(one, spoiled_by=spoiler) for one, spoiler in others]
+        finished = [result for result in batch_result.results if result not in suspects]
+        pairs = [(result, self._spoilers.pop(result.item, None)) for result in finished]
+        # an item that does not crash in a fresh process was spoiled by the previous item
+        return [result if result.crashed else replace(result, spoiled_by=spoiler) for result, spoiler in pairs]
 
     def _handle_worker_crash(
         self, worker: WatchedWorker, batch: Sequence[int], error: BaseException
     ) -> list[TaskResult[Any]]:
-        """Find the task that ended the worker; run the others of its batch again."""
-        item, death = worker.handle_death(error)
+        """Identify the task that ended the worker; run the other tasks of its batch again."""
+        item, exit_error = worker.handle_death(error)
         if item is None or item not in batch:
             self._deaths_at_start += 1
             if self._deaths_at_start >= _MAX_START_DEATHS:
-                reason = f"{death}\n{death.trace}".strip()
-                raise CampaignError(f"worker processes die before they begin a case; the last: {reason}")
-            self._again.append(list(batch))
+                reason = f"{exit_error}\n{exit_error.trace}".strip()
+                raise CampaignError(f"worker processes die before they start a case; last death: {reason}")
+            self._retries.append(list(batch))
             self._idle.append(worker)
             return []
         self._deaths_at_start = 0
         index = batch.index(item)
-        self._again.extend(list(part) for part in (batch[:index], batch[index + 1 :]) if part)
+        self._retries.extend(list(part) for part in (batch[:index], batch[index + 1 :]) if part)
         attempt = self._attempts.pop(item, 1)
-        if death.outcome in (CRASHED, OUT_OF_MEMORY) and attempt < _MAX_ATTEMPTS:
+        if exit_error.outcome in (CRASHED, OUT_OF_MEMORY) and attempt < _MAX_ATTEMPTS:
             self._attempts[item] = attempt + 1
             self._submit(worker, [item])
             return []
         self._idle.append(worker)
-        return [TaskResult(item, None, death)]
+        return [TaskResult(item, None, exit_error)]
 
 
 def _remove_abandoned_folders() -> None:
     for lock in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*/{_LOCK}"):
         with suppress(OSError):
-            held = os.open(lock, os.O_RDWR)
+            descriptor = os.open(lock, os.O_RDWR)
             try:
-                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 shutil.rmtree(lock.parent, ignore_errors=True)
             finally:
-                os.close(held)
+                os.close(descriptor)
 
 
 def free_memory() -> float:
-    """Available memory in bytes; infinite where Linux does not state it."""
+    """Available memory in bytes; infinite if Linux does not report it."""
     try:
         text = Path("/proc/meminfo").read_text()
     except OSError:
@@ -414,23 +414,23 @@ def free_memory() -> float:
 
 @dataclass(frozen=True)
 class ExecutorConfig:
-    """Choice of an executor: `jobs` worker processes on this machine, or a cluster where one is named.
+    """Choice of an executor: `jobs` worker processes on this machine, or a cluster if its address is given.
 
-    `cluster` is the address of a Dask scheduler (`tcp://host:8786`), or `local:N` for a new cluster of N workers here.
+    `cluster` is the address of a Dask scheduler (`tcp://host:8786`), or `local:N` for a new local cluster of N workers.
     """
 
     jobs: int = 1
     cluster: str | None = None
 
     def describe(self) -> str:
-        """Text for the record."""
+        """Text for the campaign record."""
         return f"{self.jobs} on this machine" if self.cluster is None else f"cluster {self.cluster}"
 
 
 def create_executor(config: ExecutorConfig) -> AbstractContextManager[Executor]:
-    """Executor as a context; its workers are killed at an exit by an exception, and end otherwise.
+    """Executor as a context; its workers are killed after an exception, and end otherwise.
 
-    Raises CampaignError where the cluster cannot be reached, or Dask is not installed.
+    Raises CampaignError if the cluster cannot be reached or Dask is not installed.
     """
     if config.cluster is None:
         return LocalExecutor(config.jobs)

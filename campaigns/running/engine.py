@@ -16,7 +16,7 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, key_text
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
 from marsyard.campaigns.definition.loading import NUMBERS, find_unknown_columns
-from marsyard.campaigns.errors import RETRYABLE, UNFINISHED, CampaignError, ConfigurationError, Problem, StoreError
+from marsyard.campaigns.errors import ENGINE_FAILURES, RETRYABLE, CampaignError, ConfigurationError, Problem, StoreError
 from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
 from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
@@ -35,7 +35,7 @@ class Watch(Protocol):
     """Receiver of a campaign's progress."""
 
     def begin(self, stage: str, total: int) -> None:
-        """Begin a stage of a number of steps."""
+        """Start a stage with a number of steps."""
 
     def step(self) -> None:
         """Count a finished step of the stage."""
@@ -53,10 +53,10 @@ class _Run:
 
 
 def run_campaign(campaign: Campaign, directory: Path, executor: ExecutorConfig, watch: Watch) -> None:
-    """Run a campaign in a folder that holds none.
+    """Run a campaign in a new folder.
 
-    Rows are stored in `cases.sqlite` as cases end; `cases.parquet` is written when all have ended.
-    Raises CampaignError where the folder is taken or cannot be written, or a requirement names a missing column.
+    Rows are stored in `cases.sqlite` as cases end; `cases.parquet` is written after the last case.
+    Raises CampaignError if the folder is occupied or not writable, or a column of a requirement is missing.
     Raises KeyboardInterrupt again after the rows and the record are stored.
     """
     record.claim(directory)
@@ -65,8 +65,8 @@ def run_campaign(campaign: Campaign, directory: Path, executor: ExecutorConfig, 
         identity = create_identity(campaign.configuration)
         algorithms = describe_algorithms(campaign)
         create_store(directory / ROWS_FILE, {"identity": identity.configuration})
-        words, stated = campaign.command, campaign.configuration
-        record.begin(directory, stated, identity, executor.describe(), command=words, algorithms=algorithms)
+        words, configuration = campaign.command, campaign.configuration
+        record.begin(directory, configuration, identity, executor.describe(), command=words, algorithms=algorithms)
         with RowStore(directory / ROWS_FILE) as store:
             _execute(_Run(campaign, directory, executor, watch), store, ())
 
@@ -80,12 +80,12 @@ def resume_campaign(
     case_time_s: float | None = None,
     allow_changed: bool = False,
 ) -> None:
-    """Run the cases of a stored campaign that have no row yet; finished ones keep their rows.
+    """Run the cases of a stored campaign that have no row yet; finished cases keep their rows.
 
     retry: keys of `RETRYABLE`: cases with these outcomes run again; their old rows stay until then.
-    case_time_s: replaces the campaign's own limit from now on.
-    allow_changed: continue with other code or versions than the campaign was run with, and record that.
-    Raises CampaignError where the folder holds no campaign that can be continued; it stays unchanged.
+    case_time_s: replaces the campaign's time limit for the remaining cases.
+    allow_changed: continue with a different program or versions, and record the difference.
+    Raises CampaignError if the folder contains no campaign that can be continued; it stays unchanged.
     """
     record.read(directory)  # no lock file is created in a folder without a campaign
     with folder_lock(directory):
@@ -103,9 +103,9 @@ def resume_campaign(
 def append_cases(
     directory: Path, cases: int, executor: ExecutorConfig, watch: Watch, *, allow_changed: bool = False
 ) -> None:
-    """Append a block of cases to a finished campaign, and run them.
+    """Append a block of cases to a finished campaign, and run it.
 
-    Raises CampaignError as `resume_campaign` does, where the campaign is not finished, or its design refuses the block.
+    Raises CampaignError as `resume_campaign` does, if the campaign is unfinished, or the block does not fit its design.
     """
     record.read(directory)  # no lock file is created in a folder without a campaign
     with folder_lock(directory):
@@ -117,7 +117,7 @@ def append_cases(
 
 
 def campaign_with_block(directory: Path, cases: int) -> Campaign:
-    """Stored campaign with another block of cases, which is not run. Raises CampaignError as `append_cases` does."""
+    """Stored campaign with an additional block of cases; runs nothing. Raises CampaignError as `append_cases` does."""
     configuration = record.stored_configuration(directory)
     appended = configuration.model_copy(update={"appended": (*configuration.appended, cases)})
     problems = [message for _, message in appended.find_sampling_problems()]
@@ -131,26 +131,26 @@ def _continue_campaign(run: _Run, command: str, allow_changed: bool, retry: Sequ
     campaign, directory, watch = run.campaign, run.directory, run.watch
     configuration, stored = campaign.configuration, record.read(directory)
     if "identity" not in stored:
-        what = "was run by an earlier version, which stored no rows to continue from"
-        raise StoreError(f"{directory} {what}; run it again")
-    before, identity = Identity.read(stored["identity"]), create_identity(configuration)
-    changes = before.differences(identity)
+        reason = "was run by an earlier version, which stored no rows to continue from"
+        raise StoreError(f"{directory} {reason}; run it again")
+    previous, identity = Identity.read(stored["identity"]), create_identity(configuration)
+    changes = previous.differences(identity)
     if changes and not allow_changed:
-        listed = "\n  ".join(changes)
+        changes_text = "\n  ".join(changes)
         raise CampaignError(
-            f"{directory} was run with another program, configuration or input files; rows would not belong together. "
-            f"Changed:\n  {listed}\nTo continue nevertheless, with a note in the record: --allow-changed"
+            f"{directory} was run with another program, configuration or input files; rows would not be comparable. "
+            f"Changed:\n  {changes_text}\nTo continue nevertheless, with a note in the record: --allow-changed"
         )
-    if before.inputs is None and identity.inputs:
+    if previous.inputs is None and identity.inputs:
         files = ", ".join(identity.inputs)
-        watch.note(f"whether these files have changed so far is not known, as no hash was kept: {files}")
+        watch.note(f"no hash is stored for these files, so earlier changes are unknown: {files}")
     with RowStore(directory / ROWS_FILE, thorough=True) as store:
         if store.about.get("identity") != stored["identity"]["configuration"] and not stored["changes"]:
             raise StoreError(f"{directory}: {ROWS_FILE} and {record.RECORD_FILE} belong to different campaigns")
         count = store.count()
-        again = store.with_outcomes(RETRYABLE[word] for word in retry)
-        ended = stored["state"] == "finished" and (directory / TABLE_FILE).is_file()
-        if not again and ended and not store.missing(configuration.total_cases):
+        retries = store.with_outcomes(RETRYABLE[word] for word in retry)
+        is_complete = stored["state"] == "finished" and (directory / TABLE_FILE).is_file()
+        if not retries and is_complete and not store.missing(configuration.total_cases):
             watch.note(f"the campaign is finished: all {count} cases have rows; nothing is run")
             return
         session = record.describe_session(command, run.executor.describe(), count)
@@ -159,19 +159,19 @@ def _continue_campaign(run: _Run, command: str, allow_changed: bool, retry: Sequ
         if changes:
             updates["changes"] = [*stored["changes"], {"utc": record.utc_now(), "cases_before": count, "in": changes}]
             updates["algorithms"] = describe_algorithms(campaign)
-        if changes or before.inputs is None:
+        if changes or previous.inputs is None:
             updates["identity"] = asdict(identity)
         updates.update(cases=configuration.total_cases, configuration=configuration.model_dump(mode="json"))
         record.update(directory, updates)
         old, new = stored["environment"], session["environment"]
         if any(old.get(key) != new[key] for key in ("machine", "processor", "processor_features")):
-            name = f"the campaign began on another processor ({old.get('processor')})"
-            watch.note(f"{name}: rows may differ from its rows in their last bits")
-        _execute(run, store, again)
+            change = f"the campaign was started on another processor ({old.get('processor')})"
+            watch.note(f"{change}: new rows may differ from the earlier rows in their last bits")
+        _execute(run, store, retries)
 
 
-def _execute(run: _Run, store: RowStore, again: Sequence[int]) -> None:
-    """Run the missing cases and those of `again`; write the table, keep products, and record the progress."""
+def _execute(run: _Run, store: RowStore, retries: Sequence[int]) -> None:
+    """Run the missing cases and those of `retries`; write the table, keep products, and record the progress."""
     configuration, table = run.campaign.configuration, run.directory / TABLE_FILE
 
     def record_end(state: str) -> None:
@@ -181,14 +181,14 @@ def _execute(run: _Run, store: RowStore, again: Sequence[int]) -> None:
     try:
         with create_executor(run.executor) as executor:
             missing = store.missing(configuration.total_cases)
-            if missing or again:
+            if missing or retries:
                 with report_compilation(configuration.scenario, run.watch.note) as first_case_ended:
-                    _prepare_inputs(run, executor, itertools.chain(*missing, again))
-                    _run_cases(run, store, executor, [*missing, again], first_case_ended)
-            write_table(table, store, [one.metric for one in configuration.requirements if one.bound is not None])
+                    _prepare_inputs(run, executor, itertools.chain(*missing, retries))
+                    _run_cases(run, store, executor, [*missing, retries], first_case_ended)
+            write_table(table, store, [item.metric for item in configuration.requirements if item.bound is not None])
             _keep_worst(run, store, executor)
     except BaseException:
-        # on a full disk the record keeps the state "running", and the released lock shows that no process runs
+        # on a full disk the record keeps the state "running"; the released lock shows that no process runs
         with suppress(StoreError):
             record_end("interrupted")
         raise
@@ -196,25 +196,25 @@ def _execute(run: _Run, store: RowStore, again: Sequence[int]) -> None:
 
 
 def _prepare_inputs(run: _Run, executor: Executor, cases: Iterable[int]) -> None:
-    """Build the inputs that cases share; where that fails, the rows of the affected cases state it."""
+    """Build the inputs shared by cases; if this fails, the rows of the affected cases contain the error."""
     configuration, watch = run.campaign.configuration, run.watch
     plan = plan_inputs(run.campaign, cases)
     inputs = plan.to_prepare
     if plan.build_bytes > plan.limit_bytes:
-        sizes = f"{plan.build_bytes / 1e9:.1f} GB, more than the cache may ({plan.limit_bytes / 1e9:.1f} GB)"
+        sizes = f"{plan.build_bytes / 1e9:.1f} GB, more than the cache limit ({plan.limit_bytes / 1e9:.1f} GB)"
         advice = "some are built more than once; MARSYARD_CACHE_GB sets the limit"
-        watch.note(f"the terrains to be built take {sizes}: {advice}")
+        watch.note(f"the terrains to be built need {sizes}: {advice}")
     if not inputs:
         return
     watch.begin("preparing", len(inputs))
     task = partial(prepare_input, configuration_text(configuration))
     limits = work_limits(configuration.limits, configuration.limits.prepare_time_s)
-    for done in itertools.chain.from_iterable(executor.run(Work(task, inputs, limits, len(inputs)))):
-        if done.error is not None:
-            error = f"{type(done.error).__name__}: {done.error}"
-            watch.note(f"shared input {done.item} could not be prepared: {error}")
-        elif done.result:
-            watch.note(done.result)
+    for result in itertools.chain.from_iterable(executor.run(Work(task, inputs, limits, len(inputs)))):
+        if result.error is not None:
+            error = f"{type(result.error).__name__}: {result.error}"
+            watch.note(f"shared input {result.item} could not be prepared: {error}")
+        elif result.result:
+            watch.note(result.result)
         watch.step()
 
 
@@ -227,18 +227,18 @@ def _run_cases(
     products = ProductStore(run.directory, configuration.retain.budget_gb)
     cases = itertools.chain.from_iterable(parts)
     watch.begin("cases", total)
-    checked = False
-    for ended in run_cases(executor, configuration, cases, keep=select_kept_cases(configuration), total=total):
-        for completed in ended:
+    is_checked = False
+    for batch in run_cases(executor, configuration, cases, keep=select_kept_cases(configuration), total=total):
+        for completed in batch:
             _keep_products(products, completed, watch)
-        store.add(completed.row for completed in ended)
-        finished = next((one.row for one in ended if one.row["outcome"] not in UNFINISHED), None)
-        if not checked and finished is not None:
+        store.add(completed.row for completed in batch)
+        finished = next((item.row for item in batch if item.row["outcome"] not in ENGINE_FAILURES), None)
+        if not is_checked and finished is not None:
             check_metrics(configuration, finished, run.directory)
             mark_ready(configuration.scenario)
             first_case_ended()
-            checked = True
-        for _ in ended:
+            is_checked = True
+        for _ in batch:
             watch.step()
 
 
@@ -249,34 +249,33 @@ def _keep_products(products: ProductStore, completed: CompletedCase, watch: Watc
         return
     case = int(completed.row["case"])
     if not products.save(case, completed.products, completed.row):
-        watch.note(f"the budget for kept products (retain.budget_gb) is used up: none is kept from case {case} on")
+        watch.note(f"the budget for kept products (retain.budget_gb) is used: none is kept from case {case} on")
 
 
 def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Path) -> None:
-    """Check the columns that requirements name against a finished case, before more cases run.
+    """Check the columns of the requirements against a finished case, before more cases run.
 
-    A row may lack columns that the scenario states: these are checked when the campaign is loaded
-    (`marsyard.campaigns.definition.loading`).
-    Raises ConfigurationError where a requirement names a missing column, or one of another type: numbers for a metric
-    with a bound, true and false for a metric without one and for a population.
+    A row may lack columns that the scenario declares: these are checked when the campaign is loaded
+    (`marsyard.campaigns.definition.loading`). Raises ConfigurationError if a column of a requirement is missing or has
+    the wrong type: numbers for a metric with a bound, booleans for a metric without a bound and for a population.
     """
-    stated = row_columns(configuration.scenario) or RowColumns((), ())
+    declared = row_columns(configuration.scenario) or RowColumns((), ())
     flags = [name for name, value in row.items() if isinstance(value, bool)]
     numbers = [name for name, value in row.items() if isinstance(value, int | float) and name not in (*flags, "case")]
 
     def is_known(name: str, kind: str) -> bool:
-        absent = name not in row and (stated.has_flag(name) or stated.has_number(name))
+        absent = name not in row and (declared.has_flag(name) or declared.has_number(name))
         return absent or name in (numbers if kind == NUMBERS else flags)
 
     unknown_columns = find_unknown_columns(configuration.requirements, flags, numbers, is_known)
     problems = [Problem(configuration.name, key_text(key), message) for key, message in unknown_columns]
     if problems:
-        stopped = Problem(str(directory), "", "the campaign was stopped; the rows so far are kept")
-        raise ConfigurationError([*problems, stopped])
+        consequence = Problem(str(directory), "", "the campaign was stopped; the rows so far are kept")
+        raise ConfigurationError([*problems, consequence])
 
 
 def _keep_worst(run: _Run, store: RowStore, executor: Executor) -> None:
-    """Run the showcase, and the worst cases where they are kept, again for their products."""
+    """Run the showcase and, if they are kept, the worst cases again for their products."""
     configuration, table = run.campaign.configuration, run.directory / TABLE_FILE
     showcase = find_showcase(configuration, table, store)
     cases = [] if showcase is None else [showcase]
@@ -291,7 +290,7 @@ def _keep_worst(run: _Run, store: RowStore, executor: Executor) -> None:
         replayed = replay_with(executor, configuration, case, store.row(case))
         if replayed.differing:
             record.update(run.directory, {"showcase_differs": list(replayed.differing)})
-            run.watch.note(f"case {case} run again came out differently in: {', '.join(replayed.differing)}")
+            run.watch.note(f"case {case}, run again, differs from its stored row in: {', '.join(replayed.differing)}")
         _keep_products(products, CompletedCase(replayed.row, replayed.products, replayed.note), run.watch)
         run.watch.step()
     record.update(run.directory, {"showcase": showcase})

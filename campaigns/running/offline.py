@@ -1,7 +1,7 @@
-"""Offline campaigns: cases are exported without their truth, and answers to them are scored.
+"""Offline campaigns: cases are exported without their truth, and the answers to them are scored.
 
-Both are ordinary campaigns. The exporting one lies in the folder of the truth: its rows hold the truth of each case.
-The scoring one runs the same cases again, with a table of answers in place of the algorithm.
+Both are ordinary campaigns. The exporting campaign writes to the folder of the truth: its rows contain the truth of
+each case. The scoring campaign runs the same cases again, with a table of answers in place of the algorithm.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from marsyard.scenarios.interface import HasAlgorithms
 from marsyard.scenarios.offline import ANSWERS, CASES, read_answers
 from marsyard.scenarios.systems import scenario
 
-#: Description of an exported folder for programs, and for the team that answers.
+#: Description of an exported folder, for programs and for the team under test.
 MANIFEST_FILE, README_FILE = "export.json", "README.md"
 SCHEMA = 1
 
@@ -35,44 +35,44 @@ def truth_folder(directory: Path) -> Path:
 
 
 def export_campaign(campaign: Campaign, directory: Path, truth: Path, executor: ExecutorConfig, watch: Watch) -> None:
-    """Export a campaign's cases; continue where an earlier export of the same campaign was interrupted.
+    """Export a campaign's cases; continue an interrupted earlier export of the same campaign.
 
-    The campaign's algorithm is `export:` with the folder. Raises CampaignError where the folders hold other contents,
-    or cannot be written.
+    The campaign's algorithm is `export:` with the folder. Raises CampaignError if the folders have other contents or
+    are not writable.
     """
     if truth.resolve().is_relative_to(directory.resolve()):
-        raise CampaignError(f"--truth {truth}: lies within {directory}, which is handed away")
+        raise CampaignError(f"--truth {truth}: is inside {directory}, which is given to the team under test")
     if (truth / record.RECORD_FILE).is_file():
         stored = record.stored_configuration(truth)
         if configuration_hash(stored) != configuration_hash(campaign.configuration):
-            raise StoreError(f"{truth} holds the truth of another export; choose other folders")
+            raise StoreError(f"{truth} contains the truth of another export; choose other folders")
         resume_campaign(truth, executor, watch)
     else:
         if directory.exists() and (not directory.is_dir() or any(directory.iterdir())):
-            raise StoreError(f"{directory} is there already, and is not empty; name a new folder with --out")
+            raise StoreError(f"{directory} already exists and is not empty; choose a new folder with --out")
         run_campaign(campaign, truth, executor, watch)
     _write_manifest(campaign, directory)
 
 
 def _write_manifest(campaign: Campaign, directory: Path) -> None:
     task, name, cases = _find_task(campaign), campaign.configuration.name, campaign.configuration.total_cases
-    form = task.offline
-    columns = () if form is None else form.columns
+    answer_format = task.offline
+    columns = () if answer_format is None else answer_format.columns
     manifest = {"schema": SCHEMA, "campaign": name, "task": task.name, "cases": cases, "columns": list(columns)}
     text = f"""# {cases} cases of {name}
 
-Each folder of `{CASES}/` is one case (task: {task.name}): `case.json`, 16-bit pictures and
-cameras, in the exchange of docs/custom-algorithms.md. Nothing here is the truth.
+Each folder of `{CASES}/` is one case (task: {task.name}): `case.json`, 16-bit images and
+cameras, in the format of docs/custom-algorithms.md. The folder contains no ground truth.
 
-Answer in a table with commas, one line for each case, with a first line of these columns:
+Answer with a comma-separated table: a header line with these columns, then one line for each case:
 
     {",".join(columns)}
 
-`case` is the folder's number. Units are those that the names end with. A case without an answer has an
-outcome and no numbers; outcomes: {", ".join(form.outcomes.__members__) if form else ""}.
+`case` is the number of the folder. The suffix of a column's name is its unit. A case without an answer has an
+outcome and no numbers; outcomes: {", ".join(answer_format.outcomes.__members__) if answer_format else ""}.
 """
-    if form and form.note:
-        text += f"{form.note}\n"
+    if answer_format and answer_format.note:
+        text += f"{answer_format.note}\n"
     with report_write_errors(directory):
         (directory / MANIFEST_FILE).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
         (directory / README_FILE).write_text(text, encoding="utf-8")
@@ -81,47 +81,47 @@ outcome and no numbers; outcomes: {", ".join(form.outcomes.__members__) if form 
 def scored_campaign(directory: Path, truth: Path, answers: Path) -> Campaign:
     """Exported campaign with the answers of a table in place of its algorithm.
 
-    Raises CampaignError where the folders hold no finished export, or the table does not answer each case once.
+    Raises CampaignError if the folders contain no finished export, or the table does not answer each case once.
     """
     path = directory / MANIFEST_FILE
     try:
         manifest = json.loads(path.read_text(encoding="utf-8"))
         if manifest["schema"] != SCHEMA:
             raise ValueError(f"has schema {manifest['schema']}; this version of Marsyard reads {SCHEMA}")
-        stated = str(manifest["campaign"]), int(manifest["cases"])
+        exported = str(manifest["campaign"]), int(manifest["cases"])
     except OSError as error:
         reason = f"{path.name}: {error.strerror or error}"
-        raise StoreError(f"{directory} holds no finished export: {reason}") from error
+        raise StoreError(f"{directory} contains no finished export: {reason}") from error
     except (KeyError, TypeError, ValueError) as error:
         raise StoreError(f"{path} is damaged: {error}") from error
     stored = record.stored_configuration(truth)
     if record.read(truth)["state"] != "finished":
         raise CampaignError(f"{truth} is not finished: export again to continue")
-    if stated != (stored.name, stored.total_cases):
+    if exported != (stored.name, stored.total_cases):
         raise CampaignError(f"{directory} and {truth} belong to different exports")
-    exporting = Campaign(stored, scenario(stored.scenario))
-    _check_answers(_find_task(exporting), stored, answers)
-    table = exporting.scenario.algorithm_table if isinstance(exporting.scenario, HasAlgorithms) else ()
+    export = Campaign(stored, scenario(stored.scenario))
+    _check_answers(_find_task(export), stored, answers)
+    table = export.scenario.algorithm_table if isinstance(export.scenario, HasAlgorithms) else ()
     parameters = replace_value(stored.parameters, [*table, "algorithm"], f"{ANSWERS}{answers.resolve()}")
-    changed = stored.model_copy(update={"parameters": parameters, "retain": Retain()})
-    return Campaign(CampaignConfiguration.model_validate(changed.model_dump()), exporting.scenario)
+    scoring = stored.model_copy(update={"parameters": parameters, "retain": Retain()})
+    return Campaign(CampaignConfiguration.model_validate(scoring.model_dump()), export.scenario)
 
 
 def _check_answers(task: Task[Any, Any], configuration: CampaignConfiguration, answers: Path) -> None:
     if task.offline is None:
         raise CampaignError(f"{configuration.name} cannot be answered in a table")
     try:
-        answer = read_answers(answers, task.offline)
+        answers_by_case = read_answers(answers, task.offline)
     except ValueError as error:
         raise CampaignError(str(error)) from error
     total = configuration.total_cases
-    unknown = sorted(case for case in answer if case >= total)
+    unknown = sorted(case for case in answers_by_case if case >= total)
     if unknown:
-        raise CampaignError(f"{answers}: there is no case {_list_first(unknown)}; allowed: 0 to {total - 1}")
-    missing = [case for case in range(total) if case not in answer]
+        raise CampaignError(f"{answers}: unknown case {_list_first(unknown)}; allowed: 0 to {total - 1}")
+    missing = [case for case in range(total) if case not in answers_by_case]
     if missing:
         failures = list(task.offline.outcomes.__members__)[1:]
-        advice = f"a case without one is stated with its outcome, such as {failures[0]}"
+        advice = f"a case without an answer needs a line with its outcome, such as {failures[0]}"
         raise CampaignError(
             f"{answers}: no answer to {len(missing)} of {total} cases: {_list_first(missing)}; {advice}"
         )
@@ -133,12 +133,12 @@ def _list_first(cases: Sequence[int]) -> str:
 
 def _find_task(campaign: Campaign) -> Task[Any, Any]:
     if not isinstance(campaign.scenario, HasAlgorithms):
-        raise CampaignError(f"the scenario of {campaign.configuration.name} has no choice of algorithms")
+        raise CampaignError(f"the scenario of {campaign.configuration.name} has no selectable algorithms")
     return campaign.scenario.task
 
 
-def cases_with_changed_pictures(truth: Path, scored: Path) -> list[int]:
-    """Cases whose pictures differed between export and scoring."""
+def find_cases_with_changed_images(truth: Path, scored: Path) -> list[int]:
+    """Cases whose images differ between export and scoring."""
     exported = {row["case"]: row.get("image_hash") for row in read_rows(truth / TABLE_FILE)}
     rows = read_rows(scored / TABLE_FILE)
     return [int(row["case"]) for row in rows if row.get("image_hash") != exported.get(row["case"])]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.errors import UNFINISHED, CampaignError
+from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError
 from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
 from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
@@ -26,19 +26,18 @@ from marsyard.sim.kernel_cache import count_compiled_functions, kernels_are_read
 REPORT_INTERVAL_S = 10.0
 #: Maximum number of trial cases; the first is excluded from the mean, since it loads code and terrains.
 _MAX_TRIALS = 9
-#: Seconds after which no further trial case is begun.
+#: Seconds after which no further trial case is started.
 _TRIAL_S = 20.0
-#: Bytes of SQLite and of the table for each byte of a row's text: pages, index and compressed columns.
+#: Bytes of SQLite and of the table per byte of a row's text: pages, index and compressed columns.
 _ROW_OVERHEAD = 1.6
 
 
 @dataclass(frozen=True)
 class InputPlan:
-    """Shared inputs that cases use.
+    """Shared inputs of some cases.
 
-    present: numbers of those on disk, where the scenario states that.
-    to_build: numbers of those to be built, each with its bytes on disk (0 where the scenario does not state it).
-    limit_bytes: size limit of the cache.
+    present: numbers of the inputs on disk, if the scenario reports them. to_build: numbers of the inputs to be built,
+    each with its bytes on disk (0 if the scenario does not report them). limit_bytes: size limit of the cache.
     """
 
     present: tuple[int, ...]
@@ -52,13 +51,13 @@ class InputPlan:
 
     @property
     def to_prepare(self) -> tuple[int, ...]:
-        """Inputs to be prepared before the cases: existing ones, to be verified, then others up to the cache's limit.
+        """Inputs to be prepared before the cases: existing ones, to be verified, then new ones up to the cache's limit.
 
-        The cases build the rest when they need it.
+        The cases build the remaining inputs when they need them.
         """
         selected, size = list(self.present), 0
-        for number, one in self.to_build.items():
-            size += one
+        for number, input_bytes in self.to_build.items():
+            size += input_bytes
             if size > self.limit_bytes:
                 break
             selected.append(number)
@@ -68,7 +67,7 @@ class InputPlan:
 def plan_inputs(campaign: Campaign, cases: Iterable[int]) -> InputPlan:
     """Plan the shared inputs of some of a campaign's cases.
 
-    Raises CampaignError where the cache's limit is not a number, or its folder cannot be created.
+    Raises CampaignError if the cache's limit is not a number, or its folder cannot be created.
     """
     numbers = find_used_inputs(campaign, cases)
     if not numbers:
@@ -88,20 +87,20 @@ def plan_inputs(campaign: Campaign, cases: Iterable[int]) -> InputPlan:
 
 
 def find_used_inputs(campaign: Campaign, cases: Iterable[int]) -> tuple[int, ...]:
-    """Numbers of the shared inputs that cases use, ascending; all where the scenario does not state those of a case.
+    """Numbers of the shared inputs that cases use, ascending; all if the scenario does not report those of a case.
 
-    Draws are a function of the case's number. The search ends when all inputs occur: for 250 terrains after about 1,500
-    cases of two milliseconds each.
+    The sampled values are a function of the case's number. The search ends when all inputs have occurred: for 250
+    terrains after about 1,500 cases of two milliseconds each.
     """
-    every = campaign.scenario.shared_inputs(campaign.base_parameters())
-    if not every or not isinstance(campaign.scenario, SelectsInputs):
-        return every
-    allowed, used = set(every), set[int]()
+    all_inputs = campaign.scenario.shared_inputs(campaign.base_parameters())
+    if not all_inputs or not isinstance(campaign.scenario, SelectsInputs):
+        return all_inputs
+    allowed, used = set(all_inputs), set[int]()
     for case in cases:
         try:
             used |= allowed.intersection(campaign.scenario.case_inputs(campaign.parameters(case), case))
         except ValueError:
-            continue  # the case's row will state why its parameters are refused
+            continue  # the case's row will contain the reason
         if used == allowed:
             break
     return tuple(sorted(used))
@@ -109,32 +108,32 @@ def find_used_inputs(campaign: Campaign, cases: Iterable[int]) -> tuple[int, ...
 
 @contextmanager
 def report_compilation(scenario: str, note: Callable[[str], None]) -> Iterator[Callable[[], None]]:
-    """Report the compilation of kernels until the context ends; nothing where they are compiled already.
+    """Report the compilation of kernels until the context ends; report nothing if the kernels are compiled already.
 
     Yields a function to be called when the first case has ended and compilation is complete.
     """
     if scenario not in scenario_paths() or kernels_are_ready(scenario):
         yield lambda: None
         return
-    note("compiling numeric kernels once on this machine, about two minutes (ahead of time: marsyard compile)")
-    ended, began, before = threading.Event(), time.monotonic(), count_compiled_functions()
+    note("compiling numeric kernels once on this machine, about two minutes (to compile in advance: marsyard compile)")
+    is_done, start_s, initial_count = threading.Event(), time.monotonic(), count_compiled_functions()
 
     def report() -> None:
-        while not ended.wait(REPORT_INTERVAL_S):
-            number = count_compiled_functions() - before
-            note(f"compiling numeric kernels: {number} functions so far, {time.monotonic() - began:.0f} s")
+        while not is_done.wait(REPORT_INTERVAL_S):
+            number = count_compiled_functions() - initial_count
+            note(f"compiling numeric kernels: {number} functions so far, {time.monotonic() - start_s:.0f} s")
 
     def finish() -> None:
-        if not ended.is_set():
-            ended.set()
-            note(f"numeric kernels are compiled, {time.monotonic() - began:.0f} s")
+        if not is_done.is_set():
+            is_done.set()
+            note(f"numeric kernels are compiled, {time.monotonic() - start_s:.0f} s")
 
     thread = threading.Thread(target=report, daemon=True)
     thread.start()
     try:
         yield finish
     finally:
-        ended.set()
+        is_done.set()
         thread.join()
 
 
@@ -142,13 +141,12 @@ def report_compilation(scenario: str, note: Callable[[str], None]) -> Iterator[C
 class Estimate:
     """Time and disk space of a campaign.
 
-    trials, unfinished: number of trial cases, and of unfinished ones among them.
-    case_s, case_range_s: mean wall-clock time of a trial case on one worker, and its range.
-    inputs, input_s, inputs_bytes: shared inputs (terrains) to be built, mean time of building one, and bytes on disk
-    together (0 where the scenario does not state it).
-    cache_limit_bytes: size limit of their cache.
-    time_s: of the whole campaign with the requested workers, if there is a core for each.
-    rows_bytes, products_bytes: on disk: SQLite and table; kept products (within their budget).
+    trials, unfinished: number of trial cases, and of unfinished cases among them. case_s, case_range_s: mean wall-clock
+    time of a trial case on one worker, and its range. inputs, input_s, inputs_bytes: number of shared inputs (terrains)
+    to be built, mean time of building one, and total bytes on disk (0 if the scenario does not report them).
+    cache_limit_bytes: size limit of the inputs' cache. time_s: time of the whole campaign with the requested workers,
+    if there is a core for each. rows_bytes, products_bytes: bytes on disk of SQLite and table, and of the kept products
+    (within their budget).
     """
 
     trials: int
@@ -165,34 +163,34 @@ class Estimate:
 
 
 def estimate(campaign: Campaign, jobs: int) -> Estimate:
-    """Run trial cases, evenly spread over the campaign, in one worker; keep only the shared inputs built for them."""
+    """Run trial cases, evenly spaced over the campaign, in one worker; keep only the shared inputs built for them."""
     configuration, total = campaign.configuration, campaign.configuration.total_cases
     plan = plan_inputs(campaign, range(total))
     trials: list[CompletedCase] = []
     times: list[float] = []
-    built: list[float] = []
+    build_times: list[float] = []
     number = min(_MAX_TRIALS, total)
     with create_executor(ExecutorConfig()) as executor:
-        began = time.monotonic()
+        start_s = time.monotonic()
         for case in (index * total // number for index in range(number)):
-            if trials and time.monotonic() - began > _TRIAL_S:
+            if trials and time.monotonic() - start_s > _TRIAL_S:
                 break
-            built += _build_inputs(campaign, executor, case)
-            start = time.monotonic()
+            build_times += _build_inputs(campaign, executor, case)
+            case_start_s = time.monotonic()
             ((completed,),) = run_cases(executor, configuration, [case], keep=KEEP_ALL)
             trials.append(completed)
-            times.append(time.monotonic() - start)
+            times.append(time.monotonic() - case_start_s)
     times = times[1:] or times
-    case_s, input_s = statistics.fmean(times), statistics.fmean(built or [0.0])
-    row_bytes = statistics.fmean(len(json.dumps(list(one.row.values()))) for one in trials)
-    product_bytes = statistics.fmean(one.products.size if one.products else 0 for one in trials)
+    case_s, input_s = statistics.fmean(times), statistics.fmean(build_times or [0.0])
+    row_bytes = statistics.fmean(len(json.dumps(list(trial.row.values()))) for trial in trials)
+    product_bytes = statistics.fmean(trial.products.size if trial.products else 0 for trial in trials)
     retain = configuration.retain
-    # of failed cases, only the rows decide how many there are
-    kept = {"none": 0, "worst": retain.worst, "every": -(-total // retain.every), "all": total, "failed": total}
-    products = min(total, kept[retain.products] + int(retain.showcase != "none")) * product_bytes
+    # the number of failed cases is unknown before the campaign: all cases are the upper bound
+    kept_cases = {"none": 0, "worst": retain.worst, "every": -(-total // retain.every), "all": total, "failed": total}
+    products = min(total, kept_cases[retain.products] + int(retain.showcase != "none")) * product_bytes
     return Estimate(
         trials=len(trials),
-        unfinished=sum(one.row["outcome"] in UNFINISHED for one in trials),
+        unfinished=sum(trial.row["outcome"] in ENGINE_FAILURES for trial in trials),
         case_s=case_s,
         case_range_s=(min(times), max(times)),
         inputs=len(plan.to_build),
@@ -208,7 +206,7 @@ def estimate(campaign: Campaign, jobs: int) -> Estimate:
 def _build_inputs(campaign: Campaign, executor: Executor, case: int) -> list[float]:
     """Build the missing shared inputs of a case; return the time of each.
 
-    Where the scenario does not state the inputs of a case, the first input stands for all, and is built for case 0.
+    If the scenario does not report the inputs of a case, the first input represents all, and is built for case 0.
     """
     missing = list(plan_inputs(campaign, [case]).to_build)
     if not isinstance(campaign.scenario, SelectsInputs):
@@ -217,7 +215,7 @@ def _build_inputs(campaign: Campaign, executor: Executor, case: int) -> list[flo
     task = partial(prepare_input, configuration_text(campaign.configuration))
     times = []
     for number in missing:
-        began = time.monotonic()
+        start_s = time.monotonic()
         list(executor.run(Work(task, [number], work_limits(limits, limits.prepare_time_s))))
-        times.append(time.monotonic() - began)
+        times.append(time.monotonic() - start_s)
     return times

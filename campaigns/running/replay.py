@@ -1,4 +1,4 @@
-"""Stored campaigns loaded again, single cases compared with their stored rows, and checks of an algorithm."""
+"""Stored campaigns loaded again, single cases compared with their stored rows, and conformance checks of algorithms."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, key_text, validation_problems
 from marsyard.campaigns.definition.identity import Identity, create_identity
-from marsyard.campaigns.errors import UNFINISHED, CampaignError, CaseEndedError, ConfigurationError, Problem
+from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, ConfigurationError, Problem, WorkerExitError
 from marsyard.campaigns.execution.cases import run_cases
 from marsyard.campaigns.execution.worker_process import (
     LOADING_S,
@@ -33,13 +33,12 @@ from marsyard.scenarios.systems import UnknownScenarioError, scenario
 
 @dataclass(frozen=True)
 class Replay:
-    """A case that was run again.
+    """A case that was run a second time.
 
-    row, stored: its row now, and as stored (None if it has none yet).
-    differing: columns in which the two differ, except those with `time` in their name.
-    products: products for figures; None where the scenario returned none, or none that can be stored.
-    note: why there are none; empty where nothing is wrong.
-    changed: differences in configuration, code and package versions from the stored campaign.
+    row, stored: its new row, and the stored row (None if it has none yet). differing: columns in which the two rows
+    differ, except those with `time` in their name. products: products for figures; None if the scenario returned none,
+    or none that can be stored. note: reason why there are no products; empty without a problem. changed: differences in
+    configuration, code and package versions from the stored campaign.
     """
 
     case: int
@@ -53,14 +52,14 @@ class Replay:
     @property
     def failed(self) -> bool:
         """Whether the case is unfinished now, although its stored row is finished."""
-        stored = self.stored
-        return self.row["outcome"] in UNFINISHED and stored is not None and stored["outcome"] not in UNFINISHED
+        was_finished = self.stored is not None and self.stored["outcome"] not in ENGINE_FAILURES
+        return was_finished and self.row["outcome"] in ENGINE_FAILURES
 
 
 def replay(directory: Path, case: int) -> Replay:
     """Run one case of a stored campaign again, in a worker process.
 
-    Raises CampaignError where the folder holds no campaign, the case does not exist, or the scenario or an algorithm
+    Raises CampaignError if the folder contains no campaign, the case does not exist, or the scenario or an algorithm
     cannot be imported; no case is run then.
     """
     configuration = stored_configuration(directory)
@@ -81,31 +80,31 @@ def replay_with(
     stored: Row | None,
     changed: tuple[str, ...] = (),
 ) -> Replay:
-    """Run one case again in given workers, and compare it with a row."""
+    """Run one case again with the given workers, and compare it with a row."""
     ((completed,),) = run_cases(executor, configuration, [case], keep=KEEP_ALL)
     differing = differing_columns(completed.row, stored) if stored is not None else ()
     return Replay(case, completed.row, stored, differing, completed.products, completed.note, changed)
 
 
-def differing_columns(row: Row, other: Row) -> tuple[str, ...]:
+def differing_columns(row: Row, stored: Row) -> tuple[str, ...]:
     """Columns in which two rows differ bit for bit, except times; a missing number equals NaN.
 
-    The traceback of an unfinished case is not compared: a process is not ended at the same instruction twice.
+    The traceback of an unfinished case is not compared: a process never ends twice at the same instruction.
     """
-    excluded = {"traceback"} if row.get("outcome") in UNFINISHED else set()
+    excluded = {"traceback"} if row.get("outcome") in ENGINE_FAILURES else set()
     differing = []
-    for name in dict.fromkeys((*row, *other)):
+    for name in dict.fromkeys((*row, *stored)):
         # NaN differs from itself
-        values = [None if one is None or one != one else one for one in (row.get(name), other.get(name))]
+        values = [None if value is None or value != value else value for value in (row.get(name), stored.get(name))]
         if "time" not in name and name not in excluded and values[0] != values[1]:
             differing.append(name)
     return tuple(differing)
 
 
 def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) -> Campaign:
-    """Campaign of a stored configuration, with its scenario and algorithms imported.
+    """Campaign of a stored configuration; its scenario and algorithms are imported.
 
-    Raises ConfigurationError where the scenario or an algorithm cannot be imported, or a parameter is not accepted.
+    Raises ConfigurationError if the scenario or an algorithm cannot be imported, or a parameter is invalid.
     """
     try:
         campaign = Campaign(configuration, scenario(configuration.scenario))
@@ -115,8 +114,8 @@ def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) 
         if isinstance(error, ValidationError):
             errors = validation_problems(error, campaign.scenario.parameters_type)
             problems = [(key_text(("parameters", *key)), message) for key, message in errors]
-        hint = "modules of your own are searched for in the current folder"
-        problems.append(("", f"nothing was run or changed; {hint}: start the command where the campaign was run"))
+        hint = "custom modules are searched for in the current folder: start the command in the campaign's first folder"
+        problems.append(("", f"nothing was run or changed; {hint}"))
         raise ConfigurationError([Problem(str(directory), *problem) for problem in problems]) from error
     return campaign
 
@@ -126,47 +125,48 @@ _OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
 
 
 def create_subject(spec: str, task: str | None, limit_s: float) -> suite.Subject:
-    """Algorithm or part of a name, for a stated task, or the task that it states itself.
+    """Algorithm or part of a name, for a given task, or for the task that its interface determines.
 
-    Raises CampaignError where the name or the task is unknown.
+    Raises CampaignError if the name or the task is unknown.
     """
     if task is not None and task not in suite.SUBJECT_KINDS:
         raise CampaignError(f"--task {task}: unknown; allowed: {', '.join(suite.SUBJECT_KINDS)}")
     try:
-        chosen = suite.determine_task(spec) if task is None else task
-        suite.check_subject(spec, chosen)
+        name = suite.determine_task(spec) if task is None else task
+        suite.check_subject(spec, name)
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    return suite.Subject(spec, chosen, limit_s)
+    return suite.Subject(spec, name, limit_s)
 
 
-def examine(subject: suite.Subject) -> Iterator[suite.Finding]:
-    """Run all checks in order; only the first, the ordinary case, if its worker process ends."""
-    # the time limit of an answer, and as much again for the rest of the check
+def run_conformance_checks(subject: suite.Subject) -> Iterator[suite.Finding]:
+    """Run all checks in order; stop after the first check, the ordinary case, if its worker process ends."""
+    # the time limit of an answer, the same again for the other work of the check, and 5 s
     limits = WorkLimits(2.0 * subject.limit_s + 5.0, _MEMORY_BYTES, _OUTPUT_BYTES)
     with LocalExecutor(1) as workers:
-        for number, (name, asked) in enumerate(suite.check_names(subject)):
-            ((done,),) = workers.run(Work(partial(_run_check, subject), [number], limits))
-            finding, error = done.result, done.error
-            if finding is None and isinstance(error, CaseEndedError):
-                where = [line.strip() for line in error.trace.splitlines() if line.strip().startswith("File ")][:1]
-                problem = f"{error.outcome}: {error}{f' ({where[0]})' if where else ''}"
-                advice = "no picture may make it hang, end its process or take all memory"
-                finding = suite.Finding(name, asked, problem, advice)
+        for number, (name, requirement) in enumerate(suite.check_names(subject)):
+            ((result,),) = workers.run(Work(partial(_run_check, subject), [number], limits))
+            finding, error = result.result, result.error
+            if finding is None and isinstance(error, WorkerExitError):
+                frames = [line.strip() for line in error.trace.splitlines() if line.strip().startswith("File ")][:1]
+                problem = f"{error.outcome}: {error}{f' ({frames[0]})' if frames else ''}"
+                advice = "it must return within the limits of time and memory for every image"
+                finding = suite.Finding(name, requirement, problem, advice)
             elif finding is None:
                 problem = f"{type(error).__name__}: {error}"
-                finding = suite.Finding(name, asked, problem, "this is a defect of the suite or of the answer's types")
-            elif finding.passed and done.changed:
-                problem = f"it changed the state of its process: {'; '.join(done.changed)}"
-                advice = "set it back before returning, and end every thread and child process"
-                finding = replace(finding, problem=problem, next_step=f"{advice}: a case must leave no trace")
+                advice = "this is a defect of the suite or of the answer's types"
+                finding = suite.Finding(name, requirement, problem, advice)
+            elif finding.passed and result.changed:
+                problem = f"it changed the state of its process: {'; '.join(result.changed)}"
+                advice = "restore the state before returning, and end every thread and child process"
+                finding = replace(finding, problem=problem, next_step=f"{advice}: a case must not affect later cases")
             yield finding
-            if number == 0 and isinstance(error, CaseEndedError):
+            if number == 0 and isinstance(error, WorkerExitError):
                 return
 
 
 def _run_check(subject: suite.Subject, number: int) -> suite.Finding:
-    """Run one check in a worker; its clock starts once everything is loaded, and again with every question."""
+    """Run one check in a worker; the clock starts after loading and compilation."""
     start_clock(grace_s=LOADING_S)
     subject.prepare()
     accept_process_state()

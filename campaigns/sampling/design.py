@@ -1,23 +1,22 @@
-"""Sampling designs and correlated groups: how the uniform numbers behind the draws are distributed over the cases.
+"""Sampling designs and correlated groups: how the uniform random numbers of the cases are generated.
 
-``random`` draws every number independently: the only design from which a probability follows. ``latin-hypercube`` and
-``sobol`` are stratified, which gives sharper means and sensitivities with fewer cases; their cases are not independent,
-so they give statistics and no verdict. Dispersions of kind ``grid`` form a full factorial under any design, which is
-no random draw either.
+``random`` draws every number independently: the only design that supports probability statements.
+``latin-hypercube`` and ``sobol`` are stratified, which gives sharper means and sensitivities with fewer cases; their
+cases are not independent, so they give statistics and no verdict. Dispersions of kind ``grid`` form a full factorial
+under any design, which is not random either.
 
-Any case can be drawn alone. Its position follows from its number: the block of cases that contains it (the first, or an
-appended one), its point of the grid (its number within the block, modulo the grid's size), and its index in the design
-of this block and grid point. A stratified design is built as a whole, from one stream per dispersion; its size is part
-of its definition.
+Any case can be drawn alone. The number of the case determines its block (the first, or an appended one), its point
+of the grid (its number within the block, modulo the grid's size), and its index in the design of this block and grid
+point. A stratified design is built as a whole, from one stream per dispersion; its size is part of its definition.
 
-Correlated groups are stated by a covariance, a correlation or a rank correlation. All three are one Gaussian copula
+Correlated groups are defined by a covariance, a correlation or a rank correlation. All three are one Gaussian copula
 (Nelsen, An Introduction to Copulas, 2006, section 2.3). The independent uniform numbers u of the members become normal,
 z = Phi^-1(u). The normals are mixed, z' = L z with the Cholesky factor L L^T = R of their correlation. Phi(z') replaces
-u. Every member keeps its distribution for any R. As L is lower triangular, the first member draws as it would alone,
-and a member added at the end changes no earlier one.
+u. Every member keeps its distribution for any R. As L is lower triangular, the first member is sampled as if alone,
+and a member added at the end changes no earlier member.
 
 - ``covariance`` and ``correlation`` (Pearson's) are for normal dispersions without truncation, whose draws are exactly
-  multivariate normal: R is the correlation itself. A covariance also states the standard deviations.
+  multivariate normal: R is the correlation itself. A covariance also defines the standard deviations.
 - ``rank`` (Spearman's) is for any continuous dispersions: R = 2 sin(pi/6 rank), exactly (Kruskal 1958, J. Am. Stat.
   Assoc. 53, 814-861; ranks do not depend on the marginals).
 """
@@ -44,7 +43,7 @@ MAX_DRAW = 1.0 - 2.0**-53
 MAX_STRATIFIED = 2**20
 #: Bits of a Sobol point, as many as in a float's fraction.
 _SOBOL_BITS = 52
-#: Designs that a process keeps: neighbouring cases share one.
+#: Number of designs that a process caches: successive cases share a design.
 _CACHED_DESIGNS = 4
 Kind = Literal["random", "latin-hypercube", "sobol"]
 #: Indices of a correlated group's members among the dispersions, and the rows of its factor L.
@@ -54,31 +53,32 @@ Group = tuple[tuple[int, ...], tuple[tuple[float, ...], ...]]
 class Design(Parameters):
     """Sampling design of a campaign.
 
-    With `nominal` the first case has the campaign's parameters without any draw.
+    With `nominal`, the first case has the campaign's parameters without sampling.
     """
 
     kind: Kind = "random"
     nominal: Annotated[bool, Field(strict=True)] = False
 
-    def find_problem(self, blocks: Sequence[int], grid_size: int) -> tuple[int, str] | None:
-        """First block of cases that has no such design, and the reason; None where all have one."""
+    def find_invalid_block(self, blocks: Sequence[int], grid_size: int) -> tuple[int, str] | None:
+        """Index of the first block whose size does not fit the design, and the reason; None if all fit."""
         for number, block in enumerate(blocks):
             nominal = int(self.nominal and number == 0)
             cases = block - nominal
-            size, rest = divmod(cases, grid_size)
+            size, remainder = divmod(cases, grid_size)
             problem = ""
-            if rest or (cases == 0 and (self.kind != "random" or grid_size > 1)):
-                problem = "none is left"
+            if remainder or (cases == 0 and (self.kind != "random" or grid_size > 1)):
+                problem = "no case remains"
                 if grid_size > 1:
-                    problem = f"the grid has {grid_size} points; allowed: a multiple of them"
+                    problem = f"the grid has {grid_size} points; allowed: a multiple of this number"
             elif self.kind != "random" and size > MAX_STRATIFIED:
-                problem = f"a {self.kind} design has at most {MAX_STRATIFIED} cases a point of the grid"
+                problem = f"a {self.kind} design has at most {MAX_STRATIFIED} cases per point of the grid"
             elif self.kind == "sobol" and size & (size - 1):
-                below = 1 << (size.bit_length() - 1)
-                each = " at each point of the grid" if grid_size > 1 else ""
-                problem = f"a Sobol design takes a power of 2{each}, such as {below} or {2 * below}"
+                lower_power = 1 << (size.bit_length() - 1)
+                condition = " at each point of the grid" if grid_size > 1 else ""
+                problem = f"a Sobol design needs a power of 2{condition}, such as {lower_power} or {2 * lower_power}"
             if problem:
-                return number, f"{cases} cases{' behind the nominal one' * nominal} cannot be laid out: {problem}"
+                after_nominal = " after the nominal case" * nominal
+                return number, f"{cases} cases{after_nominal} do not fit the sampling design: {problem}"
         return None
 
 
@@ -86,7 +86,7 @@ def locate_case(design: Design, blocks: Sequence[int], grid_size: int, case: int
     """Position of a case in blocks of given sizes; None for the nominal case.
 
     Returns the index of its point of the grid, the first case and the number of cases at this point in its block, and
-    the index of the case among these.
+    the index of the case among them.
     """
     if design.nominal and case == 0:
         return None
@@ -107,18 +107,15 @@ def build_stratified_design(
 ) -> Float64[np.ndarray, "cases dispersions"]:
     """Uniform numbers of a stratified design, each above 0 and below 1.
 
-    kind: `latin-hypercube` or `sobol`.
-    seed, campaign, first: of the random streams; `first` is the first case of the design.
-    size: number of cases.
-    paths: dispersions, in the order of their dimensions.
-    groups: see `Group`.
+    kind: `latin-hypercube` or `sobol`. seed, campaign, first: identify the random streams; `first` is the first case of
+    the design. size: number of cases. paths: dispersions, in the order of their dimensions. groups: see `Group`.
 
-    Every dispersion has its own stream. A Latin hypercube is a random permutation of the strata for each dispersion; no
-    dispersion depends on another. The dimensions of a Sobol sequence follow the order of the file; each is scrambled
-    (Matousek 1998, in SciPy) from its own stream, and changes with its position only.
+    Every dispersion has its own stream. A Latin hypercube is a random permutation of the strata for each dispersion,
+    independent of the others. The dimensions of a Sobol sequence follow the order of the file; each is scrambled
+    (Matousek 1998, in SciPy) from its own stream, and depends on its position only.
 
     Members of a correlated group keep their strata in a Latin hypercube: their numbers are sorted into the rank order
-    of the mixed ones (Stein 1987, Technometrics 29, 143-151). For a Sobol sequence the numbers themselves are mixed.
+    of the mixed numbers (Stein 1987, Technometrics 29, 143-151). For a Sobol sequence the numbers themselves are mixed.
     """
     from scipy.stats import qmc
 
@@ -147,12 +144,12 @@ def build_stratified_design(
 def correlate_uniform(
     uniform: Float64[np.ndarray, "*cases members"], factor: Float64[np.ndarray, "members members"]
 ) -> Float64[np.ndarray, "*cases members"]:
-    """Correlated uniform numbers of a group from independent ones: Phi(L Phi^-1(u))."""
+    """Correlated uniform numbers of a group from independent numbers: Phi(L Phi^-1(u))."""
     return np.asarray(np.clip(ndtr(ndtri(uniform) @ factor.T), MIN_DRAW, MAX_DRAW))
 
 
-def compute_grid_probabilities(sizes: Mapping[str, int], point: int) -> dict[str, float]:
-    """Probabilities of the grids' levels at one point of the full factorial; the last grid varies fastest."""
+def compute_grid_quantiles(sizes: Mapping[str, int], point: int) -> dict[str, float]:
+    """Probability (bin centre) of each grid's level at a point of the full factorial; the last grid varies fastest."""
     levels = np.unravel_index(point, tuple(sizes.values())) if sizes else ()
     return {path: (int(level) + 0.5) / size for (path, size), level in zip(sizes.items(), levels, strict=True)}
 
@@ -165,15 +162,15 @@ def describe_design(kind: str, grids: Sequence[str], *, nominal: bool) -> str:
         text = f"independent {text}"
     if grids:
         text += f" at each point of a grid over {', '.join(grids)}"
-    return f"{text}; case 0 is the nominal one" if nominal else text
+    return f"{text}; case 0 is the nominal case" if nominal else text
 
 
 _Matrix = tuple[tuple[Annotated[float, Field(strict=True, allow_inf_nan=False)], ...], ...]
-#: Relative tolerance of symmetry: files state rounded numbers.
+#: Relative tolerance of symmetry: files contain rounded numbers.
 _ROUNDING = 1e-9
-#: Minimum eigenvalue of a correlation; below it, members are numerically functions of one another.
+#: Minimum eigenvalue of a correlation matrix; below it, members are numerically functions of each other.
 _MIN_EIGENVALUE = 1e-10
-#: Matrices by which a group is stated.
+#: Kinds of matrix that define a group.
 MATRICES = ("covariance", "correlation", "rank")
 
 
@@ -187,13 +184,13 @@ class Correlation(Parameters):
     source: str = ""
 
     @model_validator(mode="after")
-    def _check_statement(self) -> Self:
-        given = [name for name in MATRICES if getattr(self, name) is not None]
-        if len(given) != 1:
-            raise ValueError(f"one of {', '.join(MATRICES)} is needed, got {', '.join(given) or 'none'}")
+    def _check_matrix(self) -> Self:
+        kinds = [name for name in MATRICES if getattr(self, name) is not None]
+        if len(kinds) != 1:
+            raise ValueError(f"one of {', '.join(MATRICES)} is needed, got {', '.join(kinds) or 'none'}")
         repeated = sorted({name for name in self.parameters if self.parameters.count(name) > 1})
         if repeated:
-            raise ValueError(f"named twice: {', '.join(repeated)}")
+            raise ValueError(f"repeated parameters: {', '.join(repeated)}")
         rows, size = getattr(self, self.kind), len(self.parameters)
         if len(rows) != size or any(len(row) != size for row in rows):
             raise ValueError(f"{self.kind} must have {size} rows of {size} numbers, one for each parameter")
@@ -208,20 +205,20 @@ class Correlation(Parameters):
         if self.kind != "covariance" and np.any(np.abs(matrix) > 1.0 + _ROUNDING):
             raise ValueError(f"{self.kind} has an entry that is not between -1 and 1")
         normals = self.normal_correlation
-        smallest = float(np.linalg.eigvalsh(normals)[0]) if np.isfinite(normals).all() else float("nan")
-        if not smallest > _MIN_EIGENVALUE:
-            reason = "the normals' correlation is not positive definite, with the smallest eigenvalue"
-            raise ValueError(f"{self.kind} is not valid for a group: {reason} {smallest:.3g}")
+        min_eigenvalue = float(np.linalg.eigvalsh(normals)[0]) if np.isfinite(normals).all() else float("nan")
+        if not min_eigenvalue > _MIN_EIGENVALUE:
+            reason = "the correlation of the normal numbers is not positive definite: its minimum eigenvalue is"
+            raise ValueError(f"{self.kind} is not valid for a group: {reason} {min_eigenvalue:.3g}")
         return self
 
     @property
     def kind(self) -> str:
-        """Name of the matrix that is stated."""
+        """Kind of the given matrix."""
         return next(name for name in MATRICES if getattr(self, name) is not None)
 
     @property
     def normal_correlation(self) -> Float64[np.ndarray, "n n"]:
-        """Correlation R of the normal numbers behind the draws."""
+        """Correlation R of the normal numbers before their transformation to the marginals."""
         matrix = np.array(getattr(self, self.kind), dtype=np.float64)
         symmetric: Float64[np.ndarray, "n n"] = 0.5 * (matrix + matrix.T)
         if self.kind == "rank":

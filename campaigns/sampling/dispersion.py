@@ -2,8 +2,8 @@
 
 A dispersion is a parameter's distribution over the cases, as an inverse distribution function. It maps one uniform
 number to a value. The values of a case therefore depend on one number per dispersion, whether these numbers are
-independent, correlated or stratified. Numbers of a distribution may be formulas
-(`marsyard.campaigns.sampling.dispersion`) of other parameters; `Dispersion.insert_values` inserts the values of a case.
+independent, correlated or stratified. Numbers of a distribution may be formulas of other parameters;
+`Dispersion.insert_values` inserts the values of a case.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from scipy.special import ndtr, ndtri
 from marsyard.campaigns.errors import near_match
 from marsyard.sim.parameters import Parameters
 
-#: Maximum number of characters.
+#: Maximum number of characters of a formula.
 MAX_LENGTH = 300
 _BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add,
@@ -51,7 +51,7 @@ _CONSTANTS: Mapping[str, float] = {"pi": math.pi}
 
 @dataclass(frozen=True)
 class Formula:
-    """Text of a formula, and the paths of the parameters that it names, each once."""
+    """Text of a formula, and the paths of the parameters in it, each once."""
 
     text: str
     names: tuple[str, ...]
@@ -60,7 +60,7 @@ class Formula:
     def value(self, values: Mapping[str, Any]) -> float:
         """Evaluate the formula for parameter values by dotted path.
 
-        Raises ValueError where a parameter is not a number, or the result is not finite.
+        Raises ValueError if a parameter is not a number, or the result is not finite.
         """
         numbers: dict[str, float] = {}
         for name in self.names:
@@ -68,24 +68,24 @@ class Formula:
             if isinstance(value, bool) or not isinstance(value, int | float):
                 raise ValueError(f"'{self.text}' uses {name}, which is {value!r} and not a number")
             numbers[name] = float(value)
-        given = ", ".join(f"{name} = {value:.6g}" for name, value in numbers.items())
-        failure = f"'{self.text}' has no value{' where ' if given else ''}{given}"
+        inputs = ", ".join(f"{name} = {value:.6g}" for name, value in numbers.items())
+        failure = f"'{self.text}' is undefined{' for ' if inputs else ''}{inputs}"
         try:
             result = float(_evaluate(self._root, numbers))
         except (ArithmeticError, ValueError) as error:
             raise ValueError(f"{failure}: {error}") from error
         if not math.isfinite(result):
-            raise ValueError(f"{failure}: it comes to {result}")
+            raise ValueError(f"{failure}: the result is {result}")
         return result
 
 
 @lru_cache(maxsize=1024)
 def formula(text: str) -> Formula:
-    """Parse a formula. Raises ValueError where its text is not one."""
+    """Parse a formula. Raises ValueError if the text is not a formula."""
     if len(text) > MAX_LENGTH:
         raise ValueError(f"a formula has at most {MAX_LENGTH} characters, not {len(text)}")
     try:
-        with warnings.catch_warnings():  # the parser warns of unusual texts
+        with warnings.catch_warnings():  # the parser warns about unusual texts
             warnings.simplefilter("ignore")
             root = ast.parse(text.strip(), mode="eval").body
         names = dict.fromkeys(_list_names(root))
@@ -96,7 +96,7 @@ def formula(text: str) -> Formula:
 
 
 def _list_names(node: ast.expr) -> list[str]:
-    """Paths of the parameters below a node. Raises ValueError for syntax that formulas do not have."""
+    """Paths of the parameters below a node. Raises ValueError for syntax that formulas do not support."""
     match node:
         case ast.Constant(value=value) if type(value) in (int, float):
             return []
@@ -110,11 +110,11 @@ def _list_names(node: ast.expr) -> list[str]:
         case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]):
             _, minimum, maximum = _FUNCTIONS.get(name, (None, 0, 0))
             if not maximum:
-                known = sorted(_FUNCTIONS)
-                raise ValueError(f"unknown function '{name}'{near_match(name, known)}; allowed: {', '.join(known)}")
+                allowed = sorted(_FUNCTIONS)
+                raise ValueError(f"unknown function '{name}'{near_match(name, allowed)}; allowed: {', '.join(allowed)}")
             if not minimum <= len(arguments) <= maximum:
-                takes = str(minimum) if minimum == maximum else f"{minimum} to {maximum}"
-                raise ValueError(f"{name} takes {takes} arguments, not {len(arguments)}")
+                accepted = str(minimum) if minimum == maximum else f"{minimum} to {maximum}"
+                raise ValueError(f"{name} takes {accepted} arguments, not {len(arguments)}")
             return [path for argument in arguments for path in _list_names(argument)]
     raise ValueError("allowed: numbers, names of parameters, + - * / **, parentheses and functions")
 
@@ -127,7 +127,7 @@ def _format_path(node: ast.expr) -> str:
             return f"{_format_path(table)}.{name}"
         case ast.Subscript(value=table, slice=ast.Constant(value=int(index))) if type(index) is int:
             return f"{_format_path(table)}.{index}"
-    raise ValueError("a parameter is named as in wind.east_m_s or heights_m[1]")
+    raise ValueError("a parameter name has the form wind.east_m_s or heights_m[1]")
 
 
 def _evaluate(node: ast.expr, numbers: Mapping[str, float]) -> float:
@@ -144,18 +144,18 @@ def _evaluate(node: ast.expr, numbers: Mapping[str, float]) -> float:
     return _CONSTANTS[path] if path in _CONSTANTS else numbers[path]
 
 
-#: Tail probability left out on either side when a distribution is checked against the range that a parameter allows.
+#: Tail probability omitted on either side when a distribution is checked against a parameter's allowed range.
 TAIL = 1e-12
 
 
 class Dispersion(Parameters, ABC):
-    """Fields that every dispersion has: its distribution, and the source of it.
+    """Fields of every dispersion: its distribution, and the source.
 
     `unit` and `description` default to those of the parameter (the suffix of its name, its description in the
     scenario).
     """
 
-    #: Whether the distribution has a density, so that ranks can be correlated.
+    #: Whether the distribution has a density; only then can its ranks be correlated.
     continuous: ClassVar[bool] = False
     #: Fields that hold texts or literal values, never formulas.
     _literals: ClassVar[set[str]] = {"distribution", "unit", "description", "source", "values", "value"}
@@ -169,100 +169,100 @@ class Dispersion(Parameters, ABC):
         """Value below which a draw falls with this probability, 0 < probability < 1."""
 
     def bounds(self) -> tuple[float, float] | None:
-        """Range of all values, infinite where unbounded; None where values are no numbers or depend on formulas."""
+        """Range of all values, infinite if unbounded; None if values are not numbers or depend on formulas."""
         return None
 
     def extremes(self) -> tuple[Any, ...]:
-        """Values to be checked against the range that the parameter allows."""
+        """Values to be checked against the parameter's allowed range."""
         return self.quantile(TAIL), self.quantile(1.0 - TAIL)
 
     @cached_property
     def formulas(self) -> Mapping[tuple[str | int, ...], Formula]:
-        """Formulas in place of numbers, by their keys."""
+        """Formulas used as numbers, by their keys."""
         return dict(_find_formulas(self.model_dump(mode="json", exclude=self._literals)))
 
     @property
     def names(self) -> tuple[str, ...]:
         """Paths of the parameters on which the distribution depends, each once."""
-        return tuple(dict.fromkeys(name for one in self.formulas.values() for name in one.names))
+        return tuple(dict.fromkeys(name for item in self.formulas.values() for name in item.names))
 
     def insert_values(self, values: Mapping[str, Any]) -> Self:
-        """Return the distribution for values of the parameters that its formulas name.
+        """Return the distribution for given values of the parameters in its formulas.
 
-        Raises ValueError where a formula has no value, limits are in the wrong order, or a width is not positive.
+        Raises ValueError if a formula is undefined, limits are in the wrong order, or a width is not positive.
         """
         if not self.formulas:
             return self
-        stated = self.model_dump(mode="json")
-        for key, one in self.formulas.items():
-            table: Any = stated
+        fields = self.model_dump(mode="json")
+        for key, expression in self.formulas.items():
+            table: Any = fields
             for part in key[:-1]:
                 table = table[part]
-            table[key[-1]] = one.value(values)
-        return type(self).model_validate(stated)
+            table[key[-1]] = expression.value(values)
+        return type(self).model_validate(fields)
 
     def describe(self) -> str:
         """Distribution and its parameters in one line."""
-        stated = self.model_dump(exclude={"distribution", "unit", "description", "source"}, exclude_none=True)
+        fields = self.model_dump(exclude={"distribution", "unit", "description", "source"}, exclude_none=True)
         texts = []
-        for name, value in stated.items():
+        for name, value in fields.items():
             text = str(value)
             if isinstance(value, list | tuple):
-                listed = ", ".join(str(one) for one in value)
-                is_short = len(value) <= 2 or len(listed) <= 60
-                text = f"[{listed}]" if is_short else f"[{value[0]}, ... {len(value)} in all]"
+                values_text = ", ".join(str(item) for item in value)
+                is_short = len(value) <= 2 or len(values_text) <= 60
+                text = f"[{values_text}]" if is_short else f"[{value[0]}, ... {len(value)} in all]"
             texts.append(f"{name}={text}")
         return f"{getattr(self, 'distribution', '?')}({', '.join(texts)})"
 
 
-def _find_formulas(stated: Any, key: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Formula]]:
-    if isinstance(stated, str):
-        yield key, formula(stated)
+def _find_formulas(tree: Any, key: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Formula]]:
+    if isinstance(tree, str):
+        yield key, formula(tree)
         return
-    inner = stated.items() if isinstance(stated, Mapping) else enumerate(stated) if isinstance(stated, list) else ()
+    inner = tree.items() if isinstance(tree, Mapping) else enumerate(tree) if isinstance(tree, list) else ()
     for part, value in inner:
         yield from _find_formulas(value, (*key, part))
 
 
-def _check_number(stated: Any) -> float | str:
-    if isinstance(stated, str):
-        return formula(stated).text
-    if isinstance(stated, bool) or not isinstance(stated, int | float):
+def _check_number(value: Any) -> float | str:
+    if isinstance(value, str):
+        return formula(value).text
+    if isinstance(value, bool) or not isinstance(value, int | float):
         raise PydanticKnownError("float_type")
-    if not abs(stated) < math.inf:
+    if not abs(value) < math.inf:
         raise PydanticKnownError("finite_number")
     try:
-        return float(stated)
+        return float(value)
     except OverflowError:
         raise PydanticKnownError("finite_number") from None
 
 
-def _check_positive_number(stated: Any) -> float | str:
-    number = _check_number(stated)
+def _check_positive_number(value: Any) -> float | str:
+    number = _check_number(value)
     if isinstance(number, float) and not number > 0.0:
         raise PydanticKnownError("greater_than", {"gt": 0})
     return number
 
 
-def _check_whole_number(stated: Any) -> int | str:
-    """Whole number that a float represents exactly, or the text of a formula."""
-    if isinstance(stated, str):
-        return formula(stated).text
-    if type(stated) is not int:
+def _check_whole_number(value: Any) -> int | str:
+    """Integer that a float represents exactly, or the text of a formula."""
+    if isinstance(value, str):
+        return formula(value).text
+    if type(value) is not int:
         raise PydanticKnownError("int_type")
-    if abs(stated) > 2**52:
-        raise ValueError(f"must lie between -2**52 and 2**52, got {stated}")
-    return stated
+    if abs(value) > 2**52:
+        raise ValueError(f"must lie between -2**52 and 2**52, got {value}")
+    return value
 
 
-def _check_literal(stated: Any) -> Any:
-    """Value without formulas; numbers in it must be finite, since result files cannot hold others."""
-    tables = stated.values() if isinstance(stated, Mapping) else stated if isinstance(stated, list | tuple) else ()
-    for inner in tables:
+def _check_literal(value: Any) -> Any:
+    """Value without formulas; numbers in it must be finite, because result files cannot store other numbers."""
+    items = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ()
+    for inner in items:
         _check_literal(inner)
-    if isinstance(stated, float) and not math.isfinite(stated):
+    if isinstance(value, float) and not math.isfinite(value):
         raise PydanticKnownError("finite_number")
-    return stated
+    return value
 
 
 Number = Annotated[float | str, PlainValidator(_check_number)]
@@ -274,7 +274,7 @@ Weight = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)]
 
 
 def read_interval(low: float | str, high: float | str) -> tuple[float, float] | None:
-    """Limits as numbers; None where one of them is a formula."""
+    """Limits as numbers; None if one of them is a formula."""
     return None if isinstance(low, str) or isinstance(high, str) else (float(low), float(high))
 
 
@@ -282,7 +282,7 @@ def read_interval(low: float | str, high: float | str) -> tuple[float, float] | 
 class Shape:
     """A distribution of one variable.
 
-    evaluate: value of its function `cdf` or `sf` (survival function), or of their inverses `ppf` and `isf`, by name.
+    evaluate: value of the function `cdf` or `sf` (survival function), or of an inverse, `ppf` or `isf`, by name.
     support: minimum and maximum.
     """
 
@@ -297,7 +297,7 @@ _NORMAL_FUNCTIONS: Mapping[str, Callable[[float], Any]] = {
     "ppf": ndtri,
     "isf": lambda q: -ndtri(q),
 }
-#: Standard normal distribution without importing `scipy.stats`, which takes a second.
+#: Standard normal distribution; avoids the import of `scipy.stats`, which takes a second.
 STANDARD_NORMAL = Shape(lambda function, x: float(_NORMAL_FUNCTIONS[function](x)))
 
 
@@ -310,12 +310,12 @@ def scipy_distributions() -> Mapping[str, bool]:
     from scipy import stats
 
     kinds = ((name, getattr(stats, name)) for name in dir(stats) if name != "uniform")
-    known = (stats.rv_continuous, stats.rv_discrete)
-    return {name: isinstance(kind, stats.rv_discrete) for name, kind in kinds if isinstance(kind, known)}
+    accepted = (stats.rv_continuous, stats.rv_discrete)
+    return {name: isinstance(kind, stats.rv_discrete) for name, kind in kinds if isinstance(kind, accepted)}
 
 
 def scipy_parameters(distribution: str) -> tuple[list[str], list[str]]:
-    """Parameters that a distribution of `scipy.stats` requires, and all that it accepts."""
+    """Parameters that a distribution of `scipy.stats` requires, and all parameters that it accepts."""
     from scipy import stats
 
     shapes = getattr(stats, distribution).shapes
@@ -326,42 +326,41 @@ def scipy_parameters(distribution: str) -> tuple[list[str], list[str]]:
 def scipy_shape(distribution: str, parameters: Mapping[str, float]) -> Shape:
     """Distribution of `scipy.stats` with given parameters.
 
-    Raises ValueError where it is not defined for them, now or when it is evaluated.
+    Raises ValueError if it is not defined for them, now or when it is evaluated.
     """
     from scipy import stats
 
-    where = f"{distribution} is not defined for {', '.join(f'{key} = {one}' for key, one in parameters.items())}"
+    failure = f"{distribution} is not defined for {', '.join(f'{key} = {value}' for key, value in parameters.items())}"
 
     def call(function: Callable[[], Any]) -> Any:
-        # without SciPy's warnings: an invalid result is NaN
+        # SciPy's warnings are suppressed: an invalid result is NaN
         try:
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 return function()
         except (ArithmeticError, TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(f"{where}: {error}") from error
+            raise ValueError(f"{failure}: {error}") from error
 
     def evaluate(function: str, x: float) -> float:
         result = call(lambda: float(getattr(frozen, function)(x)))
         if math.isnan(result):
-            raise ValueError(f"{where}: its {function} of {x} is not a number")
+            raise ValueError(f"{failure}: its {function} at {x} is not a number")
         return float(result)
 
     frozen = call(lambda: getattr(stats, distribution)(**parameters))
-    low, high = call(lambda: [float(one) for one in frozen.support()])
+    low, high = call(lambda: [float(limit) for limit in frozen.support()])
     if not low <= high:
-        raise ValueError(where)
+        raise ValueError(failure)
     return Shape(evaluate, (low, high), scipy_distributions()[distribution])
 
 
 def truncated_quantile(shape: Shape, limits: tuple[float, float] | None, probability: float) -> float | int:
-    """Quantile of a distribution truncated to `limits`, evaluated in the tail that keeps its digits.
+    """Quantile of a distribution truncated to `limits`, evaluated in the tail that preserves precision.
 
-    The inverse of F truncated to [a, b] is F^-1(F(a) + p (F(b) - F(a))). Where a lies above the median, the survival
-    function replaces F, since its small values keep digits that 1 - F loses. Limits of discrete distributions are
-    included.
+    The inverse of F truncated to [a, b] is F^-1(F(a) + p (F(b) - F(a))). If a exceeds the median, the survival function
+    replaces F, since its small values retain digits that 1 - F loses. Limits of discrete distributions are included.
 
-    Raises ValueError where the limits are in the wrong order or have no probability between them.
+    Raises ValueError if the limits are in the wrong order or the probability between them is zero.
     """
     low, high = shape.support if limits is None else limits
     if limits is None:
@@ -371,18 +370,18 @@ def truncated_quantile(shape: Shape, limits: tuple[float, float] | None, probabi
         value = shape.evaluate(inverse, at_low + probability * (at_high - at_low))
     value = min(max(value, low), high)
     if shape.is_discrete and not math.isfinite(value):
-        raise ValueError(f"the distribution reaches {value}")
+        raise ValueError(f"the distribution includes {value}")
     return round(value) if shape.is_discrete else value
 
 
 @lru_cache(maxsize=1024)
 def _find_truncated_inverse(shape: Shape, low: float, high: float) -> tuple[str, float, float]:
-    """Name of the inverse function that keeps its digits between two limits, and its arguments at them."""
+    """Name of the inverse function that preserves precision between two limits, and its arguments at the limits."""
     if not (low <= high if shape.is_discrete else low < high):
         raise ValueError(f"truncate = [{low}, {high}]: the first limit must be below the second")
-    below = math.ceil(low) - 1.0 if shape.is_discrete else low
-    function, inverse = ("sf", "isf") if shape.evaluate("cdf", below) > 0.5 else ("cdf", "ppf")
-    at_low, at_high = shape.evaluate(function, below), shape.evaluate(function, high)
+    start = math.ceil(low) - 1.0 if shape.is_discrete else low
+    function, inverse = ("sf", "isf") if shape.evaluate("cdf", start) > 0.5 else ("cdf", "ppf")
+    at_low, at_high = shape.evaluate(function, start), shape.evaluate(function, high)
     if not abs(at_high - at_low) > 0.0:
         raise ValueError(f"truncate = [{low}, {high}]: the distribution has no probability between the limits")
     return inverse, at_low, at_high

@@ -1,4 +1,4 @@
-# ruff: noqa: D102  (the methods are described in `Dispersion`)
+# ruff: noqa: D102  (the base class `Dispersion` describes the methods)
 """Dispersions of a campaign file: the built-in ones by name, others by their names in `scipy.stats`."""
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ def _check_range(low: float, high: float) -> None:
     if not low < high:
         raise ValueError(f"low = {low} must be below high = {high}")
     if not math.isfinite(high - low):
-        raise ValueError(f"from low = {low} to high = {high} is too far")
+        raise ValueError(f"the range from low = {low} to high = {high} is too large")
 
 
 class _Levels(base.Dispersion):
-    """A dispersion over listed values, its `points`, in order."""
+    """A dispersion over an ordered list of values, its `points`."""
 
     @property
     def points(self) -> Sequence[Any]:
@@ -50,7 +50,7 @@ class _Levels(base.Dispersion):
 class Choice(_Levels):
     """One of `values`, with equal probabilities or in proportion to `weights`, which need not sum to one.
 
-    If the parameter is a table, each value is a whole table; keys that it does not set keep their defaults.
+    If the parameter is a table, each value is a complete table; keys without a value keep their defaults.
     """
 
     distribution: Literal["choice"]
@@ -60,7 +60,7 @@ class Choice(_Levels):
     @model_validator(mode="after")
     def _check_weights(self) -> Self:
         if self.weights is not None and len(self.weights) != len(self.values):
-            raise ValueError(f"{len(self.weights)} weights for {len(self.values)} values; give one for each value")
+            raise ValueError(f"{len(self.weights)} weights for {len(self.values)} values; expected one per value")
         if not math.isfinite(self._cumulative[-1]):
             raise ValueError("the weights are too large to be summed")
         return self
@@ -119,18 +119,18 @@ class Grid(_Levels):
     step: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0.0)] | None = None
 
     @model_validator(mode="after")
-    def _check_statement(self) -> Self:
-        given = {name for name in ("values", "low", "high", "levels", "step") if getattr(self, name) is not None}
-        if given not in ({"values"}, {"low", "high", "levels"}, {"low", "high", "step"}):
-            listed = ", ".join(sorted(given)) or "none of them"
-            raise ValueError(f"a grid takes values, or low, high and levels, or low, high and step; got {listed}")
+    def _check_keys(self) -> Self:
+        keys = {name for name in ("values", "low", "high", "levels", "step") if getattr(self, name) is not None}
+        if keys not in ({"values"}, {"low", "high", "levels"}, {"low", "high", "step"}):
+            keys_text = ", ".join(sorted(keys)) or "none of these"
+            raise ValueError(f"a grid needs values, or low, high and levels, or low, high and step; got {keys_text}")
         if self.low is not None and self.high is not None:
             _check_range(self.low, self.high)
         if self.step is not None:
-            steps = (self.high - self.low) / self.step  # type: ignore[operator]  # both are given, see above
+            steps = (self.high - self.low) / self.step  # type: ignore[operator]  # both are set, see above
             if not 0.5 <= steps < MAX_LEVELS or abs(steps - round(steps)) > 1e-6:
-                divided = f"the range from {self.low} to {self.high} into 1 to {MAX_LEVELS - 1} whole steps"
-                raise ValueError(f"step = {self.step} does not divide {divided}")
+                required = f"the range from {self.low} to {self.high} into 1 to {MAX_LEVELS - 1} whole steps"
+                raise ValueError(f"step = {self.step} does not divide {required}")
         return self
 
     @cached_property
@@ -170,9 +170,9 @@ class Uniform(base.Dispersion):
 
 
 class Normal(base.Dispersion):
-    """Normal distribution with mean `mean` and standard deviation `sd`, truncated to `truncate` where given.
+    """Normal distribution with mean `mean` and standard deviation `sd`, truncated to `truncate` if given.
 
-    `sd` is omitted where a group states a covariance (`marsyard.campaigns.sampling.design`), and nowhere else.
+    `sd` is omitted if a group defines a covariance (`marsyard.campaigns.sampling.design`), and nowhere else.
     """
 
     continuous = True
@@ -198,15 +198,13 @@ class Normal(base.Dispersion):
     @property
     def _sd(self) -> float:
         if self.sd is None:
-            raise ValueError("the standard deviation is stated by a group's covariance only")
+            raise ValueError("the standard deviation is defined by a group's covariance only")
         return float(self.sd)
 
     def quantile(self, probability: float) -> float:
         standard = base.truncated_quantile(base.STANDARD_NORMAL, self._standard_limits, probability)
         value = float(self.mean) + self._sd * standard
-        if self.truncate is None:
-            return value
-        return min(max(value, float(self.truncate[0])), float(self.truncate[1]))
+        return value if self.truncate is None else min(max(value, float(self.truncate[0])), float(self.truncate[1]))
 
     def bounds(self) -> tuple[float, float] | None:
         return (-math.inf, math.inf) if self.truncate is None else base.read_interval(*self.truncate)
@@ -220,11 +218,11 @@ class _WholeNumbers(base.Dispersion):
 
     @model_validator(mode="before")
     @classmethod
-    def _convert_whole_floats(cls, stated: Any) -> Any:
-        if not isinstance(stated, Mapping):
-            return stated
-        floats = {key: stated[key] for key in ("low", "high") if isinstance(stated.get(key), float)}
-        return {**stated, **{key: int(value) for key, value in floats.items() if value.is_integer()}}
+    def _convert_whole_floats(cls, values: Any) -> Any:
+        if not isinstance(values, Mapping):
+            return values
+        floats = {key: values[key] for key in ("low", "high") if isinstance(values.get(key), float)}
+        return {**values, **{key: int(value) for key, value in floats.items() if value.is_integer()}}
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
@@ -247,22 +245,22 @@ class Integer(_WholeNumbers):
 
 
 class InTurn(_WholeNumbers):
-    """The whole numbers from `low` to `high`, both included, one case after the other, then from `low` again.
+    """The whole numbers from `low` to `high`, both included, in sequence over the cases, then from `low` again.
 
-    No number repeats before all have occurred: a campaign visits as many terrains as possible. If the number only
+    No number repeats before all have occurred: a campaign uses as many terrains as possible. If the number only
     selects one of many independent terrains, cases with different numbers are independent.
     """
 
     distribution: Literal["in-turn"]
 
     def value(self, case: int) -> int:
-        """Number that a case takes."""
+        """Number of a case."""
         low, high = int(self.low), int(self.high)
         return low + case % (high - low + 1)
 
 
 class Scipy(base.Dispersion):
-    """A distribution of `scipy.stats` by its name, with its parameters, truncated to `truncate` where given.
+    """A distribution of `scipy.stats` by its name, with its parameters, truncated to `truncate` if given.
 
     Discrete distributions (`poisson`, `binom`, ...) give whole numbers; their limits are included.
     """
@@ -279,18 +277,18 @@ class Scipy(base.Dispersion):
         names = base.scipy_distributions()
         if name not in names:
             hint = near_match(name, [*BUILT_IN, *names])
-            others = "a distribution of one variable of scipy.stats by its name there (norm, beta, poisson, ...)"
-            raise ValueError(f"unknown distribution '{name}'{hint}; allowed: {', '.join(BUILT_IN)}, or {others}")
+            alternative = "a univariate distribution of scipy.stats by its name (norm, beta, poisson, ...)"
+            raise ValueError(f"unknown distribution '{name}'{hint}; allowed: {', '.join(BUILT_IN)}, or {alternative}")
         return name
 
     @model_validator(mode="after")
     def _check_parameters(self) -> Self:
-        given = self.__pydantic_extra__ or {}
+        values = self.__pydantic_extra__ or {}
         required, allowed = base.scipy_parameters(self.distribution)
-        problems = [f"unknown parameter '{name}'{near_match(name, allowed)}" for name in given if name not in allowed]
-        problems += [f"parameter '{name}' is missing" for name in required if name not in given]
+        problems = [f"unknown parameter '{name}'{near_match(name, allowed)}" for name in values if name not in allowed]
+        problems += [f"parameter '{name}' is missing" for name in required if name not in values]
         if problems:
-            raise ValueError(f"{', '.join(problems)}; {self.distribution} takes {', '.join(allowed)}")
+            raise ValueError(f"{', '.join(problems)}; {self.distribution} accepts {', '.join(allowed)}")
         if not self.formulas:
             self.quantile(0.5)
         return self
@@ -328,14 +326,14 @@ _Dispersion = (
     | Annotated[Grid, Tag("grid")]
     | Annotated[Scipy, Tag("scipy")]
 )
-#: Distributions with names and parameters of their own; any other name is looked up in `scipy.stats`.
+#: Distributions implemented in this module; any other name is looked up in `scipy.stats`.
 BUILT_IN: Mapping[str, type[base.Dispersion]] = {
     tag.tag: kind for kind, tag in map(get_args, get_args(_Dispersion)) if kind is not Scipy
 }
 
 
-def _select_tag(stated: Any) -> str:
-    name = stated.get("distribution") if isinstance(stated, Mapping) else getattr(stated, "distribution", None)
+def _select_tag(value: Any) -> str:
+    name = value.get("distribution") if isinstance(value, Mapping) else getattr(value, "distribution", None)
     return name if isinstance(name, str) and name in BUILT_IN else "scipy"
 
 

@@ -1,4 +1,4 @@
-"""Products of cases: which cases keep them, and their files: arrays in `products.npz`, all else in `products.json`."""
+"""Products of cases: selection of the kept ones, and files: arrays in `products.npz`, other data in `products.json`."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from zipfile import BadZipFile
 import numpy as np
 
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Requirement
-from marsyard.campaigns.errors import UNFINISHED, StoreError, report_write_errors
+from marsyard.campaigns.errors import ENGINE_FAILURES, StoreError, report_write_errors
 
-#: Key in `products.json` that replaces an array by its name in `products.npz`.
+#: Key in `products.json` that represents an array by its name in `products.npz`.
 _ARRAY = "__array__"
 _OUTLINE = "products.json"
 
 
 @dataclass(frozen=True)
 class PackedProducts:
-    """Products of a case as the bytes of their two files."""
+    """Products of a case as the contents of their two files."""
 
     outline: bytes
     arrays: bytes
@@ -37,10 +37,9 @@ class PackedProducts:
 
 
 def pack_products(products: Mapping[str, Any]) -> PackedProducts:
-    """Pack products into bytes, so that a worker compresses them and another process writes them.
+    """Pack products into bytes: a worker compresses them, and another process writes them.
 
-    Raises TypeError where a product is neither an array, a text, a number, a boolean, None, nor a table or list of
-    these.
+    Raises TypeError if a product is neither an array, a text, a number, a boolean, None, nor a table or list of these.
     """
     arrays: dict[str, np.ndarray] = {}
     text = json.dumps(_move_arrays(products, "products", arrays), indent=2) + "\n"
@@ -50,16 +49,16 @@ def pack_products(products: Mapping[str, Any]) -> PackedProducts:
 
 
 def save_packed(directory: Path, packed: PackedProducts, row: Mapping[str, Any]) -> None:
-    """Write packed products and their case's row into a folder, in place of existing ones.
+    """Write packed products and the row of their case into a folder; existing files are replaced.
 
-    Raises StoreError where the folder cannot be written; its files then stay as they are.
+    Raises StoreError if the folder is not writable; its files then remain unchanged.
     """
     with replace_files(directory) as folder:
         write_packed(folder, packed, row)
 
 
 def write_packed(folder: Path, packed: PackedProducts, row: Mapping[str, Any]) -> None:
-    """Write packed products and their case's row into an existing folder. Raises OSError where that fails."""
+    """Write packed products and the row of their case into an existing folder. Raises OSError on failure."""
     (folder / "row.json").write_text(json.dumps(dict(row), indent=2) + "\n", encoding="utf-8")
     (folder / "products.npz").write_bytes(packed.arrays)
     (folder / _OUTLINE).write_bytes(packed.outline)
@@ -69,14 +68,14 @@ def write_packed(folder: Path, packed: PackedProducts, row: Mapping[str, Any]) -
 def replace_files(directory: Path) -> Iterator[Path]:
     """Temporary folder whose files replace those in `directory` at the end; after an exception nothing is replaced.
 
-    Raises StoreError where the folder cannot be written.
+    Raises StoreError if the folder is not writable.
     """
     with report_write_errors(directory):
         directory.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=directory, prefix=".partial-") as name:
             folder = Path(name)
             yield folder
-            # the outline last: it marks a folder as complete
+            # the outline is moved last: it marks a folder as complete
             for path in sorted(folder.rglob("*"), key=lambda path: (path == folder / _OUTLINE, path)):
                 target = directory / path.relative_to(folder)
                 if path.is_dir():
@@ -86,18 +85,18 @@ def replace_files(directory: Path) -> Iterator[Path]:
 
 
 def unpack_products(packed: PackedProducts) -> dict[str, Any]:
-    """Products that were packed; tuples become lists."""
+    """Unpack products; tuples become lists."""
     with np.load(io.BytesIO(packed.arrays), allow_pickle=False) as arrays:
 
         def insert_array(table: dict[str, Any]) -> Any:
             return arrays[table[_ARRAY]] if set(table) == {_ARRAY} else table
 
-        filled: dict[str, Any] = json.loads(packed.outline, object_hook=insert_array)
-    return filled
+        products: dict[str, Any] = json.loads(packed.outline, object_hook=insert_array)
+    return products
 
 
 def _move_arrays(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
-    """Product with its arrays moved to `arrays`."""
+    """Product whose arrays are moved to `arrays` and replaced by references."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, np.ndarray):
@@ -110,22 +109,22 @@ def _move_arrays(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
         return {_ARRAY: name}
     if isinstance(value, Mapping):
         if _ARRAY in value:
-            raise TypeError(f"{path} has a key {_ARRAY}, which is taken")
+            raise TypeError(f"{path} has a key {_ARRAY}, which is reserved")
         return {str(name): _move_arrays(inner, f"{path}.{name}", arrays) for name, inner in value.items()}
     if isinstance(value, list | tuple):
         return [_move_arrays(inner, f"{path}.{index}", arrays) for index, inner in enumerate(value)]
     if value is None or isinstance(value, str | int | float | bool):
         return value
-    raise TypeError(f"{path} is a {type(value).__name__}; allowed: arrays, texts, numbers, tables and lists of those")
+    raise TypeError(f"{path} is a {type(value).__name__}; allowed: arrays, texts, numbers, tables and lists of these")
 
 
 def load_products(directory: Path) -> dict[str, Any]:
-    """Products that were saved into a folder; tuples become lists. Raises StoreError where it holds none."""
+    """Products saved in a folder; tuples become lists. Raises StoreError if there are none."""
     try:
         files = [(directory / name).read_bytes() for name in (_OUTLINE, "products.npz")]
         return unpack_products(PackedProducts(*files))
     except (OSError, ValueError, KeyError, BadZipFile) as error:
-        raise StoreError(f"{directory} holds no products of a case: {error}") from error
+        raise StoreError(f"{directory} contains no products of a case: {error}") from error
 
 
 #: Folder of the kept products, with a folder for each case.
@@ -139,9 +138,9 @@ def case_directory(directory: Path, case: int) -> Path:
 
 @dataclass(frozen=True)
 class Keep:
-    """Selection of rows whose products a worker returns.
+    """Selection of cases whose products a worker returns.
 
-    every: step between numbers of kept cases; 0 for none by their number.
+    every: step between the numbers of kept cases; 0 to keep none by number.
     failed: requirements; a case that fails any of them is kept.
     """
 
@@ -159,7 +158,7 @@ KEEP_ALL = Keep(every=1)
 
 
 def select_kept_cases(configuration: CampaignConfiguration) -> Keep:
-    """Selection while a campaign runs; the worst cases are run again at its end."""
+    """Selection during the campaign; the worst cases are run again at its end."""
     retain = configuration.retain
     if retain.products == "all":
         return KEEP_ALL
@@ -169,11 +168,12 @@ def select_kept_cases(configuration: CampaignConfiguration) -> Keep:
 
 
 def fails(row: Mapping[str, Any], requirement: Requirement) -> bool:
-    """Whether a row fails a requirement; an unfinished case does in every population that may contain it."""
-    unfinished = row["outcome"] in UNFINISHED
-    known = {"all": True, "completed": not unfinished, "valid": row["answered"]}
-    parts = [known[part] if part in known else row.get(part) for part in requirement.population.split(" and ")]
-    if any(part is False for part in parts):
+    """Whether a row fails a requirement; an unfinished case fails in every population that may contain it."""
+    unfinished = row["outcome"] in ENGINE_FAILURES
+    memberships = {"all": True, "completed": not unfinished, "valid": row["answered"]}
+    populations = requirement.population.split(" and ")
+    parts = [memberships[name] if name in memberships else row.get(name) for name in populations]
+    if any(value is False for value in parts):
         return False
     if None in parts or unfinished:
         return True
@@ -191,17 +191,17 @@ class ProductStore:
     def __init__(self, directory: Path, budget_gb: float) -> None:
         self._directory = directory
         used = sum(path.stat().st_size for path in (directory / CASES_FOLDER).rglob("*") if path.is_file())
-        self._left = budget_gb * 1e9 - used
+        self._free_bytes = budget_gb * 1e9 - used
         self.full = False
 
     def save(self, case: int, packed: PackedProducts, row: Mapping[str, Any]) -> bool:
-        """Save a case's products, unless they exceed the budget; from then on none are saved.
+        """Save a case's products unless they exceed the budget; after that, no products are saved.
 
-        Raises StoreError where they cannot be written.
+        Raises StoreError if they cannot be written.
         """
-        self.full = self.full or packed.size > self._left
+        self.full = self.full or packed.size > self._free_bytes
         if self.full:
             return False
-        self._left -= packed.size
+        self._free_bytes -= packed.size
         save_packed(case_directory(self._directory, case), packed, row)
         return True

@@ -1,4 +1,4 @@
-"""Campaign folder: its record `campaign.json` (statements, program, machine, progress) and its lock."""
+"""Campaign folder: its record `campaign.json` (configuration, program, machine, progress) and its lock."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, stored_configuration_now
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, update_stored_configuration
 from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.errors import StoreError, report_write_errors
 from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
@@ -25,7 +25,7 @@ from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
 #: Version of the layout of a campaign's folder.
 SCHEMA = 1
 RECORD_FILE = "campaign.json"
-#: Files of a campaign; a folder with any of them is never used for another one.
+#: Files of a campaign; a folder with any of them is never used for another campaign.
 _CAMPAIGN_FILES = (RECORD_FILE, "cases.parquet", ROWS_FILE, "report.html", "report.json", "cases")
 #: JSON types of the keys of a record that commands read.
 _TYPES: Mapping[str, tuple[type, str]] = {
@@ -42,18 +42,18 @@ def utc_now() -> str:
 
 
 def claim(directory: Path) -> None:
-    """Create a folder for a campaign; a folder of a run that was killed before it wrote its record counts as free.
+    """Create a folder for a campaign; the folder of a run that was killed before it wrote its record counts as free.
 
-    Raises StoreError where it holds a campaign, or cannot be written.
+    Raises StoreError if it contains a campaign or is not writable.
     """
     with report_write_errors(directory):
         try:
             directory.mkdir(parents=True, exist_ok=True)
         except FileExistsError as error:
-            raise StoreError(f"{directory} is taken; choose another folder with --out") from error
-        held = [name for name in _CAMPAIGN_FILES if (directory / name).exists()]
-        if held and (held != [ROWS_FILE] or not is_empty_store(directory / ROWS_FILE)):
-            raise StoreError(f"{directory} already holds a campaign ({held[0]}); choose another folder with --out")
+            raise StoreError(f"{directory} is not a folder; choose another folder with --out") from error
+        campaign_files = [name for name in _CAMPAIGN_FILES if (directory / name).exists()]
+        if campaign_files and (campaign_files != [ROWS_FILE] or not is_empty_store(directory / ROWS_FILE)):
+            raise StoreError(f"{directory} contains a campaign ({campaign_files[0]}); choose another folder with --out")
 
 
 def begin(
@@ -65,13 +65,12 @@ def begin(
     command: Sequence[str] = (),
     algorithms: Sequence[Mapping[str, Any]] = (),
 ) -> None:
-    """Write the record of a campaign that begins.
+    """Write the record of a new campaign.
 
-    executor: description of its workers.
-    command: words of the command that runs it again, from the current folder.
-    algorithms: from `marsyard.campaigns.definition.algorithms.describe_algorithms`.
+    executor: description of its workers. command: words of the command that repeats the campaign, from the current
+    folder. algorithms: see `marsyard.campaigns.definition.identity.describe_algorithms`.
     """
-    stated = configuration.model_dump(mode="json")
+    contents = configuration.model_dump(mode="json")
     write(
         directory,
         {
@@ -85,8 +84,8 @@ def begin(
             "cases_finished": 0,
             "cases_crashed": 0,
             "seed": configuration.seed,
-            "requirements": stated["requirements"],
-            "configuration": stated,
+            "requirements": contents["requirements"],
+            "configuration": contents,
             "identity": asdict(identity),
             "command": {"words": list(command), "folder": str(Path.cwd())} if command else None,
             "algorithms": list(algorithms),
@@ -112,14 +111,14 @@ def describe_session(command: str, executor: str, cases_before: int) -> dict[str
 
 
 def update(directory: Path, changes: Mapping[str, Any]) -> None:
-    """Change keys of a campaign's record, all or none."""
+    """Change keys of a campaign's record atomically."""
     write(directory, {**read(directory), **changes})
 
 
 def write(directory: Path, record: Mapping[str, Any]) -> None:
-    """Write a campaign's record, whole or not at all.
+    """Write a campaign's record atomically.
 
-    Raises StoreError where that fails; the previous record stays.
+    Raises StoreError on failure; the previous record stays.
     """
     path = directory / RECORD_FILE
     partial = path.with_suffix(".partial")
@@ -134,8 +133,8 @@ def write(directory: Path, record: Mapping[str, Any]) -> None:
 def read(directory: Path) -> dict[str, Any]:
     """Read a campaign's record.
 
-    Raises StoreError where the folder holds none, one of another version, or one whose required keys are missing or of
-    another JSON type.
+    Raises StoreError if the folder contains no record, or a record of another version, or one with missing keys or keys
+    of another JSON type.
     """
     path = directory / RECORD_FILE
     if not directory.is_dir():
@@ -143,8 +142,8 @@ def read(directory: Path) -> dict[str, Any]:
     if not path.is_file():
         hint = ""
         if (directory / ROWS_FILE).is_file() and is_empty_store(directory / ROWS_FILE):
-            hint = "; a run was stopped before it began: start it again with --out of this folder"
-        raise StoreError(f"{directory} does not hold a campaign: it has no {RECORD_FILE}{hint}")
+            hint = "; a run was stopped before its first case: start it again with --out of this folder"
+        raise StoreError(f"{directory} does not contain a campaign: it has no {RECORD_FILE}{hint}")
     try:
         record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         schema = record["schema"]
@@ -157,15 +156,15 @@ def read(directory: Path) -> dict[str, Any]:
     # records of versions without an identity lack the other keys as well, and can still be reported
     required = _TYPES if "identity" in record else ("name", "state", "cases", "configuration")
     problems = [f"it has no {key}" for key in required if key not in record]
-    for key, (kind, what) in _TYPES.items():
+    for key, (kind, type_text) in _TYPES.items():
         if key in record and (not isinstance(record[key], kind) or isinstance(record[key], bool)):
-            problems.append(f"{key} is not {what}")
+            problems.append(f"{key} is not {type_text}")
     if not problems and "identity" in record:
         identity, sessions = record["identity"], record["sessions"]
         if not isinstance(identity.get("versions"), dict) or not {"configuration", "code"} <= set(identity):
-            problems.append("identity lacks configuration, code or versions")
+            problems.append("identity has no configuration, code or versions")
         if not sessions or not isinstance(sessions[-1], dict):
-            problems.append("sessions holds none")
+            problems.append("sessions is empty")
     if problems:
         raise StoreError(f"{path} is damaged: {problems[0]}")
     return record
@@ -174,56 +173,56 @@ def read(directory: Path) -> dict[str, Any]:
 def stored_configuration(directory: Path) -> CampaignConfiguration:
     """Configuration of a stored campaign."""
     try:
-        return CampaignConfiguration.model_validate(stored_configuration_now(read(directory)["configuration"]))
+        return CampaignConfiguration.model_validate(update_stored_configuration(read(directory)["configuration"]))
     except (ValueError, KeyError) as error:
         raise StoreError(f"{directory / RECORD_FILE} is damaged: {error}") from error
 
 
 def git_commit() -> str | None:
-    """Commit of the checked-out program, with ``+changes`` if files were edited; None where unknown."""
+    """Commit of the checked-out program, with ``+changes`` if files were edited; None if unknown."""
     git, source = shutil.which("git"), Path(__file__).resolve()
-    answers = []
+    outputs = []
     commands = (["rev-parse", "HEAD"], ["ls-files", source.name], ["status", "--porcelain", "--untracked-files=no"])
     try:
-        for words in commands if git is not None else ():
-            command = [str(git), "-C", str(source.parent), *words]
-            done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603
-            answers.append(done.stdout.strip())
+        for arguments in commands if git is not None else ():
+            command = [str(git), "-C", str(source.parent), *arguments]
+            completed = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603
+            outputs.append(completed.stdout.strip())
     except (subprocess.SubprocessError, OSError):
         return None
-    if git is None or not answers[1]:
+    if git is None or not outputs[1]:
         return None
-    commit, _, edited = answers
+    commit, _, edited = outputs
     return f"{commit}+changes" if edited else commit
 
 
 def describe_machine() -> dict[str, Any]:
-    """Python, platform and processor with a hash of its features: rows are equal bit for bit where these are equal."""
+    """Python, platform and processor with a hash of its features: rows are equal bit for bit if these are equal."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:
         text = ""
     model = re.search(r"^(?:model name|CPU part)\s*:\s*(.*)$", text, re.MULTILINE)
     features = re.search(r"^(?:flags|Features)\s*:\s*(.*)$", text, re.MULTILINE)
-    listed = " ".join(sorted(features[1].split())) if features else ""
+    sorted_features = " ".join(sorted(features[1].split())) if features else ""
     return {
         "python": platform.python_version(),
         "implementation": platform.python_implementation(),
         "platform": platform.platform(),
         "machine": platform.machine(),
         "processor": model[1] if model else platform.processor(),
-        "processor_features": hashlib.sha256(listed.encode()).hexdigest()[:16] if listed else None,
+        "processor_features": hashlib.sha256(sorted_features.encode()).hexdigest()[:16] if sorted_features else None,
         "variables": {name: value for name, value in sorted(os.environ.items()) if name.startswith("MARSYARD_")},
     }
 
 
-#: Locked by the process that works in the folder; the kernel releases the lock when the process ends.
+#: Lock file of the process that works in the folder; the kernel releases the lock when the process ends.
 _LOCK_FILE = "campaign.lock"
 
 
 @contextmanager
 def folder_lock(directory: Path) -> Iterator[None]:
-    """Lock a campaign's folder. Raises StoreError where another process holds it, or the folder cannot be written."""
+    """Lock a campaign's folder. Raises StoreError if another process holds the lock, or the folder is not writable."""
     path = directory / _LOCK_FILE
     with report_write_errors(directory):
         file = path.open("a+", encoding="utf-8")
@@ -233,8 +232,8 @@ def folder_lock(directory: Path) -> Iterator[None]:
         except OSError as error:
             file.seek(0)
             holder = file.read().strip() or "another process"
-            raise StoreError(f"{directory} is in use: {holder} works in it; wait for it, or end it") from error
-        # only for messages of other processes, so a full disk is ignored here
+            raise StoreError(f"{directory} is in use: {holder} works in it; wait until it ends, or stop it") from error
+        # the text serves only messages of other processes, so a full disk is ignored
         with suppress(OSError):
             file.truncate(0)
             file.write(f"process {os.getpid()} on {platform.node()}\n")

@@ -1,10 +1,10 @@
 """Rows of a campaign, stored while it runs: one SQLite file, written by one process.
 
-The Parquet table can always be rebuilt from this file. A row is a JSON list of values; its column names are stored once
-per layout.
+The Parquet table can always be rebuilt from this file. A row is a JSON list of values; the column names are stored
+once per layout.
 
 Durability: the journal is a write-ahead log with `synchronous = FULL`. A committed transaction survives a killed
-program, and a power failure as far as the disk honours `fsync`. That costs one `fsync` per batch, some milliseconds for
+program, and also a power failure if the disk honours `fsync`. That takes one `fsync` per batch, some milliseconds for
 a second of work.
 """
 
@@ -21,7 +21,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.errors import UNFINISHED, StoreError
+from marsyard.campaigns.errors import ENGINE_FAILURES, StoreError
 from marsyard.scenarios.interface import Scalar
 
 ROWS_FILE = "cases.sqlite"
@@ -45,7 +45,7 @@ COMMIT;
 
 
 def create_store(path: Path, about: Mapping[str, str]) -> None:
-    """Create an empty store, whole or not at all; `about` identifies the campaign of its rows."""
+    """Create an empty store atomically; `about` identifies the campaign of its rows."""
     partial = path.with_name(f"{path.name}.partial")
     try:
         partial.unlink(missing_ok=True)
@@ -63,15 +63,14 @@ def create_store(path: Path, about: Mapping[str, str]) -> None:
 class RowStore(AbstractContextManager["RowStore"]):
     """Rows of a campaign, as a context.
 
-    path: a file made by `create_store`.
-    thorough: check every page first, as required before more is written.
-    Raises StoreError where the file is missing, damaged, or of another version; nothing is written to it then.
+    path: a file created by `create_store`. thorough: check every page first, as required before more rows are written.
+    Raises StoreError if the file is missing, damaged, or of another version; nothing is written to it then.
     """
 
     def __init__(self, path: Path, *, thorough: bool = False) -> None:
         self._path = path
         if not path.is_file():
-            raise StoreError(f"{path}: no such file; the rows of this campaign cannot be added to")
+            raise StoreError(f"{path}: no such file; no rows can be added to this campaign")
         try:
             self._connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=rw", uri=True, isolation_level=None)
         except sqlite3.Error as error:
@@ -82,7 +81,7 @@ class RowStore(AbstractContextManager["RowStore"]):
                 execute(f"PRAGMA {key}").fetchone() for key in ("application_id", "user_version")
             )
             if application != _APPLICATION:
-                raise StoreError(f"{path} is damaged, or no store of this version: it does not say that it is one")
+                raise StoreError(f"{path} is damaged, or is not a store of this version: wrong application id")
             if version != STORE_VERSION:
                 raise StoreError(f"{path} has version {version}; this version of Marsyard reads {STORE_VERSION}")
             problems = [text for (text,) in execute("PRAGMA quick_check(1)")] if thorough else ["ok"]
@@ -110,25 +109,25 @@ class RowStore(AbstractContextManager["RowStore"]):
         text = str(error)
         if "full" in text:
             advice = "free disk space and resume"
-            return StoreError(f"{self._path}: the disk is full; the rows before that are safe: {advice}")
+            return StoreError(f"{self._path}: the disk is full; all earlier rows are stored: {advice}")
         if "malformed" in text or "not a database" in text:
             return StoreError(f"{self._path} is damaged: {text}; nothing was written to it")
         return StoreError(f"{self._path}: {text}")
 
     def __exit__(self, *_: object) -> None:
-        # closing may fail where writing did; the log then stays and is read the next time
+        # closing may fail after a failed write; the log then stays and is read the next time
         with suppress(sqlite3.Error):
             self._connection.close()
 
     @property
     def about(self) -> dict[str, str]:
-        """Identification of the rows, as given when the store was made."""
-        return dict(self._ask("SELECT key, value FROM about"))
+        """Identification of the rows, as given to `create_store`."""
+        return dict(self._query("SELECT key, value FROM about"))
 
     def add(self, rows: Iterable[Row]) -> None:
         """Store rows in one transaction; an existing row of a case is replaced.
 
-        Raises StoreError where that fails; then none of them is stored.
+        Raises StoreError on failure; then no row is stored.
         """
         execute = self._connection.execute
         try:
@@ -155,43 +154,44 @@ class RowStore(AbstractContextManager["RowStore"]):
 
     def count(self) -> int:
         """Number of cases that have a row."""
-        (number,) = self._ask("SELECT count(*) FROM cases").fetchone()
+        (number,) = self._query("SELECT count(*) FROM cases").fetchone()
         return int(number)
 
     def count_unfinished(self) -> int:
         """Number of unfinished cases."""
-        return len(self.with_outcomes(UNFINISHED))
+        return len(self.with_outcomes(ENGINE_FAILURES))
 
     def missing(self, total: int) -> list[range]:
         """Cases below `total` that have no row."""
-        ends = [-1, *(number for (number,) in self._ask("SELECT case_number FROM cases ORDER BY 1")), total]
-        return [range(before + 1, after) for before, after in pairwise(ends) if after > before + 1]
+        ends = [-1, *(number for (number,) in self._query("SELECT case_number FROM cases ORDER BY 1")), total]
+        return [range(last + 1, next_row) for last, next_row in pairwise(ends) if next_row > last + 1]
 
     def with_outcomes(self, outcomes: Iterable[str]) -> list[int]:
-        """Cases with any of some outcomes."""
-        named = sorted(outcomes)
-        marks = ", ".join("?" * len(named))
+        """Cases with one of the given outcomes."""
+        values = sorted(outcomes)
+        marks = ", ".join("?" * len(values))
         query = f"SELECT case_number FROM cases WHERE outcome IN ({marks}) ORDER BY 1"  # noqa: S608 (marks only)
-        return [number for (number,) in self._ask(query, named)]
+        return [number for (number,) in self._query(query, values)]
 
     def first_completed(self) -> int | None:
-        """First finished case; None where there is none."""
-        marks = ", ".join("?" * len(UNFINISHED))
+        """First finished case; None if no case is finished."""
+        marks = ", ".join("?" * len(ENGINE_FAILURES))
         query = f"SELECT min(case_number) FROM cases WHERE outcome NOT IN ({marks})"  # noqa: S608 (marks only)
-        (found,) = self._ask(query, sorted(UNFINISHED)).fetchone()
-        return None if found is None else int(found)
+        (case,) = self._query(query, sorted(ENGINE_FAILURES)).fetchone()
+        return None if case is None else int(case)
 
     def row(self, case: int) -> Row | None:
-        """Row of a case; None where it has none."""
-        record = self._ask("SELECT layout, row FROM cases WHERE case_number = ?", [case]).fetchone()
+        """Row of a case; None if it has none."""
+        record = self._query("SELECT layout, row FROM cases WHERE case_number = ?", [case]).fetchone()
         try:
-            return None if record is None else dict(zip(self.names()[record[0]], json.loads(record[1]), strict=True))
+            columns = () if record is None else self.columns_by_layout()[record[0]]
+            return None if record is None else dict(zip(columns, json.loads(record[1]), strict=True))
         except (ValueError, TypeError) as error:
             raise StoreError(f"{self._path} is damaged: a row cannot be read: {error}") from error
 
-    def names(self) -> dict[int, tuple[str, ...]]:
+    def columns_by_layout(self) -> dict[int, tuple[str, ...]]:
         """Columns of each layout, layouts in the order of their first cases."""
-        order = self._ask("SELECT layout FROM cases GROUP BY layout ORDER BY min(case_number)")
+        order = self._query("SELECT layout FROM cases GROUP BY layout ORDER BY min(case_number)")
         names = {layout: columns for columns, layout in self._layouts.items()}
         try:
             return {layout: names[layout] for (layout,) in order}
@@ -206,17 +206,17 @@ class RowStore(AbstractContextManager["RowStore"]):
         return values
 
     def chunks(self, size: int) -> Iterator[list[tuple[int, list[Any]]]]:
-        """Layouts and values of all rows in the order of their cases, `size` at a time."""
-        cursor = self._ask("SELECT layout, row FROM cases ORDER BY case_number")
-        while found := cursor.fetchmany(size):
+        """Layouts and values of all rows in the order of their cases, in chunks of `size`."""
+        cursor = self._query("SELECT layout, row FROM cases ORDER BY case_number")
+        while records := cursor.fetchmany(size):
             # parsing one text takes half the time of parsing each row
             try:
-                values = json.loads(f"[{','.join(text for _, text in found)}]")
+                values = json.loads(f"[{','.join(text for _, text in records)}]")
             except (ValueError, TypeError) as error:
                 raise StoreError(f"{self._path} is damaged: a row cannot be read: {error}") from error
-            yield [(layout, row) for (layout, _), row in zip(found, values, strict=True)]
+            yield [(layout, row) for (layout, _), row in zip(records, values, strict=True)]
 
-    def _ask(self, query: str, values: Sequence[Any] = ()) -> sqlite3.Cursor:
+    def _query(self, query: str, values: Sequence[Any] = ()) -> sqlite3.Cursor:
         try:
             return self._connection.execute(query, values)
         except sqlite3.Error as error:
@@ -224,7 +224,7 @@ class RowStore(AbstractContextManager["RowStore"]):
 
 
 def is_empty_store(path: Path) -> bool:
-    """Whether a file is a store without rows; False where it is damaged, or no store."""
+    """Whether a file is a store without rows; False if it is damaged or not a valid store."""
     try:
         with readable_store(path) as store:
             return store.count() == 0
@@ -234,13 +234,13 @@ def is_empty_store(path: Path) -> bool:
 
 @contextmanager
 def readable_store(path: Path) -> Iterator[RowStore]:
-    """Rows of a campaign for reading; of a folder that cannot be written to, a temporary copy.
+    """Rows of a campaign for reading; if its folder is not writable, from a temporary copy.
 
-    SQLite needs files of its own next to the log even for reading. Raises StoreError as `RowStore` does, and where the
-    copy cannot be made.
+    SQLite needs its own files next to the log even for reading. Raises StoreError as `RowStore` does, and if the copy
+    fails.
     """
     with ExitStack() as stack:
-        if not all(os.access(one, os.W_OK, effective_ids=True) for one in (path, path.parent)):
+        if not all(os.access(target, os.W_OK, effective_ids=True) for target in (path, path.parent)):
             try:
                 folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="marsyard-"))
                 for file in (path, path.with_name(f"{path.name}-wal")):
@@ -253,15 +253,13 @@ def readable_store(path: Path) -> Iterator[RowStore]:
 
 
 def classify_value(value: Any) -> str:
-    """Type of a value, in the words of `RowStore.kinds`."""
+    """Type of a value, as in `RowStore.kinds`."""
     kind = type(value)
-    if kind is int and not -(2**63) <= value < 2**63:
-        return "big"
-    return kind.__name__
+    return "big" if kind is int and not -(2**63) <= value < 2**63 else kind.__name__
 
 
-#: One case as stored.
+#: Row of one case as stored.
 Row = Mapping[str, Scalar]
-#: Columns that the engine writes, before and behind those of the scenario.
+#: Columns that the engine writes, before and after those of the scenario.
 LEADING_COLUMNS = ("case", "outcome", "answered")
 TRAILING_COLUMNS = ("wall_time_s", "cpu_time_s", "error", "traceback")

@@ -1,4 +1,4 @@
-"""Parquet table of a campaign, written from its store in row groups to limit memory; and its worst cases."""
+"""Parquet table of a campaign, written from its store in row groups to limit memory; worst cases."""
 
 from __future__ import annotations
 
@@ -24,35 +24,35 @@ _GROUP = 50_000
 
 
 def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> None:
-    """Write the rows of a store as a Parquet table in the order of the cases, whole or not at all.
+    """Write the rows of a store as a Parquet table in the order of the cases, atomically.
 
     The engine's columns are the first and last. A missing number is NaN, any other missing value null. `measures` are
-    columns of numbers that the table always has.
+    numeric columns that the table always contains.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
     import pyarrow.parquet as pq
 
-    layouts, kinds = store.names(), store.kinds()
+    layouts, kinds = store.columns_by_layout(), store.kinds()
     columns = dict.fromkeys((*itertools.chain.from_iterable(layouts.values()), *measures))
-    own = [name for name in columns if name not in LEADING_COLUMNS and name not in TRAILING_COLUMNS]
-    forms = {name: _choose_type(kinds.get(name, set())) for name in (*LEADING_COLUMNS, *own, *TRAILING_COLUMNS)}
-    schema = pa.schema([(name, kind) for name, (kind, _) in forms.items()])
+    payload = [name for name in columns if name not in LEADING_COLUMNS and name not in TRAILING_COLUMNS]
+    types = {name: _choose_type(kinds.get(name, set())) for name in (*LEADING_COLUMNS, *payload, *TRAILING_COLUMNS)}
+    schema = pa.schema([(name, kind) for name, (kind, _) in types.items()])
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         with pq.ParquetWriter(partial, schema) as writer, ExitStack() as stack:
             if gc.isenabled():
-                # it takes as long as reading millions of rows, and none has cyclic references
+                # collection takes as long as reading millions of rows, and no row has cyclic references
                 gc.disable()
                 stack.callback(gc.enable)
             for chunk in store.chunks(_GROUP):
                 arrays = []
-                for values, (kind, convert) in zip(_columns(chunk, layouts, list(forms)), forms.values(), strict=True):
+                for values, (kind, convert) in zip(_columns(chunk, layouts, list(types)), types.values(), strict=True):
                     if convert is not None:
                         values = [None if value is None else convert(value) for value in values]
                     array = pa.array(values, kind)
-                    fills = array.null_count and pa.types.is_floating(kind)
-                    arrays.append(pc.fill_null(array, math.nan) if fills else array)
+                    needs_fill = array.null_count and pa.types.is_floating(kind)
+                    arrays.append(pc.fill_null(array, math.nan) if needs_fill else array)
                 writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=_GROUP)
         with partial.open("rb") as file:
             os.fsync(file.fileno())
@@ -61,7 +61,7 @@ def write_table(path: Path, store: RowStore, measures: Sequence[str] = ()) -> No
         raise StoreError(f"{path} cannot be written: {error.strerror or error}") from error
     except (TypeError, ValueError) as error:
         partial.unlink(missing_ok=True)
-        raise StoreError(f"{path} cannot be made, as {ROWS_FILE} is damaged: a row cannot be read: {error}") from error
+        raise StoreError(f"{path} cannot be written: {ROWS_FILE} is damaged: a row cannot be read: {error}") from error
 
 
 def _columns(
@@ -70,24 +70,24 @@ def _columns(
     indices: dict[int, list[int]] = {}
     for index, (layout, _) in enumerate(chunk):
         indices.setdefault(layout, []).append(index)
-    parts = {
-        layout: dict(zip(layouts[layout], zip(*(chunk[index][1] for index in found), strict=True), strict=True))
-        for layout, found in indices.items()
+    values_by_layout = {
+        layout: dict(zip(layouts[layout], zip(*(chunk[index][1] for index in layout_rows), strict=True), strict=True))
+        for layout, layout_rows in indices.items()
     }
     for name in columns:
-        if len(parts) == 1:
-            (part,) = parts.values()
-            yield part.get(name, [None] * len(chunk))
+        if len(values_by_layout) == 1:
+            (layout_values,) = values_by_layout.values()
+            yield layout_values.get(name, [None] * len(chunk))
             continue
         values: list[Any] = [None] * len(chunk)
-        for layout, found in indices.items():
-            for index, value in zip(found, parts[layout].get(name, ()), strict=False):
+        for layout, layout_rows in indices.items():
+            for index, value in zip(layout_rows, values_by_layout[layout].get(name, ()), strict=False):
                 values[index] = value
         yield values
 
 
 def _choose_type(kinds: set[str]) -> tuple[Any, Callable[[Any], Any] | None]:
-    """Narrowest Arrow type that holds all values of a column, and the conversion to it."""
+    """Narrowest Arrow type that represents all values of a column, and the conversion to it."""
     import pyarrow as pa
 
     if kinds == {"bool"}:
@@ -100,35 +100,35 @@ def _choose_type(kinds: set[str]) -> tuple[Any, Callable[[Any], Any] | None]:
 
 
 def read_rows(path: Path, case: int | None = None) -> list[dict[str, Any]]:
-    """Rows of a Parquet table without missing values; of all cases, or of one.
+    """Rows of a Parquet table without missing values; of all cases, or of one case.
 
-    Raises StoreError where there is no such table.
+    Raises StoreError if there is no such table.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        only = None if case is None else [("case", "==", case)]
-        rows: list[dict[str, Any]] = pq.read_table(path, filters=only).to_pylist()
+        case_filter = None if case is None else [("case", "==", case)]
+        rows: list[dict[str, Any]] = pq.read_table(path, filters=case_filter).to_pylist()
     except (OSError, pa.ArrowException) as error:
         raise StoreError(f"{path}: not a table of cases: {error}") from error
     return [{name: value for name, value in row.items() if value is not None} for row in rows]
 
 
 def refresh_table(directory: Path) -> None:
-    """Write the table of an unfinished campaign from its rows so far.
+    """Write the table of an unfinished campaign from its current rows.
 
-    Raises StoreError where its store cannot be read, or the table cannot be written.
+    Raises StoreError if the store is unreadable or the table is not writable.
     """
     if not (directory / ROWS_FILE).exists() and (directory / TABLE_FILE).exists():
-        return  # of an earlier version, which wrote the table when it was interrupted
+        return  # folder of an earlier version, which wrote the table at an interruption
     requirements = stored_configuration(directory).requirements
     with RowStore(directory / ROWS_FILE) as store:
-        write_table(directory / TABLE_FILE, store, [one.metric for one in requirements if one.bound is not None])
+        write_table(directory / TABLE_FILE, store, [item.metric for item in requirements if item.bound is not None])
 
 
 def stored_row(directory: Path, case: int) -> Row | None:
-    """Row of a case of a stored campaign; None where it has none."""
+    """Row of a case of a stored campaign; None if it has none."""
     if (directory / ROWS_FILE).is_file():
         with readable_store(directory / ROWS_FILE) as store:
             return store.row(case)
@@ -137,7 +137,7 @@ def stored_row(directory: Path, case: int) -> Row | None:
 
 
 def find_showcase(configuration: CampaignConfiguration, table: Path, store: RowStore) -> int | None:
-    """Case whose products are kept for the report; None where none is requested or finished."""
+    """Case whose products are kept for the report; None if no case is requested or finished."""
     if configuration.retain.showcase == "none":
         return None
     worst = find_worst_cases(configuration, table, 1) if configuration.retain.showcase == "worst" else []
@@ -145,16 +145,16 @@ def find_showcase(configuration: CampaignConfiguration, table: Path, store: RowS
 
 
 def find_worst_cases(configuration: CampaignConfiguration, table: Path, number: int) -> list[int]:
-    """Answered cases with the largest metrics, the worst first: of the first requirement with a single column."""
+    """Answered cases with the largest metrics, worst first: metric of the first requirement with a single column."""
     # a sum of columns is a sum of times, which does not rank cases
-    single = (one for one in configuration.requirements if one.bound is not None and len(one.metric_columns) == 1)
-    metric = next((one.metric for one in single), None)
+    ranking = (item for item in configuration.requirements if item.bound is not None and len(item.metric_columns) == 1)
+    metric = next((item.metric for item in ranking), None)
     if metric is None:
         return []
     import pyarrow.parquet as pq
 
     rows = pq.read_table(table, columns=["case", "answered", metric])
-    sizes = np.abs(np.asarray(rows[metric].to_numpy(), dtype=np.float64))
-    sizes = np.where(np.asarray(rows["answered"].to_numpy(), dtype=np.bool_), sizes, np.nan)
-    order = np.argsort(-sizes, kind="stable")[:number]
-    return [int(rows["case"][int(index)].as_py()) for index in order if not np.isnan(sizes[index])]
+    magnitudes = np.abs(np.asarray(rows[metric].to_numpy(), dtype=np.float64))
+    magnitudes = np.where(np.asarray(rows["answered"].to_numpy(), dtype=np.bool_), magnitudes, np.nan)
+    order = np.argsort(-magnitudes, kind="stable")[:number]
+    return [int(rows["case"][int(index)].as_py()) for index in order if not np.isnan(magnitudes[index])]

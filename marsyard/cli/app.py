@@ -26,14 +26,14 @@ from marsyard.cli.terrain import gallery, render
 
 
 class _PlainFlags:
-    """Hides the value type of flags in the help of a command or group."""
+    """Hide the value type of flags in the help of a command or group."""
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """The parameters, flags without a type."""
+        """Return the parameters; flags have no value type."""
         parameters: list[Any] = super().get_params(ctx)  # type: ignore[misc]
-        for one in parameters:
-            if getattr(one, "is_flag", False):
-                one.metavar = ""
+        for parameter in parameters:
+            if getattr(parameter, "is_flag", False):
+                parameter.metavar = ""
         return parameters
 
 
@@ -49,16 +49,16 @@ app = typer.Typer(
     cls=_Group,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    help="A virtual Mars Yard: runs vision software through rendered, truth-known cases and reports whether its "
-    "requirements are met, with a stated confidence.",
-    epilog="Exit status: 0 every requirement met, or none asked; 1 a requirement failed, or a case crashed; "
-    "2 the command or a file is wrong; 3 not enough cases for a verdict, or no independent random draws.",
+    help="A virtual Mars Yard: run vision software on rendered cases with ground truth, and report whether it "
+    "meets its requirements at a given confidence level.",
+    epilog="Exit status: 0 all requirements met, or no requirements; 1 a requirement failed, or a case crashed; "
+    "2 the command or a file is invalid; 3 not enough cases for a verdict, or no independent random draws.",
 )
 
 
 @handle_user_errors
 def list_campaigns(as_json: JsonOption = False) -> None:
-    """List the campaigns of the catalogue."""
+    """List the built-in campaigns."""
     from rich.table import Table
     from rich.text import Text
 
@@ -73,11 +73,11 @@ def list_campaigns(as_json: JsonOption = False) -> None:
         table.add_column(heading, overflow="fold")
     for name, path in catalogue().items():
         try:
-            stated = tomllib.loads(path.read_text(encoding="utf-8"))  # not validated: `run` reports errors
+            definition = tomllib.loads(path.read_text(encoding="utf-8"))  # not validated: `run` reports errors
         except (OSError, ValueError) as error:
-            stated = {"description": f"cannot be read: {error}"}
-        rows.append({"name": name, "file": str(path), **{key: stated.get(key) for key in keys}})
-        table.add_row(Text(name), *(Text(str(stated.get(key, ""))) for key in keys))
+            definition = {"description": f"cannot be read: {error}"}
+        rows.append({"name": name, "file": str(path), **{key: definition.get(key) for key in keys}})
+        table.add_row(Text(name), *(Text(str(definition.get(key, ""))) for key in keys))
     if as_json:
         typer.echo(json.dumps(rows, indent=2))
     else:
@@ -88,19 +88,21 @@ def list_campaigns(as_json: JsonOption = False) -> None:
 def show(
     campaign: CampaignArgument,
     override: SetOption = None,
-    draw: Annotated[int | None, Option(metavar="N", help="Show the draws of the first N cases.")] = None,
+    draw: Annotated[
+        int | None, Option(metavar="N", help="Show the drawn parameter values of the first N cases.")
+    ] = None,
     figure: Annotated[
         Path | None, Option(metavar="FILE", help="With --draw: write marginals and pairs as .svg or .png.")
     ] = None,
     as_json: Annotated[bool, Option("--json", help="Print JSON, with all draws.")] = False,
 ) -> None:
-    """Show a campaign: parameters, dispersions with their sources, requirements; or the draws of its cases."""
+    """Show a campaign: parameters, dispersions with their sources, requirements; with --draw, values of its cases."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.errors import CampaignError
     from marsyard.cli.showing import describe_campaign, show_campaign, show_draws, write_draws_figure
 
     if figure is not None and draw is None:
-        raise CampaignError("--figure shows draws: give the number of cases with --draw N")
+        raise CampaignError("--figure plots draws: give the number of cases with --draw N")
     loaded = load_campaign(campaign, override or [])
     if figure is not None and draw is not None:
         write_draws_figure(loaded, draw, figure)
@@ -115,14 +117,14 @@ def show(
 
 
 def doctor(as_json: JsonOption = False) -> None:
-    """Check the machine and the installation, with a fix for each problem."""
-    from marsyard.doctor import run as examine
+    """Check the machine and the installation, and print a remedy for each problem."""
+    from marsyard.doctor import run as run_checks
 
-    raise typer.Exit(examine(console(), as_json=as_json))
+    raise typer.Exit(run_checks(console(), as_json=as_json))
 
 
-def _print_version(asked: bool) -> None:
-    if asked:
+def _print_version(is_requested: bool) -> None:
+    if is_requested:
         from importlib.metadata import version
 
         typer.echo(f"marsyard {version('marsyard')}")
@@ -138,22 +140,22 @@ def _marsyard(
     pass
 
 
-#: Commands by the panels of the help; the first word of a function's name is that of its command.
+#: Commands by help panel; the first word of a function's name is the command's name.
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {
     "Run campaigns": (list_campaigns, show, run, resume, append, replay, nightly),
     "Results": (report, compare, dashboard),
-    "Worlds and pictures": (render, gallery, dataset),
-    "Your own campaigns and algorithms": (new, ingest, conformance, export, score),
+    "Worlds and images": (render, gallery, dataset),
+    "Custom campaigns and algorithms": (new, ingest, conformance, export, score),
     "Housekeeping": (doctor, compile_kernels, clean),
 }
 for panel, commands in PANELS.items():
     for command in commands:
         app.command(name=command.__name__.partition("_")[0], cls=_Command, rich_help_panel=panel)(command)
-    if panel == "Worlds and pictures":
+    if panel == "Worlds and images":
         app.add_typer(terrain, name="terrain", cls=_Group, rich_help_panel=panel)
 
 
-_format_usual = warnings.formatwarning
+_format_default = warnings.formatwarning
 
 
 def _format_warning(
@@ -163,15 +165,15 @@ def _format_warning(
 
     if issubclass(category, RenamedWarning):
         return f"warning: {message}\n"
-    return _format_usual(message, category, filename, lineno, line)
+    return _format_default(message, category, filename, lineno, line)
 
 
 def main() -> None:
-    """Entry point of the program. A defect ends with a traceback and status 2, not with a verdict's status 1."""
-    # without `pgrep` loky warns at each worker's end, and works all the same
+    """Run the command line. A defect of the program ends with a traceback and status 2; status 1 is for verdicts."""
+    # if `pgrep` is not installed, loky warns at the end of each worker, without consequences
     warnings.filterwarnings("ignore", message="Failed to kill subprocesses")
     warnings.formatwarning = _format_warning
-    if not {"--help", "--version"}.issuperset(sys.argv[1:]):  # these answer before NumPy is imported
+    if not {"--help", "--version"}.issuperset(sys.argv[1:]):  # these run without NumPy
         from marsyard.sim.parameters import current_options
 
         sys.argv[1:] = current_options(sys.argv[1:])

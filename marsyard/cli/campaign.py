@@ -1,4 +1,4 @@
-"""`marsyard run`, `resume`, `append` and `replay`: campaigns and their folders."""
+"""Commands `marsyard run`, `resume`, `append` and `replay`: run campaigns and rerun cases."""
 
 from __future__ import annotations
 
@@ -45,26 +45,26 @@ class RunOptions:
 
 @options.handle_user_errors
 @options.with_options(RunOptions)
-def run(given: RunOptions) -> None:
+def run(arguments: RunOptions) -> None:
     """Run a campaign, evaluate its requirements, and write its report."""
     from marsyard.campaigns.definition.loading import load_campaign
 
-    changes = list(given.override or [])
-    if given.case_time is not None:
-        changes.append(f"limits.case_time_s={given.case_time}")
-    loaded = load_campaign(given.campaign, changes, given.cases, given.seed, given.algorithm or [])
-    # imported after loading, so that an error in the file is reported at once
+    changes = list(arguments.override or [])
+    if arguments.case_time is not None:
+        changes.append(f"limits.case_time_s={arguments.case_time}")
+    loaded = load_campaign(arguments.campaign, changes, arguments.cases, arguments.seed, arguments.algorithm or [])
+    # imported after loading, so that an error in the file is reported without delay
     from marsyard.campaigns.running.engine import run_campaign
     from marsyard.cli import outcome
 
-    executor = make_executor(given.jobs, given.cluster)
-    if given.dry_run:
+    executor = make_executor(arguments.jobs, arguments.cluster)
+    if arguments.dry_run:
         outcome.print_estimate(loaded, executor)
         outcome.print_limits(loaded)
         return
-    directory = given.out if given.out is not None else default_directory(loaded.configuration.name)
-    start = outcome.run_until_decided if given.until_decided else run_campaign
-    run_and_judge(directory, lambda watch: start(loaded, directory, executor, watch))
+    directory = arguments.out if arguments.out is not None else default_directory(loaded.configuration.name)
+    run_cases = outcome.run_until_decided if arguments.until_decided else run_campaign
+    run_and_evaluate(directory, lambda watch: run_cases(loaded, directory, executor, watch))
 
 
 @options.handle_user_errors
@@ -90,16 +90,16 @@ def resume(
     from marsyard.cli.outcome import continue_until_decided
 
     executor, allowed = make_executor(jobs, cluster), [*RETRYABLE, "all"]
-    for word in retry or []:
-        if word not in allowed:
-            raise CampaignError(f"--retry: {unknown_name_message('outcome', word, allowed)}")
+    for name in retry or []:
+        if name not in allowed:
+            raise CampaignError(f"--retry: {unknown_name_message('outcome', name, allowed)}")
     outcomes = list(RETRYABLE) if "all" in (retry or []) else retry or []
 
     def continue_campaign(watch: Watch) -> None:
         resume_campaign(directory, executor, watch, retry=outcomes, case_time_s=case_time, allow_changed=allow_changed)
         continue_until_decided(directory, executor, watch)
 
-    run_and_judge(directory, continue_campaign)
+    run_and_evaluate(directory, continue_campaign)
 
 
 @options.handle_user_errors
@@ -110,17 +110,17 @@ def append(
     cluster: options.ClusterOption = None,
     allow_changed: options.ChangedOption = False,
 ) -> None:
-    """Add cases to a finished campaign, run them, and evaluate all."""
+    """Add cases to a finished campaign, run them, and evaluate all cases."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.running.engine import append_cases, campaign_with_block
     from marsyard.campaigns.store.record import stored_configuration
     from marsyard.cli import outcome
 
     if stored_configuration(directory).max_cases is not None:
-        raise CampaignError(f"{directory} stopped itself (--until-decided): more cases would buy a second chance")
+        raise CampaignError(f"{directory} was run with --until-decided: cases added afterwards would bias the verdict")
     outcome.print_limits(campaign_with_block(directory, cases))
     executor = make_executor(jobs, cluster)
-    run_and_judge(directory, lambda watch: append_cases(directory, cases, executor, watch, allow_changed=allow_changed))
+    run_and_evaluate(directory, lambda log: append_cases(directory, cases, executor, log, allow_changed=allow_changed))
 
 
 @options.handle_user_errors
@@ -128,12 +128,14 @@ def replay(
     directory: options.DirectoryArgument,
     case: Annotated[int, Argument(metavar="CASE", help="Number of the case, from 0.")],
     out: Annotated[
-        Path | None, Option(metavar="DIR", help="Folder of its products; by default DIR/cases/CASE.")
+        Path | None, Option(metavar="DIR", help="Folder of the products; by default DIR/cases/CASE.")
     ] = None,
-    save_stages: Annotated[bool, Option("--save-stages", help="Also write each stage's product into stages/.")] = False,
+    save_stages: Annotated[
+        bool, Option("--save-stages", help="Also write the result of each processing stage to stages/.")
+    ] = False,
 ) -> None:
-    """Rerun one case, write and plot its intermediate results, and compare its row with the stored one."""
-    from marsyard.campaigns.running.replay import replay as run_again
+    """Rerun one case, write and plot its intermediate results, and compare its results with the stored row."""
+    from marsyard.campaigns.running.replay import replay as rerun_case
     from marsyard.campaigns.store.products import (
         case_directory,
         pack_products,
@@ -144,11 +146,11 @@ def replay(
     from marsyard.cli.showing import write_stages
     from marsyard.reports.presentation import write_case_figures
 
-    replayed = run_again(directory, case)
+    replayed = rerun_case(directory, case)
     target = out if out is not None else case_directory(directory, case)
     if (replayed.failed or replayed.products is None) and (target / "products.json").exists():
-        written = [f"{target} keeps the products that it had: this time the case delivered none to replace them"]
-    else:  # the products, stages and figures, all or none
+        written = [f"{target} keeps its previous products: this run of the case produced none"]
+    else:  # replace the products, stages and figures together or not at all
         packed = replayed.products or pack_products({})
         products = unpack_products(packed)
         with replace_files(target) as folder:
@@ -163,9 +165,9 @@ def replay(
             typer.echo(line)
     typer.echo("\n".join(written))
     if replayed.changed:
-        typer.echo(f"since the campaign ran this has changed: {'; '.join(replayed.changed)}")
+        typer.echo(f"changed since the campaign was run: {'; '.join(replayed.changed)}")
     if replayed.stored is None:
-        typer.echo("the campaign has no row of this case to compare with")
+        typer.echo("the campaign has no stored row of this case to compare with")
     elif replayed.differing:
         typer.echo(f"the row differs from the stored one in: {', '.join(replayed.differing)}")
         for column in replayed.differing:
@@ -176,30 +178,30 @@ def replay(
 
 
 def make_executor(jobs: int | None, cluster: str | None) -> ExecutorConfig:
-    """The workers of a campaign by the options."""
+    """Return the configuration of the workers from the options `--jobs` and `--cluster`."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.execution.workers import ExecutorConfig, available_cores
 
     if jobs is not None and jobs < 1:
         raise CampaignError(f"--jobs {jobs}: at least one worker process is needed")
     if jobs is not None and cluster is not None:
-        raise CampaignError("--jobs and --cluster exclude one another: a cluster has its own workers")
+        raise CampaignError("--jobs and --cluster cannot be combined: a cluster has its own workers")
     return ExecutorConfig(jobs or available_cores(), cluster)
 
 
-def run_and_judge(directory: Path, work: Callable[[Watch], None]) -> None:
-    """Do a campaign's work and evaluate it."""
-    from marsyard.cli.outcome import conclude
+def run_and_evaluate(directory: Path, work: Callable[[Watch], None]) -> None:
+    """Run `work`, evaluate the campaign, and exit with the status of its verdict."""
+    from marsyard.cli.outcome import evaluate_and_report
     from marsyard.cli.progress import RunLog
 
-    with shown_progress(directory, f"marsyard resume {directory}") as progress, RunLog(directory, progress) as log:
+    with show_progress(directory, f"marsyard resume {directory}") as progress, RunLog(directory, progress) as log:
         work(log)
-    raise typer.Exit(conclude(directory, options.console()))
+    raise typer.Exit(evaluate_and_report(directory, options.console()))
 
 
 @contextmanager
-def shown_progress(directory: Path, next_command: str) -> Iterator[Watch]:
-    """Show the progress of work in a folder; an interruption ends with the next command and status 130."""
+def show_progress(directory: Path, next_command: str) -> Iterator[Watch]:
+    """Show the progress of work in a folder; an interruption prints the next command and exits with status 130."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.store.record import read
     from marsyard.cli.progress import campaign_progress
@@ -219,30 +221,30 @@ def shown_progress(directory: Path, next_command: str) -> Iterator[Watch]:
 
 @contextmanager
 def stop_on_signals() -> Iterator[None]:
-    """The first Ctrl-C or SIGTERM stops the work in good order, the second ends the program at once."""
+    """Raise KeyboardInterrupt at the first Ctrl-C or SIGTERM; exit immediately at the second."""
 
-    def stop(number: int, _frame: object) -> None:
-        for kind in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(kind, end_at_once)
+    def interrupt(number: int, _frame: object) -> None:
+        for handled_signal in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(handled_signal, exit_immediately)
         raise KeyboardInterrupt(signal.Signals(number).name)
 
-    def end_at_once(_number: int, _frame: object) -> None:
+    def exit_immediately(_number: int, _frame: object) -> None:
         # the workers' supervisors detect the end of this process, kill their children and remove temporary files
         os.write(2, b"\x1b[?25hkilled\n" if os.isatty(2) else b"killed\n")
         os._exit(options.Exit.INTERRUPTED)
 
-    before = {kind: signal.signal(kind, stop) for kind in (signal.SIGINT, signal.SIGTERM)}
+    previous_handlers = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        for kind, handler in before.items():
-            signal.signal(kind, handler)
+        for number, handler in previous_handlers.items():
+            signal.signal(number, handler)
 
 
 def default_directory(name: str) -> Path:
-    """A new folder ``runs/<campaign>-<UTC time>``, numbered if it exists."""
+    """Return a new folder ``runs/<campaign>-<UTC time>``, with a number if that folder exists."""
     from datetime import UTC, datetime
 
     base = Path("runs") / f"{name}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
-    numbered = (base.with_name(f"{base.name}-{number}") for number in itertools.count(2))
-    return next(one for one in itertools.chain([base], numbered) if not one.exists())
+    numbered_folders = (base.with_name(f"{base.name}-{number}") for number in itertools.count(2))
+    return next(folder for folder in itertools.chain([base], numbered_folders) if not folder.exists())

@@ -1,4 +1,4 @@
-"""`marsyard clean` and `compile`: cached terrains and compiled kernels on disk."""
+"""Commands `marsyard clean` and `compile`: cached terrains and compiled kernels on disk."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typer import Argument, Option
 
 from marsyard.cli.options import JsonOption, console, handle_user_errors, size_text
 
-#: Kinds of cached files, and the cost of removing them.
+#: Kinds of cached files, and how they are rebuilt after removal.
 KINDS = {
-    "terrain": "terrains built for campaigns; built again when a case needs one, from seconds to minutes each",
-    "kernels": "compiled code; compiled again in the next minute of running",
+    "terrain": "terrains of campaigns; rebuilt when a case needs one, seconds to minutes each",
+    "kernels": "compiled code; recompiled at the next run, about one minute",
 }
 #: The kind with a size limit (MARSYARD_CACHE_GB).
 LIMITED = "terrain"
@@ -30,7 +30,7 @@ def clean(
 ) -> None:
     """List the caches on disk with their sizes; with --yes remove them.
 
-    Campaigns' folders are not touched. Running campaigns continue: missing files are built again.
+    Folders of campaigns are not changed. Running campaigns continue and rebuild the files that they need.
     """
     from rich import box
     from rich.table import Table
@@ -41,39 +41,39 @@ def clean(
     for kind in kinds or []:
         if kind not in KINDS:
             raise CampaignError(unknown_name_message("kind", kind, KINDS))
-    usages = [cache_usage(kind) for kind in kinds or KINDS]
+    caches = [cache_usage(kind) for kind in kinds or KINDS]
     freed = 0
-    paths = [path for one in usages for path in sorted(one["folder"].rglob("*"), reverse=True)] if yes else []
+    paths = [path for cache in caches for path in sorted(cache["folder"].rglob("*"), reverse=True)] if yes else []
     for path in paths:
         try:
             if path.is_dir() and not path.is_symlink():
                 path.rmdir()
-            elif path.suffix != UNFINISHED:  # of another process
+            elif path.suffix != UNFINISHED:  # a file that another process is writing
                 size = path.stat().st_size
                 path.unlink()
                 freed += size
-        except OSError:  # not empty, in use, or gone already
+        except OSError:  # not empty, in use, or already removed
             continue
     if as_json:
-        typer.echo(json.dumps({"kept": usages, "removed_bytes": freed}, indent=2, default=str))
+        typer.echo(json.dumps({"kept": caches, "removed_bytes": freed}, indent=2, default=str))
         return
     table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("kind", "files", "size", "limit", "folder", "what it is"):
+    for heading in ("kind", "files", "size", "limit", "folder", "contents"):
         right = heading in ("files", "size", "limit")
         table.add_column(heading, justify="right" if right else "left", overflow="fold")
-    for one in usages:
-        limit = "none" if one["limit_bytes"] is None else size_text(one["limit_bytes"])
-        kind, size = one["kind"], size_text(one["bytes"])
-        table.add_row(kind, str(one["files"]), size, limit, str(one["folder"]), KINDS[kind])
+    for cache in caches:
+        limit = "none" if cache["limit_bytes"] is None else size_text(cache["limit_bytes"])
+        kind, size = cache["kind"], size_text(cache["bytes"])
+        table.add_row(kind, str(cache["files"]), size, limit, str(cache["folder"]), KINDS[kind])
     console().print(table)
     if yes:
         typer.echo(f"removed {size_text(freed)}")
     else:
-        typer.echo("nothing was removed; to remove it: marsyard clean --yes")
+        typer.echo("nothing was removed; to remove these files: marsyard clean --yes")
 
 
 def cache_usage(kind: str) -> dict[str, Any]:
-    """Folder, number of files and bytes of a kind. Raises CampaignError for a wrong number in MARSYARD_CACHE_GB."""
+    """Return folder, file count and size of a cache. Raises CampaignError for an invalid MARSYARD_CACHE_GB."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.sim.cache import cache_directory, limit_bytes
 
@@ -83,7 +83,7 @@ def cache_usage(kind: str) -> dict[str, Any]:
         try:
             if path.is_file() and not path.is_symlink():
                 sizes.append(path.stat().st_size)
-        except OSError:  # another process has removed it meanwhile
+        except OSError:  # removed by another process
             continue
     size = sum(sizes)
     try:
@@ -97,7 +97,7 @@ def cache_usage(kind: str) -> dict[str, Any]:
 def compile_kernels() -> None:
     """Compile the numeric kernels before the first run.
 
-    Each system runs a small case. Compiled code stays on disk until the code changes (`marsyard clean` lists where).
+    Run a small case of each system. The cache of compiled code is valid until the source changes.
     """
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.execution.worker_process import limit_threads
@@ -105,13 +105,13 @@ def compile_kernels() -> None:
     from marsyard.sim.kernel_cache import kernels_are_ready, mark_ready
 
     limit_threads()
-    for name, settings in (one for system in systems() for one in system.compiled_by.items()):
+    for name, settings in (item for system in systems() for item in system.compiled_by.items()):
         campaign = load_campaign(name, settings)
         scenario = campaign.configuration.scenario
         if kernels_are_ready(scenario):
-            typer.echo(f"{scenario}: compiled before")
+            typer.echo(f"{scenario}: already compiled")
             continue
-        began = time.monotonic()
+        start_s = time.monotonic()
         campaign.scenario.run(campaign.parameters(0), campaign.streams(0))
         mark_ready(scenario)
-        typer.echo(f"{scenario}: compiled, {time.monotonic() - began:.0f} s")
+        typer.echo(f"{scenario}: compiled, {time.monotonic() - start_s:.0f} s")

@@ -1,4 +1,4 @@
-"""`marsyard new` and `ingest`: a campaign from flags or a short dialogue, and one from recorded pictures."""
+"""Commands `marsyard new` and `ingest`: create a campaign from options or questions, or from recorded pictures."""
 
 from __future__ import annotations
 
@@ -30,22 +30,26 @@ class NewOptions:
     """Arguments and options of `marsyard new`."""
 
     name: Annotated[str, Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")]
-    system: Annotated[str | None, Option(help="System under test, such as velocity; a wrong name lists all.")] = None
-    site: Annotated[str | None, Option(help="One of `marsyard terrain list`.")] = None
+    system: Annotated[
+        str | None, Option(help="System under test, such as velocity; an unknown name prints the list.")
+    ] = None
+    site: Annotated[str | None, Option(help="A site from `marsyard terrain list`.")] = None
     camera: Annotated[str | None, Option(metavar="FILE", help="Custom camera file (docs/custom-worlds.md).")] = None
     detector: Annotated[str | None, Option(metavar="FILE", help="Custom detector datasheet in TOML.")] = None
-    flight: Annotated[str | None, Option(metavar="FILE", help="Trajectory file in place of the dynamics.")] = None
+    flight: Annotated[str | None, Option(metavar="FILE", help="Trajectory file; replaces simulated dynamics.")] = None
     axes: Annotated[str, Option(help="World axes of the trajectory: enu or ned.")] = "enu"
-    bound: Annotated[float | None, Option(metavar="X", help="Requirement: maximum error or minimum fraction.")] = None
+    bound: Annotated[
+        float | None, Option(metavar="X", help="Bound of the requirement: maximum error, or minimum success fraction.")
+    ] = None
     cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24
-    out: Annotated[Path | None, Option(metavar="FILE", help="Instead of NAME.toml.")] = None
+    out: Annotated[Path | None, Option(metavar="FILE", help="File to write; by default NAME.toml.")] = None
     overwrite: OverwriteOption = False
 
 
 @handle_user_errors
 @with_options(NewOptions)
-def new(given: NewOptions) -> None:
-    """Write a commented campaign of your own; at a terminal asks for what is not given."""
+def new(arguments: NewOptions) -> None:
+    """Write a commented campaign file; on a terminal, ask for missing options."""
     from marsyard.campaigns.errors import CampaignError, unknown_name_message
     from marsyard.cli.outcome import evidence_limits
     from marsyard.reports.wording import count
@@ -54,30 +58,31 @@ def new(given: NewOptions) -> None:
     from marsyard.scenarios.user_files import import_object
     from marsyard.sim.terrain import sites
 
-    name = given.name
-    path = Path(f"{name}.toml") if given.out is None else given.out
-    if path.exists() and not given.overwrite:
-        raise CampaignError(f"{path}: there already; --overwrite replaces it, --out writes another")
+    name = arguments.name
+    path = Path(f"{name}.toml") if arguments.out is None else arguments.out
+    if path.exists() and not arguments.overwrite:
+        raise CampaignError(f"{path}: the file exists; use --overwrite to replace it, or --out to write another file")
     if not name or any(letter in name for letter in '/\\"\n'):
-        raise CampaignError(f"'{name}' is no name for a campaign: without slashes and quotes")
-    asked, known = given.system is None and _is_terminal(), template_paths()
-    chosen = given.system or _answer("System", next(iter(known)), asked, partial(_find_word_problem, list(known)))
-    if chosen not in known:
-        raise CampaignError(f"--system: {unknown_name_message('system', chosen, known)}")
-    template: CampaignTemplate = import_object(known[chosen])
-    asks_camera, asks_flight = (asked and option not in template.refused for option in ("camera", "flight"))
-    with_terrain = [name for name, one in sites().items() if getattr(one, template.scale) is not None]
-    site = given.site or _answer("Site", template.site, asked, partial(_find_word_problem, with_terrain))
-    camera = given.camera or _answer("Camera's file (empty: the paper's camera)", "", asks_camera, _find_camera_problem)
-    flight = given.flight or _answer("Trajectory's file (empty: simulated)", "", asks_flight, _find_file_problem)
+        raise CampaignError(f"'{name}' is not a valid campaign name: slashes and quotes are not allowed")
+    interactive, paths = arguments.system is None and _is_terminal(), template_paths()
+    find_problem = partial(_find_name_problem, list(paths))
+    system = arguments.system or _ask("System", next(iter(paths)), interactive, find_problem)
+    if system not in paths:
+        raise CampaignError(f"--system: {unknown_name_message('system', system, paths)}")
+    template: CampaignTemplate = import_object(paths[system])
+    asks_camera, asks_flight = (interactive and option not in template.refused for option in ("camera", "flight"))
+    names = [name for name, preset in sites().items() if getattr(preset, template.scale) is not None]
+    site = arguments.site or _ask("Site", template.site, interactive, partial(_find_name_problem, names))
+    camera = arguments.camera or _ask("Camera file (empty: the paper's camera)", "", asks_camera, _find_camera_problem)
+    flight = arguments.flight or _ask("Trajectory file (empty: simulated)", "", asks_flight, _find_file_problem)
     question, default = f"Requirement: {template.bound_text}", f"{template.bound:g}"
-    bound = math.nan if given.bound is None else given.bound
+    bound = math.nan if arguments.bound is None else arguments.bound
     if math.isnan(bound):
-        bound = float(_answer(question, default, asked, partial(_find_number_problem, template.max_bound)))
-    choices = Choices(name, site, camera, given.detector or "", flight, given.axes, bound, given.cases)
+        bound = float(_ask(question, default, interactive, partial(_find_number_problem, template.max_bound)))
+    choices = Choices(name, site, camera, arguments.detector or "", flight, arguments.axes, bound, arguments.cases)
     loaded = _write_and_load(path, template, choices)
-    where = f"{path}: {chosen} over {site}, {count(given.cases, 'case')}"
-    typer.echo(f"{where}. See it with `marsyard show {path}`, run it with\n  marsyard run {path}")
+    summary = f"{path}: {system} over {site}, {count(arguments.cases, 'case')}"
+    typer.echo(f"{summary}. To show it: `marsyard show {path}`. To run it:\n  marsyard run {path}")
     for limit in evidence_limits(loaded):
         typer.echo(f"note: {limit}")
 
@@ -87,11 +92,11 @@ def _is_terminal() -> bool:
 
 
 def _write_and_load(path: Path, template: CampaignTemplate, choices: Choices) -> Campaign:
-    """Write the campaign and load it; where it cannot be loaded, restore what the path held before."""
+    """Write the campaign file and load it; if it is invalid, restore the previous content of the path."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.errors import CampaignError, report_write_errors
 
-    before = path.read_text(encoding="utf-8") if path.exists() else None
+    previous_text = path.read_text(encoding="utf-8") if path.exists() else None
     try:
         with report_write_errors(f"{path}:"):
             path.write_text(template.text(choices), encoding="utf-8")
@@ -100,32 +105,32 @@ def _write_and_load(path: Path, template: CampaignTemplate, choices: Choices) ->
     try:
         return load_campaign(str(path))
     except CampaignError:
-        path.unlink() if before is None else path.write_text(before, encoding="utf-8")
+        path.unlink() if previous_text is None else path.write_text(previous_text, encoding="utf-8")
         raise
 
 
-def _answer(question: str, default: str, asked: bool, find_problem: Callable[[str], str]) -> str:
-    """The answer at the terminal, asked for again while it has a problem; or the default."""
+def _ask(question: str, default: str, interactive: bool, find_problem: Callable[[str], str]) -> str:
+    """Ask on the terminal until the answer is valid; return the default if not interactive."""
 
     def check(answer: str) -> str:
         if problem := find_problem(answer):
             raise typer.BadParameter(problem)
         return answer
 
-    if not asked:
+    if not interactive:
         return default
     return str(typer.prompt(question, default=default, show_default=bool(default), value_proc=check))
 
 
-def _find_word_problem(allowed: Sequence[str], answer: str) -> str:
+def _find_name_problem(allowed: Sequence[str], answer: str) -> str:
     from marsyard.campaigns.errors import unknown_name_message
 
     return "" if answer in allowed else unknown_name_message("answer", answer, allowed)
 
 
 def _find_file_problem(answer: str) -> str:
-    missing = answer and not Path(answer).is_file()
-    return f"{answer}: no such file; allowed: the path of a file, or nothing" if missing else ""
+    is_missing = answer and not Path(answer).is_file()
+    return f"{answer}: no such file; allowed: the path of a file, or an empty answer" if is_missing else ""
 
 
 def _find_camera_problem(answer: str) -> str:
@@ -135,7 +140,7 @@ def _find_camera_problem(answer: str) -> str:
         if answer:
             read_camera(answer)
     except CameraFileError as error:
-        return f"{error}; allowed: the path of a camera's file, or nothing"
+        return f"{error}; allowed: the path of a camera file, or an empty answer"
     return ""
 
 
@@ -144,8 +149,8 @@ def _find_number_problem(limit: float, answer: str) -> str:
         number = float(answer)
     except ValueError:
         number = 0.0
-    below = "" if limit == math.inf else f" and below {limit:g}"
-    return "" if 0.0 < number < limit else f"'{answer}' is not allowed; allowed: a number above 0{below}"
+    upper_limit = "" if limit == math.inf else f" and below {limit:g}"
+    return "" if 0.0 < number < limit else f"'{answer}' is not allowed; allowed: a number above 0{upper_limit}"
 
 
 @handle_user_errors
@@ -153,28 +158,28 @@ def ingest(
     folder: Annotated[
         Path, Argument(metavar="FOLDER", help="ingest.toml, pictures.csv and pictures (docs/real-pictures.md).")
     ],
-    out: Annotated[Path, Option(metavar="DIR", help="New folder of the cases and their campaign.")],
-    system: Annotated[str | None, Option(help="System of the cases; by default real pictures.")] = None,
+    out: Annotated[Path, Option(metavar="DIR", help="New folder for the cases and the campaign file.")],
+    system: Annotated[str | None, Option(help="System under test; by default real pictures.")] = None,
 ) -> None:
-    """Make a campaign of real cases from pictures with measured attitude and altitude."""
+    """Create a campaign from recorded pictures with measured attitude and altitude."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors, unknown_name_message
     from marsyard.reports.wording import count
     from marsyard.scenarios.systems import systems
     from marsyard.scenarios.user_files import import_object
 
-    known = {one.name: one.ingest for one in systems() if one.ingest}
-    chosen = system or next(iter(known))
-    if chosen not in known:
-        raise CampaignError(f"--system: {unknown_name_message('system', chosen, known)}")
+    importers = {candidate.name: candidate.ingest for candidate in systems() if candidate.ingest}
+    name = system or next(iter(importers))
+    if name not in importers:
+        raise CampaignError(f"--system: {unknown_name_message('system', name, importers)}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise StoreError(f"{out} is there already, and is not empty; name a new folder with --out")
+        raise StoreError(f"{out} exists and is not empty; give a new folder with --out")
     unfinished = out.with_name(f"{out.name}.part{os.getpid()}")
     try:
         with report_write_errors(f"{out}:"):
             unfinished.mkdir(parents=True)
-            made: Ingested = import_object(known[chosen])(folder, unfinished, out.resolve())
-            (unfinished / CAMPAIGN_FILE).write_text(made.campaign, encoding="utf-8")
+            ingested: Ingested = import_object(importers[name])(folder, unfinished, out.resolve())
+            (unfinished / CAMPAIGN_FILE).write_text(ingested.campaign, encoding="utf-8")
             if out.exists():
                 out.rmdir()
             unfinished.rename(out)
@@ -184,10 +189,10 @@ def ingest(
         shutil.rmtree(unfinished, ignore_errors=True)
     try:
         load_campaign(str(out / CAMPAIGN_FILE))
-    except CampaignError:  # a campaign that cannot be run is not kept
+    except CampaignError:  # remove a campaign that cannot be run
         shutil.rmtree(out)
         raise
-    typer.echo(f"{count(made.cases, 'case')} of {count(made.pictures, 'picture')}: {out}")
-    if made.note:
-        typer.echo(made.note)
-    typer.echo(f"run them with: marsyard run {out / CAMPAIGN_FILE}")
+    typer.echo(f"{count(ingested.cases, 'case')} of {count(ingested.pictures, 'picture')}: {out}")
+    if ingested.note:
+        typer.echo(ingested.note)
+    typer.echo(f"to run the cases: marsyard run {out / CAMPAIGN_FILE}")

@@ -1,4 +1,4 @@
-"""A nightly's plan, and the run of its campaigns in one night."""
+"""Plan of nightly campaigns, and the run of these campaigns in one night."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import Watch, run_campaign
 from marsyard.cli.options import Exit
-from marsyard.cli.outcome import settle
-from marsyard.reports.campaign import write_whole
-from marsyard.reports.comparison import build_sample, list_figures
+from marsyard.cli.outcome import evaluate_and_store
+from marsyard.reports.campaign import write_atomic
+from marsyard.reports.comparison import build_sample, list_metrics
 from marsyard.reports.dashboard.site import write_site
-from marsyard.reports.history import Change, History, NightCampaign, NightFigure, compare_night, night_text
+from marsyard.reports.history import Change, History, NightCampaign, NightFigure, list_comparisons, night_text
 from marsyard.sim.parameters import Parameters
 
-#: Files and folders of a nightly's folder.
+#: Files and folders in the output folder of `marsyard nightly`.
 HISTORY_FILE, PAGE_FILE, RUNS, SITE = "history.sqlite", "nightly.md", "runs", "site"
-#: Verdict of a campaign that could not be run at all.
+#: Verdict of a campaign that could not be run.
 NOT_RUN = "NOT RUN"
 
 #: The plan that ships with Marsyard.
@@ -39,7 +39,7 @@ Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
 
 class PlannedCampaign(Parameters):
-    """A campaign of the plan, with values that replace those of its file."""
+    """A campaign of the plan, with values that override its campaign file."""
 
     campaign: Annotated[str, Field(min_length=1)]
     cases: Annotated[int, Field(strict=True, ge=1, le=MAX_CASES)] | None = None
@@ -47,49 +47,49 @@ class PlannedCampaign(Parameters):
     algorithms: Texts = ()
 
     def load(self, seed: int, night: int, folder: Path) -> Campaign:
-        """The campaign as it runs in a night: paths are from the plan's folder, the root seed is the night's own."""
+        """Load the campaign with the root seed of a night; paths are relative to the plan's folder."""
         path = folder / self.campaign
         name = str(path) if path.is_file() else self.campaign
         return load_campaign(name, self.override, self.cases, night_seed(seed, night), self.algorithms)
 
 
 class Plan(Parameters):
-    """Campaigns of every night."""
+    """Campaigns to run each night."""
 
     seed: Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)] = Field(
-        default=0, description="of which each night's root seed is made, so that nights draw cases of their own"
+        default=0, description="seed from which the root seed of each night is derived: each night draws new cases"
     )
     campaigns: Annotated[tuple[PlannedCampaign, ...], Field(strict=False, min_length=1)]
 
     @model_validator(mode="after")
     def _check_names(self) -> Plan:
-        names = [one.campaign for one in self.campaigns]
+        names = [planned.campaign for planned in self.campaigns]
         if len(set(names)) < len(names):
-            raise ValueError("a campaign is named twice; give it a file and a name of its own")
+            raise ValueError("the plan contains a campaign twice; copy it to a second file with another name")
         return self
 
 
 def read_plan(path: Path) -> Plan:
-    """Read the plan in a file. Raises ConfigurationError where it cannot be read or is not valid."""
+    """Read the plan from a file. Raises ConfigurationError if the file is not readable or not valid."""
     return read_table(path, Plan)
 
 
 def night_seed(seed: int, night: int) -> int:
-    """The root seed of a night."""
+    """Derive the root seed of a night by hashing the plan's seed and the night's number."""
     digest = hashlib.sha256(f"{seed}:{night}".encode()).digest()
     return int.from_bytes(digest[:7], "little")
 
 
-def campaign_definition(campaign: Campaign) -> str:
-    """Hash a campaign's definition without seed and texts: nights are compared where it is the same."""
+def hash_definition(campaign: Campaign) -> str:
+    """Hash a campaign's definition without seed and texts; only nights with equal hashes are compared."""
     excluded = {"seed", "description", "retain", "limits", "cases"}
-    stated = campaign.configuration.model_dump(mode="json", exclude=excluded)
-    return hashlib.sha256(json.dumps(stated, sort_keys=True).encode()).hexdigest()
+    definition = campaign.configuration.model_dump(mode="json", exclude=excluded)
+    return hashlib.sha256(json.dumps(definition, sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
-class Night:
-    """A night in progress."""
+class NightlyRun:
+    """A nightly run in progress."""
 
     history: History
     number: int
@@ -98,39 +98,39 @@ class Night:
     plan: Plan
 
 
-def run_planned(now: Night, planned: PlannedCampaign, folder: Path, watch: Watch) -> None:
-    """Run a campaign, evaluate it, and store its figures; its errors do not affect the others."""
+def run_scheduled_campaign(run: NightlyRun, planned: PlannedCampaign, folder: Path, watch: Watch) -> None:
+    """Run a campaign, evaluate it, and store its metrics; its errors do not affect the other campaigns."""
     figures = []
     try:
-        campaign = planned.load(now.plan.seed, now.number, folder)
+        campaign = planned.load(run.plan.seed, run.number, folder)
         name = campaign.configuration.name
-        directory = now.out / RUNS / f"night-{now.number:05d}-{name}"
-        run_campaign(campaign, directory, now.executor, watch)
-        found, _ = settle(directory)
-        frame, compared = list_figures(found.run)
-        figures = [NightFigure(one.name, one.larger_is_better, one.level, build_sample(frame, one)) for one in compared]
-        verdict, definition = found.whole, campaign_definition(campaign)
-        result = NightCampaign(name, definition, directory.name, verdict.word, found.exit_code, verdict.sentence)
+        directory = run.out / RUNS / f"night-{run.number:05d}-{name}"
+        run_campaign(campaign, directory, run.executor, watch)
+        evaluation, _ = evaluate_and_store(directory)
+        frame, metrics = list_metrics(evaluation.run)
+        figures = [NightFigure(m.name, m.larger_is_better, m.summary_value, build_sample(frame, m)) for m in metrics]
+        verdict, definition = evaluation.overall_verdict, hash_definition(campaign)
+        result = NightCampaign(name, definition, directory.name, verdict.word, evaluation.exit_code, verdict.sentence)
     except Exception as error:  # a defect in one campaign must not stop the others
         figures = []
         if not isinstance(error, CampaignError):
             traceback.print_exc()
         result = NightCampaign(planned.campaign, "", "", NOT_RUN, Exit.FAILED, f"{type(error).__name__}: {error}")
-    now.history.add(now.number, result, figures)
+    run.history.add(run.number, result, figures)
 
 
-def publish(history: History, night: int, out: Path, found: Sequence[Change]) -> None:
+def publish_page(history: History, night: int, out: Path, changes: Sequence[Change]) -> None:
     """Write the page and the dashboard, and print the page."""
-    text = write_page(history, night, out, found)
+    text = write_page(history, night, out, changes)
     write_site(out / SITE, [out / RUNS])
     typer.echo(text)
 
 
-def write_page(history: History, night: int, out: Path, found: Sequence[Change]) -> str:
-    """Write the page of the night so far, and return it."""
-    nights = {one.night: one for one in history.nights()}
-    earlier = [one for number, one in nights.items() if number < night]
-    compared = sum(bool(one.before) for one in compare_night(history, night))
-    text = night_text(nights[night], earlier, history.campaigns(night), found, compared)
-    write_whole(out / PAGE_FILE, text)
+def write_page(history: History, night: int, out: Path, changes: Sequence[Change]) -> str:
+    """Write the page with the results of the night so far; return its text."""
+    nights = {record.night: record for record in history.nights()}
+    earlier = [record for number, record in nights.items() if number < night]
+    compared = sum(bool(comparison.before) for comparison in list_comparisons(history, night))
+    text = night_text(nights[night], earlier, history.campaigns(night), changes, compared)
+    write_atomic(out / PAGE_FILE, text)
     return text

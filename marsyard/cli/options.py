@@ -1,4 +1,4 @@
-"""Shared by all commands: options and arguments, exit status, error handling, console."""
+"""Options, arguments, exit status, error handling and console that the commands share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Exit(IntEnum):
-    """Exit status of the program; of several the order of precedence is 2, 1, 3."""
+    """Exit status of the program; if several apply, the order of precedence is 2, 1, 3."""
 
     MET = 0
     FAILED = 1
@@ -34,26 +34,26 @@ SiteArgument = Annotated[
     str, Argument(metavar="SITE", help="A site from `marsyard terrain list`, or a DTM: .tif or .npz.")
 ]
 MaxHolesOption = Annotated[
-    float | None, Option(metavar="F", min=0.0, max=0.99, help="Of a DTM: maximum fraction of missing posts.")
+    float | None, Option(metavar="F", min=0.0, max=0.99, help="Maximum fraction of missing posts of a DTM.")
 ]
 CasesOption = Annotated[int | None, Option("-n", "--cases", metavar="N", help="Number of cases.")]
-SeedOption = Annotated[int | None, Option(metavar="S", help="Root seed.")]
+SeedOption = Annotated[int | None, Option(metavar="S", help="Root seed of the random draws.")]
 JsonOption = Annotated[bool, Option("--json", help="Print JSON.")]
-DirectoryArgument = Annotated[Path, Argument(metavar="DIR", help="Folder of a campaign that was run.")]
+DirectoryArgument = Annotated[Path, Argument(metavar="DIR", help="Folder of a finished campaign run.")]
 SetOption = Annotated[
     list[str] | None,
     Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Override a value, such as render.backend=egl; the parameter is then not dispersed.",
+        help="Override a value, such as render.backend=egl; the parameter then keeps this value in all cases.",
     ),
 ]
 AlgorithmOption = Annotated[
     list[str] | None,
     Option(
         metavar="NAME",
-        help="The algorithm under test: a name, module:Class, exec:PROGRAM or serve:PROGRAM. Given several times, all "
-        "run on the same cases and are compared; the first is under test.",
+        help="The algorithm under test: a name, module:Class, exec:PROGRAM or serve:PROGRAM. If repeated, all "
+        "algorithms run on the same cases and are compared; the first is under test.",
     ),
 ]
 JobsOption = Annotated[int | None, Option(metavar="J", help="Worker processes; by default one per core.")]
@@ -64,10 +64,10 @@ CaseTimeOption = Annotated[
     float | None, Option(metavar="S", help="Time limit of a case in seconds (limits.case_time_s).")
 ]
 ChangedOption = Annotated[
-    bool, Option("--allow-changed", help="Continue with changed code or versions; the record notes it.")
+    bool, Option("--allow-changed", help="Continue with changed code or versions; the record stores the change.")
 ]
 
-OutOption = Annotated[Path | None, Option(metavar="DIR", help="Folder; by default runs/<campaign>-<UTC time>.")]
+OutOption = Annotated[Path | None, Option(metavar="DIR", help="Output folder; by default runs/<campaign>-<UTC time>.")]
 OverwriteOption = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
 
 Parameters = ParamSpec("Parameters")
@@ -75,13 +75,13 @@ Options = TypeVar("Options")
 
 
 def with_options(kind: type[Options]) -> Callable[[Callable[[Options], None]], Callable[..., None]]:
-    """Make the fields of a dataclass the arguments and options of a command, which receives one object."""
+    """Make the fields of a dataclass the options of a command, which receives one instance."""
     hints = get_type_hints(kind, include_extras=True)
-    fields = [one.replace(annotation=hints[name]) for name, one in inspect.signature(kind).parameters.items()]
+    fields = [field.replace(annotation=hints[name]) for name, field in inspect.signature(kind).parameters.items()]
 
     def decorate(command: Callable[[Options], None]) -> Callable[..., None]:
-        def call(**given: Any) -> None:
-            command(kind(**given))
+        def call(**values: Any) -> None:
+            command(kind(**values))
 
         call.__name__, call.__doc__ = command.__name__, command.__doc__
         call.__annotations__ = hints
@@ -92,11 +92,11 @@ def with_options(kind: type[Options]) -> Callable[[Callable[[Options], None]], C
 
 
 def handle_user_errors(command: Callable[Parameters, None]) -> Callable[Parameters, None]:
-    """Wrap a command: a user error, a full disk or a read-only one ends it with one message and status 2."""
+    """Wrap a command: a user error, a full disk or a read-only disk prints one message and exits with status 2."""
 
     @functools.wraps(command)
     def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
-        # imported here, so that `doctor` can report a foreign package in place of ours
+        # imported here, so that `doctor` can report another package that shadows Marsyard
         from marsyard.campaigns.errors import CampaignError
 
         try:
@@ -116,14 +116,14 @@ def fail(error: object) -> NoReturn:
 
 
 def console(*, stderr: bool = False) -> Console:
-    """The console of a command's output."""
+    """Create the console for a command's output."""
     from rich.console import Console
 
     return Console(stderr=stderr)
 
 
 def size_text(count: float) -> str:
-    """A number of bytes with a unit prefix."""
+    """Format a number of bytes with a unit prefix."""
     for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= size:
             return f"{count / size:.3g} {unit}"

@@ -1,4 +1,4 @@
-"""A campaign's verdict, exit status, report, table and pictures from its stored rows; server of a site."""
+"""Evaluate stored campaigns: verdict, exit status, report, table and images; serve a dashboard."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import pandas as pd
 import pyarrow.csv as pa_csv
@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.configuration import stored_columns_now
+from marsyard.campaigns.definition.configuration import find_renamed_columns
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
 from marsyard.campaigns.running.engine import Watch, append_cases, run_campaign
@@ -36,7 +36,7 @@ from marsyard.campaigns.store.table import TABLE_FILE, refresh_table, stored_row
 from marsyard.cli.options import Exit, size_text
 from marsyard.cli.showing import grid_table
 from marsyard.reports.campaign import write_evaluation
-from marsyard.reports.comparison import comparison, comparison_grids
+from marsyard.reports.comparison import compare_algorithms, comparison_grids
 from marsyard.reports.evaluation import Evaluation, evaluate_run, next_look
 from marsyard.reports.presentation import notable_cases
 from marsyard.reports.sampling_design import read_sampling_design
@@ -48,43 +48,43 @@ from marsyard.reports.wording import count, format_fraction, primary_metric
 
 #: Browsers that can print pages, in order of preference.
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-_PRINTING_S = 600.0
+_PRINT_TIMEOUT_S = 600.0
+Requirements: TypeAlias = Sequence[Mapping[str, Any]]
 
 
-def conclude(directory: Path, console: Console, requirements: Sequence[Mapping[str, Any]] | None = None) -> int:
-    """Evaluate a campaign, write its report, print both, and return the exit status.
+def evaluate_and_report(directory: Path, console: Console, requirements: Requirements | None = None) -> int:
+    """Evaluate a campaign, write its report, print the verdicts, and return the exit status.
 
-    An unfinished campaign is evaluated by its rows so far, with a status that is never 0; its record is not changed.
-    `requirements` replace the campaign's own; the record then keeps its status too.
-
-    Raises StoreError where the folder holds no campaign with rows, or the report cannot be written.
+    The status of an unfinished campaign is never 0; its verdict uses the rows stored so far. `requirements` replace the
+    requirements of the campaign; the record of the campaign is then not changed.
+    Raises StoreError if the folder contains no campaign with rows, or the report cannot be written.
     """
     stored = record.read(directory)
     finished = stored["state"] == "finished"
     if not finished:
         refresh_table(directory)
-    found, page = settle(directory, requirements)
-    console.print(verdict_table(found.verdicts))
-    for table in _comparison_tables(found.how.draw(found.run.frame), found.run.requirements, found.verdicts):
+    evaluation, page = evaluate_and_store(directory, requirements)
+    run, verdicts = evaluation.run, evaluation.verdicts
+    console.print(verdict_table(verdicts))
+    for table in _comparison_tables(evaluation.sampling.exclude_nominal_case(run.frame), run.requirements, verdicts):
         console.print(table)
-    lines = [f"verdict: {found.whole.word}", found.whole.sentence, f"report: {page}"]
+    lines = [f"verdict: {evaluation.overall_verdict.word}", evaluation.overall_verdict.sentence, f"report: {page}"]
     if not finished:
         state = "killed" if stored["state"] == "running" else stored["state"]
-        reason = f"it was {state}; to continue: marsyard resume {directory}"
-        reason = "it is running" if is_locked(directory) else reason
-        lines.insert(0, f"INCOMPLETE: {len(found.run.whole)} of {count(stored['cases'], 'case')}; {reason}")
+        reason = f"the campaign was {state}; to continue: marsyard resume {directory}"
+        reason = "the campaign is running" if is_locked(directory) else reason
+        lines.insert(0, f"INCOMPLETE: {len(run.all_cases)} of {count(stored['cases'], 'case')}; {reason}")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-    # what has been met so far is not met yet
-    return found.exit_code if finished else found.exit_code or Exit.INSUFFICIENT
+    # requirements met by a part of the cases are not yet met by all cases
+    return evaluation.exit_code if finished else evaluation.exit_code or Exit.INSUFFICIENT
 
 
-def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> tuple[Evaluation, Path]:
-    """Evaluate a campaign's rows and write its report; return the verdicts and the page.
+def evaluate_and_store(directory: Path, requirements: Requirements | None = None) -> tuple[Evaluation, Path]:
+    """Evaluate a campaign's rows and write its report; return the evaluation and the path of the report.
 
-    The record stores the exit status of a finished campaign that is evaluated by its own requirements.
-
-    Raises StoreError where the folder holds no campaign with rows, or the report cannot be written.
+    The exit status of a finished campaign is stored in its record, unless `requirements` replace its requirements.
+    Raises StoreError if the folder contains no campaign with rows, or the report cannot be written.
     """
     evaluation = evaluate_run(directory, requirements)
     if requirements is None and evaluation.run.recorded("state") == "finished":
@@ -93,30 +93,28 @@ def settle(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = N
         return evaluation, write_evaluation(evaluation)
 
 
-def _comparison_tables(
-    frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]], verdicts: Sequence[Verdict]
-) -> list[Table]:
-    """Comparison of algorithms on the same cases; empty for a single one."""
+def _comparison_tables(frame: pd.DataFrame, requirements: Requirements, verdicts: Sequence[Verdict]) -> list[Table]:
+    """Compare algorithms on the same cases; return no table for a single algorithm."""
     metric = primary_metric(frame, requirements)
     bound = next((v.bound for v in verdicts if v.metric == metric and math.isfinite(v.bound)), None)
-    contenders, differences = comparison(frame, metric, bound)
-    if not contenders:
+    algorithms, differences = compare_algorithms(frame, metric, bound)
+    if not algorithms:
         return []
-    titles = ("Algorithms on the same cases", f"Against {contenders[0].name}")
-    grids = zip(titles, comparison_grids(contenders, differences, metric), strict=True)
+    titles = ("Algorithms on the same cases", f"Compared with {algorithms[0].name}")
+    grids = zip(titles, comparison_grids(algorithms, differences, metric), strict=True)
     return [grid_table(title, grid) for title, grid in grids if grid.rows]
 
 
 def read_frame(directory: Path) -> pd.DataFrame:
-    """The stored rows of a campaign. Raises StoreError where there are none."""
+    """Read the stored rows of a campaign. Raises StoreError if there is no table."""
     path = directory / TABLE_FILE
     if not path.is_file():
-        raise StoreError(f"{directory} has no {TABLE_FILE}: the campaign did not end")
+        raise StoreError(f"{directory} has no {TABLE_FILE}: the campaign is not finished")
     try:
         frame = pd.read_parquet(path)
-        return frame.rename(columns=stored_columns_now(frame.columns, stored_configuration(directory).scenario))
+        return frame.rename(columns=find_renamed_columns(frame.columns, stored_configuration(directory).scenario))
     except (OSError, ValueError) as error:
-        raise StoreError(f"{path}: not a table of cases: {error}") from error
+        raise StoreError(f"{path} is not a valid table of cases: {error}") from error
 
 
 def write_csv(directory: Path) -> Path:
@@ -133,77 +131,77 @@ def write_csv(directory: Path) -> Path:
 
 
 def print_page(directory: Path) -> Path:
-    """Print the page to PDF with a headless browser."""
-    browser = next((found for name in _BROWSERS if (found := shutil.which(name))), None)
+    """Print the report to PDF with a headless browser."""
+    browser = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
     if browser is None:
-        raise CampaignError(f"--pdf takes a browser, and none is found; install chromium ({', '.join(_BROWSERS)})")
+        raise CampaignError(f"--pdf requires a browser; install chromium ({', '.join(_BROWSERS)})")
     target, page = ((directory / name).resolve() for name in ("report.pdf", "report.html"))
     with tempfile.TemporaryDirectory() as profile:
         command = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={profile}"]
         command += ["--no-pdf-header-footer", f"--print-to-pdf={target}", page.as_uri()]
         try:
-            subprocess.run(command, check=True, capture_output=True, timeout=_PRINTING_S)  # noqa: S603
+            subprocess.run(command, check=True, capture_output=True, timeout=_PRINT_TIMEOUT_S)  # noqa: S603
         except (subprocess.SubprocessError, OSError) as error:
-            raise CampaignError(f"{browser} did not print {target}: {error}") from error
+            raise CampaignError(f"{browser} failed to print {target}: {error}") from error
     return target
 
 
 def rerun_notable_cases(directory: Path) -> None:
-    """Rerun a campaign's notable cases without stored products, and store them; a differing row is reported.
+    """Rerun notable cases without stored products and store their products; report rows that differ.
 
-    Raises CampaignError where the campaign's scenario or an algorithm cannot be imported.
+    Raises CampaignError if the campaign's scenario or an algorithm cannot be imported.
     """
     run = read_run(directory)
-    lacking = [case for case in notable_cases(run) if case not in run.showcases]
-    if not lacking:
+    missing = [case for case in notable_cases(run) if case not in run.showcases]
+    if not missing:
         return
     configuration = stored_configuration(directory)
     load_stored_campaign(directory, configuration)
     with LocalExecutor(1) as workers:
-        for case in lacking:
+        for case in missing:
             replayed = replay_with(workers, configuration, case, stored_row(directory, case))
             if replayed.products is None or replayed.failed:
-                typer.echo(f"case {case}: ran again and left no pictures")
+                typer.echo(f"case {case}: rerun, but no images were produced")
                 continue
             save_packed(case_directory(directory, case), replayed.products, replayed.row)
-            differs = f", and differs from its row in: {', '.join(replayed.differing)}" if replayed.differing else ""
-            typer.echo(f"case {case}: ran again for its pictures{differs}")
+            differences = f"; the new row differs in: {', '.join(replayed.differing)}" if replayed.differing else ""
+            typer.echo(f"case {case}: rerun for its images{differences}")
 
 
-#: Terrains are counted of at most this many cases; a draw takes milliseconds.
+#: Maximum number of cases for which distinct terrains are counted; each draw takes milliseconds.
 _MAX_DRAWS = 5000
 
 
 def evidence_limits(campaign: Campaign) -> list[str]:
-    """Why requirements cannot be PASS even without a failure, with the remedy; empty where they can.
+    """Explain why requirements cannot reach PASS even without failures, with a remedy; empty if all can.
 
-    Covers requirements that are decided at a confidence, each as of all cases: a smaller population needs more.
+    Covers requirements with a confidence level and assumes that each applies to all cases; subsets need more cases.
     """
     configuration = campaign.configuration
-    asked = [one for one in configuration.requirements if one.decide_by != ESTIMATE]
-    how = read_sampling_design(configuration.model_dump(mode="json"))
-    if not asked:
+    requirements = [item for item in configuration.requirements if item.decide_by != ESTIMATE]
+    design = read_sampling_design(configuration.model_dump(mode="json"))
+    if not requirements:
         return []
-    if not how.independent:
-        return [how.no_probability]
-    hardest = max(asked, key=lambda one: minimum_sample_size(one.probability, one.confidence))
-    fewest = minimum_sample_size(hardest.probability, hardest.confidence)
-    cases = configuration.total_cases
-    what = f"{hardest.id}: {format_fraction(hardest.probability)} at {format_fraction(hardest.confidence)} confidence"
+    if not design.independent:
+        return [design.no_probability]
+    strictest = max(requirements, key=lambda item: minimum_sample_size(item.probability, item.confidence))
+    min_cases, cases = minimum_sample_size(strictest.probability, strictest.confidence), configuration.total_cases
+    level = f"{format_fraction(strictest.probability)} at {format_fraction(strictest.confidence)} confidence"
     limits = []
-    if cases < fewest:
-        limits.append(f"{what} takes at least {count(fewest, 'case')} without a failure, and {cases} are asked for.")
-    supply = how.terrains
+    if cases < min_cases:
+        needed = f"{level} takes at least {count(min_cases, 'case')} without a failure"
+        limits.append(f"{strictest.id}: {needed}; the campaign has {cases}.")
+    supply = design.terrains
     if supply is None:
         return limits
-    # the distinct terrains of the cases: in turn, or as drawn
+    # number of distinct terrains: assigned in turn, or drawn at random
     terrains = min(cases, supply.terrains) if supply.in_turn else cases
     path = next((path for path in ("location.terrain", "world.terrain") if path in configuration.dispersions), None)
     if not supply.in_turn and path is not None and cases <= _MAX_DRAWS:
         terrains = len({campaign.draws(case)[path] for case in range(int(configuration.design.nominal), cases)})
-    # cases with a terrain each are limited by their number alone; others are counted by terrains
-    if terrains < min(cases, fewest):
-        limits.append(supply.advice(fewest, hardest.probability, hardest.confidence))
+    # if several cases share a terrain, the evidence is limited by the number of terrains
+    if terrains < min(cases, min_cases):
+        limits.append(supply.advice(min_cases, strictest.probability, strictest.confidence))
     return limits
 
 
@@ -220,14 +218,14 @@ def print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:
     if estimated.inputs:
         typer.echo(f"  {count(estimated.inputs, 'terrain')} (shared inputs) to build, {estimated.input_s:.3g} s each")
     trials = count(estimated.trials, "trial case")
-    typer.echo(f"  {estimated.case_s:.3g} s a case ({low:.3g} to {high:.3g} s in {trials})")
+    typer.echo(f"  {estimated.case_s:.3g} s per case ({low:.3g} to {high:.3g} s in {trials})")
     if estimated.unfinished:
-        typer.echo(f"  {estimated.unfinished} of the trial cases did not come to their end")
+        typer.echo(f"  {estimated.unfinished} of the trial cases did not finish")
     rows, products = size_text(estimated.rows_bytes), size_text(estimated.products_bytes)
     typer.echo(f"disk: {rows} of rows, up to {products} of products")
     if estimated.inputs_bytes:
         limit = size_text(estimated.cache_limit_bytes)
-        typer.echo(f"  {size_text(estimated.inputs_bytes)} of terrains in the cache, which keeps at most {limit}")
+        typer.echo(f"  {size_text(estimated.inputs_bytes)} of terrains in the cache (maximum {limit})")
 
 
 def print_limits(campaign: Campaign) -> None:
@@ -237,16 +235,16 @@ def print_limits(campaign: Campaign) -> None:
 
 
 def run_until_decided(campaign: Campaign, directory: Path, executor: ExecutorConfig, watch: Watch) -> None:
-    """Run a campaign of at most its number of cases; see `marsyard.reports.statistics.proportions`.
+    """Run a campaign until its verdicts are decided; see `marsyard.reports.statistics.proportions`.
 
-    Raises CampaignError for dependent draws, or without a requirement to decide; and as `run_campaign`.
+    The number of cases is the maximum. Raises CampaignError for dependent draws or if no requirement has a confidence.
     """
     configuration = campaign.configuration
-    how = read_sampling_design(configuration.model_dump(mode="json"))
-    if not how.independent:
-        raise CampaignError(f"--until-decided: {how.no_probability}")
-    if all(asked.decide_by == ESTIMATE for asked in configuration.requirements):
-        raise CampaignError("--until-decided: the campaign has no requirement that is decided at a confidence")
+    design = read_sampling_design(configuration.model_dump(mode="json"))
+    if not design.independent:
+        raise CampaignError(f"--until-decided: {design.no_probability}")
+    if all(requirement.decide_by == ESTIMATE for requirement in configuration.requirements):
+        raise CampaignError("--until-decided: the campaign has no requirement with a confidence level")
     limit = configuration.total_cases
     first = configuration.model_copy(
         update={"cases": planned_looks(limit)[0].cases, "appended": (), "max_cases": limit}
@@ -257,26 +255,25 @@ def run_until_decided(campaign: Campaign, directory: Path, executor: ExecutorCon
 
 
 def continue_until_decided(directory: Path, executor: ExecutorConfig, watch: Watch) -> None:
-    """Add cases to a finished campaign with looks until it is decided."""
-    from marsyard.cli.outcome import read_frame  # the reports, which `new` does not need
-
+    """Append cases at the planned interim evaluations until the campaign is decided."""
     while True:
         configuration = record.stored_configuration(directory)
         if configuration.max_cases is None:
             return
-        plain = configuration.model_dump(mode="json")
-        how, cases = read_sampling_design(plain), configuration.total_cases
-        look = next_look(evaluate_requirements(read_frame(directory), plain["requirements"], how), how, cases)
-        if look is None:
+        settings = configuration.model_dump(mode="json")
+        design, cases = read_sampling_design(settings), configuration.total_cases
+        verdicts = evaluate_requirements(read_frame(directory), settings["requirements"], design)
+        next_cases = next_look(verdicts, design, cases)
+        if next_cases is None:
             watch.note(f"stopped after {cases} of at most {count(configuration.max_cases, 'case')}")
             return
-        append_cases(directory, look - cases, executor, watch)
+        append_cases(directory, next_cases - cases, executor, watch)
 
 
-class _Handler(SimpleHTTPRequestHandler):
-    """Serves the site's files; lists no folders, follows nothing out of it, and keeps quiet.
+class _SiteHandler(SimpleHTTPRequestHandler):
+    """Serve the files of the site's folder only, without folder listings and log messages.
 
-    `names` are the host names by which the server may be addressed.
+    `names` are the allowed host names of the server.
     """
 
     def __init__(self, *args: Any, names: Collection[str], **kwargs: Any) -> None:
@@ -284,33 +281,33 @@ class _Handler(SimpleHTTPRequestHandler):
         super().__init__(*args, **kwargs)
 
     def parse_request(self) -> bool:
-        """Refuse a request for another host: a foreign page whose name was bound to this address may not read."""
+        """Reject a request with another host name: protects against DNS rebinding."""
         if not super().parse_request():
             return False
         if not is_own_host(self.headers.get("Host", ""), self._names):
-            self.send_error(403, "this server is not known by that host name")
+            self.send_error(403, "this server does not have that host name")
             return False
         return True
 
     def translate_path(self, path: str) -> str:
-        """The file that a path of the address means; one that is not there where it leads out of the site."""
+        """Map the path of a URL to a file; a path outside the site maps to a missing file."""
         root = Path(self.directory).resolve()
         try:
             target = Path(super().translate_path(path)).resolve()
-        except (OSError, ValueError):  # such as a name with a zero byte
+        except (OSError, ValueError):  # for example a name with a zero byte
             return str(root / "no such file")
         return str(target if target.is_relative_to(root) else root / "no such file")
 
     def list_directory(self, path: object) -> None:
-        """Refuses."""
+        """Reject the request."""
         self.send_error(404, "no such file")
 
     def log_message(self, *_: object) -> None:
-        """Keeps quiet."""
+        """Print no log messages."""
 
 
 def is_own_host(header: str, names: Collection[str]) -> bool:
-    """Whether a Host header names this server: by an address, which no name server can redirect, or by a known name.
+    """Whether a Host header contains an IP address, which DNS cannot redirect, or a name of this server.
 
     >>> [is_own_host(text, ["localhost"]) for text in ("127.0.0.1:80", "[::1]", "LOCALHOST:8", "evil.example", "")]
     [True, True, True, False, False]
@@ -326,7 +323,7 @@ def is_own_host(header: str, names: Collection[str]) -> bool:
     return True
 
 
-def server(directory: Path, host: str, port: int) -> ThreadingHTTPServer:
-    """A server of a site's folder; port 0 takes one that is free."""
+def create_server(directory: Path, host: str, port: int) -> ThreadingHTTPServer:
+    """Create a server of a site's folder; port 0 selects a free port."""
     names = {"localhost", host.lower(), socket.gethostname().lower()}
-    return ThreadingHTTPServer((host, port), partial(_Handler, directory=str(directory), names=names))
+    return ThreadingHTTPServer((host, port), partial(_SiteHandler, directory=str(directory), names=names))

@@ -1,4 +1,4 @@
-"""Pictures of a site with truth layers, camera model and record of their inputs, for `render` and `gallery`."""
+"""Render images of a site with ground-truth layers, camera model and metadata, for `render` and `gallery`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt16
 
-from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, is_terrain_file, site_or_file
+from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, is_terrain_file, load_site
 from marsyard.scenarios.views import STANCES, Eye, SiteGround, camera_pose, site_scene
 from marsyard.sim import sensor
 from marsyard.sim.camera import BODY_FRAME, CameraModel, write_cahvor
@@ -27,16 +27,16 @@ from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Site, sites
 from marsyard.sim.terrain.imported import embed
 
-#: Files of a picture: 16-bit picture, truth layers, camera model, and record of its inputs.
-ENDINGS = (".png", ".npz", ".cahvor", ".json")
-#: Radiance factor of the largest number in a picture without detector.
+#: Files of an image: 16-bit image, truth layers, camera model, and metadata.
+SUFFIXES = (".png", ".npz", ".cahvor", ".json")
+#: Radiance factor that maps to full scale (65535) without a detector model.
 FULL_SCALE_RADIANCE_FACTOR = 1.0
 MAX_ALTITUDE_M = 20000.0
 
 
 @dataclass(frozen=True)
-class Shot:
-    """Site, camera pose and sun of a picture."""
+class ImageRequest:
+    """Site, camera pose and sun direction of an image."""
 
     site: str
     camera: str
@@ -52,28 +52,28 @@ class Shot:
     max_hole_fraction: float
 
     @classmethod
-    def usual(cls, site: str, camera: str, **settings: Any) -> Shot:
-        """A picture from the camera's usual pose with these settings. Raises ValueError for an invalid one."""
+    def from_defaults(cls, site: str, camera: str, **settings: Any) -> ImageRequest:
+        """Return the camera's default pose, changed by `settings`. Raises ValueError for an invalid value."""
         if not is_terrain_file(site):
             _check_name("site", site, sites())
         _check_name("camera", camera, sensor.PRESETS)
-        stance = STANCES[camera]
-        usual = {"scale": stance.scale, "altitude_m": stance.height_m, "elevation_deg": stance.elevation_deg}
-        usual |= dict.fromkeys(("east_m", "north_m", "azimuth_deg"), 0.0)
-        usual |= {"sun_azimuth_deg": 250.0, "sun_elevation_deg": 35.0}
-        usual |= {"seed": 1, "max_hole_fraction": MAX_HOLE_FRACTION}
-        given = {name: value for name, value in settings.items() if value is not None}
-        if is_terrain_file(site):  # it lies in the middle of the periodic terrain
-            terrain = site_or_file(site, float(given.get("max_hole_fraction", MAX_HOLE_FRACTION))).terrain()
-            usual |= dict.fromkeys(("east_m", "north_m"), 0.5 * terrain.samples * terrain.spacing_m)
-        shot = cls(site=site, camera=camera, **(usual | given))
-        shot._check()
-        return shot
+        pose = STANCES[camera]
+        defaults = {"scale": pose.scale, "altitude_m": pose.height_m, "elevation_deg": pose.elevation_deg}
+        defaults |= dict.fromkeys(("east_m", "north_m", "azimuth_deg"), 0.0)
+        defaults |= {"sun_azimuth_deg": 250.0, "sun_elevation_deg": 35.0}
+        defaults |= {"seed": 1, "max_hole_fraction": MAX_HOLE_FRACTION}
+        changes = {name: value for name, value in settings.items() if value is not None}
+        if is_terrain_file(site):  # the DTM is centred in the periodic terrain
+            terrain = load_site(site, float(changes.get("max_hole_fraction", MAX_HOLE_FRACTION))).terrain()
+            defaults |= dict.fromkeys(("east_m", "north_m"), 0.5 * terrain.samples * terrain.spacing_m)
+        request = cls(site=site, camera=camera, **(defaults | changes))
+        request._check()
+        return request
 
     @property
     def site_definition(self) -> Site:
-        """The site, or that of the terrain model's file. Raises ValueError where it cannot be used."""
-        return site_or_file(self.site, self.max_hole_fraction)
+        """The preset site, or a site made from the DTM file. Raises ValueError if the file is not usable."""
+        return load_site(self.site, self.max_hole_fraction)
 
     def _check(self) -> None:
         ranges = {
@@ -82,8 +82,8 @@ class Shot:
             "sun-elevation": (self.sun_elevation_deg, 0.0, 90.0),
         }
         for name, (value, low, high) in ranges.items():
-            above = value >= low if name == "elevation" else value > low
-            if not (above and value <= high):
+            is_above_minimum = value >= low if name == "elevation" else value > low
+            if not (is_above_minimum and value <= high):
                 allowed = f"{low:g}" if name == "elevation" else f"more than {low:g}"
                 raise ValueError(f"--{name} {value:g} is out of range; allowed: {allowed} to {high:g}")
         for name in ("east_m", "north_m", "azimuth_deg", "sun_azimuth_deg"):
@@ -93,63 +93,63 @@ class Shot:
         scales = [scale for scale in ("descent", "ground") if getattr(self.site_definition, scale) is not None]
         if self.scale not in scales:
             raise ValueError(
-                f"site {self.site} has no terrain at the scale '{self.scale}', from which camera {self.camera} is to "
-                f"look; with --scale: {', '.join(scales)}"
+                f"site {self.site} has no terrain at the scale '{self.scale}', which camera {self.camera} needs; "
+                f"allowed --scale: {', '.join(scales)}"
             )
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A picture of one camera, or of one of a pair."""
+class RenderedImage:
+    """An image of a single camera or of one camera of a stereo pair."""
 
-    suffix: str  #: ``-left`` or ``-right`` of a pair; empty for a single camera
-    camera: CameraModel  #: in the world frame
-    mounted: CameraModel  #: in the body frame, as written to the file
-    frame: Frame  #: radiance and truth
+    suffix: str  #: ``-left`` or ``-right`` for a stereo pair; empty for a single camera
+    camera_world: CameraModel  #: camera model in the world frame
+    camera_body: CameraModel  #: camera model in the body frame, as written to the file
+    frame: Frame  #: radiance and ground truth
     scene: Scene
-    exposed: sensor.AutoExposure | None  #: the detector at its automatic exposure time; None without detector
+    auto_exposure: sensor.AutoExposure | None  #: detector with automatic exposure time; None without detector
     counts: UInt16[np.ndarray, "rows columns"] | None  #: None without detector
-    #: whether a pixel sees a filled hole of a terrain model; None on a preset's ground
+    #: whether a pixel sees a filled hole of a DTM; None for a preset site
     filled: Bool[np.ndarray, "rows columns"] | None
 
-    def sixteen_bit(self) -> UInt16[np.ndarray, "rows columns"]:
-        """Counts shifted to the upper bits, or radiance factor in 65535ths of the full scale."""
-        if self.exposed is not None and self.counts is not None:
-            return np.asarray(self.counts * np.uint16(self.multiplied_by))
+    def to_uint16(self) -> UInt16[np.ndarray, "rows columns"]:
+        """Return the counts shifted to the upper bits, or the radiance factor scaled to 65535 at full scale."""
+        if self.auto_exposure is not None and self.counts is not None:
+            return np.asarray(self.counts * np.uint16(self.count_scale))
         fraction = np.clip(self.frame.radiance / FULL_SCALE_RADIANCE_FACTOR, 0.0, 1.0)
         return np.asarray(np.rint(65535.0 * fraction).astype(np.uint16))
 
     @property
-    def multiplied_by(self) -> int:
-        """Factor of the counts that fills 16 bits; 1 without detector."""
-        return 1 if self.exposed is None else int(2 ** (16 - self.exposed.detector.parameters.bits))
+    def count_scale(self) -> int:
+        """Factor that scales the counts to 16 bits; 1 without detector."""
+        return 1 if self.auto_exposure is None else int(2 ** (16 - self.auto_exposure.detector.parameters.bits))
 
 
-def take(shot: Shot, *, detector: bool = True, both: bool = True) -> list[Picture]:
-    """Take the picture; of a stereo pair both, or the left one alone."""
-    ground = SiteGround.of(shot.site_definition, "descent" if shot.scale == "descent" else "ground", seed=shot.seed)
-    of_camera = sensor.preset(shot.camera)
-    cameras = of_camera.cameras()
-    position = (shot.east_m, shot.north_m, shot.altitude_m)
-    pose = camera_pose(ground.surface, of_camera.design, *position, shot.azimuth_deg, shot.elevation_deg)
-    towards_sun = direction(np.radians(shot.sun_azimuth_deg), np.radians(shot.sun_elevation_deg))
+def render_images(request: ImageRequest, *, detector: bool = True, both: bool = True) -> list[RenderedImage]:
+    """Render the image; for a stereo pair both images, or the left image only."""
+    preset, site = sensor.preset(request.camera), request.site_definition
+    ground = SiteGround.of(site, "descent" if request.scale == "descent" else "ground", seed=request.seed)
+    cameras = preset.cameras()
+    position = (request.east_m, request.north_m, request.altitude_m)
+    pose = camera_pose(ground.surface, preset.design, *position, request.azimuth_deg, request.elevation_deg)
+    towards_sun = direction(np.radians(request.sun_azimuth_deg), np.radians(request.sun_elevation_deg))
     sun = Sun(towards_sun, ground.site.environment.sun_radius_rad)
     selected = cameras if both else cameras[:1]
     rays = [PixelRays.of(camera) for camera in selected]
-    # The cameras of a pair are so close together that one scene serves both.
+    # The baseline of a pair is so short that one scene serves both cameras.
     scene = site_scene(ground, Eye.of(rays[0], pose, ground.surface), sun)
-    pictures = []
+    images = []
     for number, camera in enumerate(selected):
         frame = process_renderer(default_backend()).render(scene, rays[number], pose)
-        exposed, counts = _expose(shot, ground, camera, number, frame) if detector else (None, None)
+        exposure, counts = _expose(request, ground, camera, number, frame) if detector else (None, None)
         suffix = "" if len(cameras) == 1 else ("-left", "-right")[number]
         filled = _mark_filled(ground, frame)
-        pictures.append(Picture(suffix, camera.transform(pose), camera, frame, scene, exposed, counts, filled))
-    return pictures
+        images.append(RenderedImage(suffix, camera.transform(pose), camera, frame, scene, exposure, counts, filled))
+    return images
 
 
 def _mark_filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows columns"] | None:
-    """Mark the pixels that see ground in holes of a terrain model; None for the ground of a preset."""
+    """Mark the pixels that see filled holes of a DTM; None for a preset site."""
     terrain = ground.terrain
     if terrain.source is None:
         return None
@@ -161,99 +161,99 @@ def _mark_filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows col
 
 
 def _expose(
-    shot: Shot, ground: SiteGround, camera: CameraModel, number: int, frame: Frame
+    request: ImageRequest, ground: SiteGround, camera: CameraModel, number: int, frame: Frame
 ) -> tuple[sensor.AutoExposure, UInt16[np.ndarray, "rows columns"]]:
-    """Expose the camera's detector at the site automatically; its rows are not summed."""
-    streams = Streams(shot.seed, "render", number)
-    of_camera, air = sensor.preset(shot.camera), ground.site.environment
-    # The preset's light may be another planet's.
-    sun_au = 1.0 / math.sqrt(air.solar_irradiance)
-    lit = {"responsivity_e_s": of_camera.light.responsivity_e_s(sun_au), "sun_au": sun_au}
-    parameters = of_camera.detector.model_copy(update={**lit, "rows_summed": 1})
+    """Expose the camera's detector with automatic exposure time; rows are not summed."""
+    streams = Streams(request.seed, "render", number)
+    preset, environment = sensor.preset(request.camera), ground.site.environment
+    # the preset may be defined for the distance of another planet from the sun
+    sun_au = 1.0 / math.sqrt(environment.solar_irradiance)
+    sunlight = {"responsivity_e_s": preset.light.responsivity_e_s(sun_au), "sun_au": sun_au}
+    parameters = preset.detector.model_copy(update={**sunlight, "rows_summed": 1})
     detector = sensor.Detector.draw(sensor.natural_fall_off(camera), parameters, streams.generator("detector response"))
-    # the frame's radiance factor is over the sunlight at the ground; the detector's is over that above the air
-    radiance = frame.radiance * np.float32(air.direct_share(math.radians(shot.sun_elevation_deg)))
-    exposed = sensor.auto_expose(
+    # rendered I/F is relative to the irradiance at the ground; detector I/F to that at the top of the atmosphere
+    radiance = frame.radiance * np.float32(environment.direct_share(math.radians(request.sun_elevation_deg)))
+    auto_exposure = sensor.auto_expose(
         detector, radiance, sensor.AutoExposureParameters(), streams.generator("test pictures")
     )
-    return exposed, exposed.detector.expose(radiance, streams.generator("detector noise"))
+    return auto_exposure, auto_exposure.detector.expose(radiance, streams.generator("detector noise"))
 
 
-def layers(picture: Picture) -> dict[str, Any]:
-    """The truth layers, each of the picture's rows and columns, and the pose."""
-    frame, scene = picture.frame, picture.scene
+def truth_layers(image: RenderedImage) -> dict[str, Any]:
+    """Return the ground-truth layers, each with the rows and columns of the image, and the pose."""
+    frame, scene = image.frame, image.scene
     directions = frame.world_from_body.rotation.apply(frame.rays.directions.astype(np.float64))
     phase = np.degrees(np.arccos(np.clip(-(directions @ scene.sun.direction), -1.0, 1.0)))
     ground = np.isfinite(frame.range_m)
-    # Rendered again with the sun alone: black pixels have no direct light.
-    direct = replace(scene.photometry, sky_share=0.0, sky_radiance=0.0, surrounding_albedo=0.0)
-    by_sun = process_renderer(default_backend()).render(
-        replace(scene, photometry=direct, edge_rays=1), frame.rays, frame.world_from_body
+    # Second rendering without diffuse light: zero radiance marks shadow.
+    direct_light = replace(scene.photometry, sky_share=0.0, sky_radiance=0.0, surrounding_albedo=0.0)
+    sunlit = process_renderer(default_backend()).render(
+        replace(scene, photometry=direct_light, edge_rays=1), frame.rays, frame.world_from_body
     )
-    names = np.append(scene.objects.names, [-2, -1])  # the last two: bodies -2 (sky) and -1 (ground)
+    names = np.append(scene.objects.names, [-2, -1])  # body indices -2 (sky) and -1 (ground)
     return {
         "radiance_factor": frame.radiance,
         "range_m": frame.range_m,
         "point_m": frame.points_world(),
         "normal": frame.normal,
         "object": names[frame.body].astype(np.int32),
-        "shadow": ground & (by_sun.radiance <= 0.0),
+        "shadow": ground & (sunlit.radiance <= 0.0),
         "phase_deg": np.where(ground, phase.reshape(ground.shape), np.nan).astype(np.float32),
         "world_from_body": frame.world_from_body.as_matrix(),
-        **({} if picture.filled is None else {"filled": picture.filled}),
+        **({} if image.filled is None else {"filled": image.filled}),
     }
 
 
-def write(picture: Picture, shot: Shot, prefix: Path) -> list[Path]:
-    """Write a picture's files and return their paths."""
-    png, npz, cahvor, sidecar = (_path(prefix, picture.suffix, ending) for ending in ENDINGS)
-    done, encoded = cv2.imencode(".png", picture.sixteen_bit())
-    if not done:
+def write_image(image: RenderedImage, request: ImageRequest, prefix: Path) -> list[Path]:
+    """Write the files of an image and return their paths."""
+    png, npz, cahvor, sidecar = (_path(prefix, image.suffix, ending) for ending in SUFFIXES)
+    is_encoded, encoded = cv2.imencode(".png", image.to_uint16())
+    if not is_encoded:
         raise ValueError(f"{png} could not be encoded")
     png.write_bytes(encoded.tobytes())
     with npz.open("wb") as file:
-        np.savez(file, **layers(picture))
-    write_cahvor(picture.mounted, cahvor, f"{shot.camera}{picture.suffix} at {shot.site}", frame=BODY_FRAME)
-    sidecar.write_text(json.dumps(record(picture, shot), indent=2) + "\n", encoding="utf-8")
+        np.savez(file, **truth_layers(image))
+    write_cahvor(image.camera_body, cahvor, f"{request.camera}{image.suffix} at {request.site}", frame=BODY_FRAME)
+    sidecar.write_text(json.dumps(describe_image(image, request), indent=2) + "\n", encoding="utf-8")
     return [png, npz, cahvor, sidecar]
 
 
-def record(picture: Picture, shot: Shot) -> dict[str, Any]:
-    """All inputs of a picture, and the meaning of its numbers."""
-    columns, rows = picture.camera.size
-    scene, exposed, detector = picture.scene, picture.exposed, None
-    meaning: dict[str, Any] = {
-        "holds": "radiance factor (I/F) over the sunlight that reaches the ground",
+def describe_image(image: RenderedImage, request: ImageRequest) -> dict[str, Any]:
+    """Return the metadata of an image: all inputs and the quantities in its files."""
+    columns, rows = image.camera_world.size
+    scene, auto_exposure, detector = image.scene, image.auto_exposure, None
+    png: dict[str, Any] = {
+        "holds": "radiance factor (I/F) relative to the solar irradiance at the ground",
         "full_scale_radiance_factor": FULL_SCALE_RADIANCE_FACTOR,
     }
-    if exposed is not None:
-        detector = exposed.detector.parameters
-        meaning = {
-            "holds": "counts of the detector, in the upper bits",
-            "multiplied_by": picture.multiplied_by,
+    if auto_exposure is not None:
+        detector = auto_exposure.detector.parameters
+        png = {
+            "holds": "detector counts, in the upper bits",
+            "multiplied_by": image.count_scale,
             "exposure_s": detector.exposure_s,
-            "auto_exposure_converged": exposed.converged,
+            "auto_exposure_converged": auto_exposure.converged,
         }
     return {
         "marsyard": version("marsyard"),
-        "shot": asdict(shot),
-        "picture": picture.suffix.lstrip("-") or "single",
+        "shot": asdict(request),
+        "picture": image.suffix.lstrip("-") or "single",
         "size": {"columns": columns, "rows": rows},
-        "png": meaning,
+        "png": png,
         "npz": {
-            "object": "number of the rock seen; -1 ground, -2 sky",
-            "shadow": "no direct sunlight: a cast shadow, or a face turned away from the sun",
-            "frame": "world: x east, y north (of a DTM the grid's north), z up, metres",
-            "filled": "the ground is in a hole of the DTM, which is filled",
+            "object": "number of the visible rock; -1 ground, -2 sky",
+            "shadow": "no direct sunlight: a cast shadow, or a surface that faces away from the sun",
+            "frame": "world: x east, y north (grid north for a DTM), z up, metres",
+            "filled": "the pixel sees a filled hole of the DTM",
         },
-        "cahvor": {"frame": "body; world_from_body takes it to the world"},
-        "filled_fraction": None if picture.filled is None else float(picture.filled.mean()),
-        "world_from_body": picture.frame.world_from_body.as_matrix().tolist(),
+        "cahvor": {"frame": "body frame; world_from_body transforms it to the world frame"},
+        "filled_fraction": None if image.filled is None else float(image.filled.mean()),
+        "world_from_body": image.frame.world_from_body.as_matrix().tolist(),
         "sun_direction": scene.sun.direction.tolist(),
         "photometry": asdict(scene.photometry),
         "mesh": {name: getattr(scene, name) for name in ("mesh_finest_m", "mesh_reach_m", "mesh_lines")},
         "rocks_drawn": len(scene.objects),
-        "site": shot.site_definition.model_dump(mode="json"),
+        "site": request.site_definition.model_dump(mode="json"),
         "detector": None if detector is None else detector.model_dump(mode="json"),
         "gl_backend": default_backend(),
     }
@@ -264,26 +264,26 @@ def _path(prefix: Path, suffix: str, ending: str) -> Path:
 
 
 def check_files(prefix: Path, camera: str, overwrite: bool) -> None:
-    """Raise ValueError where the files cannot be written, or exist and may not be replaced."""
+    """Raise ValueError if the files cannot be written, or exist and `overwrite` is False."""
     folder = prefix.parent
     if prefix.name in ("", ".", ".."):
-        raise ValueError(f"--out {prefix} names no file; a path without ending is needed, such as pictures/gusev")
+        raise ValueError(f"--out {prefix} is not a file name; give a path without extension, such as pictures/gusev")
     if not folder.is_dir():
-        raise ValueError(f"--out {prefix}: there is no folder {folder}")
+        raise ValueError(f"--out {prefix}: the folder {folder} does not exist")
     if not os.access(folder, os.W_OK):
-        raise ValueError(f"--out {prefix}: the folder {folder} cannot be written to")
+        raise ValueError(f"--out {prefix}: the folder {folder} is not writable")
     suffixes = ("",) if sensor.preset(camera).design.baseline_m is None else ("-left", "-right")
-    paths = [_path(prefix, suffix, ending) for suffix in suffixes for ending in ENDINGS]
+    paths = [_path(prefix, suffix, ending) for suffix in suffixes for ending in SUFFIXES]
     existing = [str(path) for path in paths if path.exists()]
     if existing and not overwrite:
-        raise ValueError(f"{', '.join(existing)}: there already; --overwrite replaces what is there")
+        raise ValueError(f"{', '.join(existing)}: files exist; use --overwrite to replace them")
 
 
 def _check_name(kind: str, name: str, names: Iterable[str]) -> None:
-    """Raise ValueError for an unknown name, with similar names."""
+    """Raise ValueError for an unknown name; the message lists similar names."""
     allowed = list(names)
     if name in allowed:
         return
-    close = get_close_matches(name, allowed, n=1) or [one for one in allowed if name and name in one]
-    meant = f"; did you mean {' or '.join(close)}?" if close else "."
-    raise ValueError(f"no {kind} is called '{name}'{meant} Allowed: {', '.join(allowed)}")
+    close = get_close_matches(name, allowed, n=1) or [candidate for candidate in allowed if name and name in candidate]
+    hint = f"; did you mean {' or '.join(close)}?" if close else "."
+    raise ValueError(f"no {kind} is called '{name}'{hint} Allowed: {', '.join(allowed)}")

@@ -1,6 +1,6 @@
-"""Progress of a running campaign: bars with rate and time left on a terminal, lines elsewhere, and `run.log`.
+"""Progress of a running campaign: bars with rate and remaining time on a terminal, text lines otherwise, and `run.log`.
 
-The classes are `Watch` objects (`marsyard.campaigns.running.engine`).
+The public classes implement `Watch` of `marsyard.campaigns.running.engine`.
 """
 
 from __future__ import annotations
@@ -29,42 +29,42 @@ LOG_FILE = "run.log"
 LINE_INTERVAL_S, LOG_INTERVAL_S = 10.0, 60.0
 
 
-def left_s(done: int, total: int, elapsed_s: float) -> float:
-    """Seconds that a stage still takes at its mean rate so far, the rate that `rate_text` prints."""
+def remaining_s(done: int, total: int, elapsed_s: float) -> float:
+    """Estimated remaining time, seconds, from the mean rate so far."""
     return elapsed_s / done * (total - done) if done else 0.0
 
 
-def rate_text(done: int, elapsed_s: float) -> str:
-    """Steps a second, or seconds a step where that is the easier number."""
+def format_rate(done: int, elapsed_s: float) -> str:
+    """Format the rate in items per second, or as seconds per item if the rate is below 1/s."""
     if done == 0 or elapsed_s <= 0.0:
         return ""
     rate = done / elapsed_s
-    return f"{rate:.1f} /s" if rate >= 1.0 else f"{1.0 / rate:.1f} s each"
+    return f"{rate:.1f} /s" if rate >= 1.0 else f"{1.0 / rate:.1f} s per item"
 
 
 def _elapsed_s(task: Task) -> float:
-    """Seconds of a stage up to now, or to its end: a stage that has ended stops counting."""
-    ended = task.finished_time if task.finished else task.elapsed
-    return ended or 0.0
+    """Return the elapsed time of a stage, seconds; the end time is fixed when the stage ends."""
+    elapsed = task.finished_time if task.finished else task.elapsed
+    return elapsed or 0.0
 
 
 class _RateColumn(ProgressColumn):
     def render(self, task: Task) -> Text:
-        return Text(rate_text(int(task.completed), _elapsed_s(task)))
+        return Text(format_rate(int(task.completed), _elapsed_s(task)))
 
 
-class _LeftColumn(ProgressColumn):
-    """Time left while a stage runs, its duration when it has ended."""
+class _RemainingColumn(ProgressColumn):
+    """Remaining time of a running stage; duration of a completed stage."""
 
     def render(self, task: Task) -> Text:
         done, total, elapsed = int(task.completed), int(task.total or 0), _elapsed_s(task)
         if task.finished or task.stop_time is not None:
-            return Text(f"{timedelta(seconds=round(elapsed))} in all")
-        return Text(f"{timedelta(seconds=round(left_s(done, total, elapsed)))} left" if done else "")
+            return Text(f"total {timedelta(seconds=round(elapsed))}")
+        return Text(f"{timedelta(seconds=round(remaining_s(done, total, elapsed)))} left" if done else "")
 
 
 class BarProgress:
-    """A bar for each stage."""
+    """Progress bars, one for each stage."""
 
     def __init__(self, console: Console) -> None:
         self.bars = Progress(
@@ -72,7 +72,7 @@ class BarProgress:
             BarColumn(),
             MofNCompleteColumn(),
             _RateColumn(),
-            _LeftColumn(),
+            _RemainingColumn(),
             console=console,
         )
         self._task = self.bars.add_task("starting", visible=False)
@@ -92,93 +92,93 @@ class BarProgress:
 
 
 class LineProgress:
-    """A line when a stage begins, every so often, and when it ends."""
+    """Print a line at the start and end of a stage and every 10 s."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
         self._stage, self._total, self._done = "", 0, 0
-        self._began = self._printed = 0.0
+        self._start_s = self._last_print_s = 0.0
 
     def begin(self, stage: str, total: int) -> None:
         """See `marsyard.campaigns.running.engine.Watch`."""
         self._stage, self._total, self._done = stage, total, 0
-        self._began = self._printed = time.monotonic()
-        self._line(f"{stage}: {total}")
+        self._start_s = self._last_print_s = time.monotonic()
+        self._print(f"{stage}: {total}")
 
     def step(self) -> None:
         """See `marsyard.campaigns.running.engine.Watch`."""
         self._done += 1
-        now = time.monotonic()
-        if self._done < self._total and now - self._printed < LINE_INTERVAL_S:
+        now_s = time.monotonic()
+        if self._done < self._total and now_s - self._last_print_s < LINE_INTERVAL_S:
             return
-        self._printed, elapsed = now, now - self._began
-        text = f"{self._stage}: {self._done}/{self._total}, {rate_text(self._done, elapsed)}"
-        left = left_s(self._done, self._total, elapsed)
-        self._line(f"{text}, {left:.0f} s left" if self._done < self._total else f"{text}, {elapsed:.1f} s")
+        self._last_print_s, elapsed_s = now_s, now_s - self._start_s
+        text = f"{self._stage}: {self._done}/{self._total}, {format_rate(self._done, elapsed_s)}"
+        remaining = remaining_s(self._done, self._total, elapsed_s)
+        self._print(f"{text}, {remaining:.0f} s left" if self._done < self._total else f"{text}, {elapsed_s:.1f} s")
 
     def note(self, text: str) -> None:
         """See `marsyard.campaigns.running.engine.Watch`."""
-        self._line(f"note: {text}")
+        self._print(f"note: {text}")
 
-    def _line(self, text: str) -> None:
+    def _print(self, text: str) -> None:
         self._console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 class RunLog:
-    """A `Watch` that appends to the log and forwards to another; a log that cannot be written stops no campaign."""
+    """A `Watch` that writes the log and forwards to another watch; errors in writing the log are ignored."""
 
     def __init__(self, directory: Path, watch: Watch) -> None:
         self._path, self._watch = directory / LOG_FILE, watch
         self._stage, self._total, self._done = "", 0, 0
-        self._started, self._write_campaign, self._begun = time.monotonic(), 0.0, False
+        self._start_s, self._last_write_s, self._has_entries = time.monotonic(), 0.0, False
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _at: TracebackType | None
+        self, kind: type[BaseException] | None, error: BaseException | None, _traceback: TracebackType | None
     ) -> None:
-        if not self._begun:
-            return  # the campaign did not begin: the folder is not its own
-        duration = f"{time.monotonic() - self._started:.1f} s"
+        if not self._has_entries:
+            return  # the campaign did not start, and the folder may belong to another campaign
+        duration = f"{time.monotonic() - self._start_s:.1f} s"
         stopped = "" if kind is None else f", {self._stage}: {self._done}/{self._total}: {kind.__name__}: {error}"
-        self._line(f"{'stopped' if stopped else 'ended'} after {duration}{stopped}")
+        self._write(f"{'stopped' if stopped else 'ended'} after {duration}{stopped}")
 
     def begin(self, stage: str, total: int) -> None:
-        """Log the begin of a stage."""
+        """Log the start of a stage."""
         self._stage, self._total, self._done = stage, total, 0
-        self._line(f"{stage}: {total}")
+        self._write(f"{stage}: {total}")
         self._watch.begin(stage, total)
 
     def step(self) -> None:
         """Count a step; log the progress at intervals."""
         self._done += 1
-        if self._done == self._total or time.monotonic() - self._write_campaign > LOG_INTERVAL_S:
-            self._line(f"{self._stage}: {self._done}/{self._total}")
+        if self._done == self._total or time.monotonic() - self._last_write_s > LOG_INTERVAL_S:
+            self._write(f"{self._stage}: {self._done}/{self._total}")
         self._watch.step()
 
     def note(self, text: str) -> None:
         """Log a note."""
-        self._line(f"note: {text}")
+        self._write(f"note: {text}")
         self._watch.note(text)
 
-    def _line(self, text: str) -> None:
-        self._write_campaign, lines = time.monotonic(), [text]
-        if not self._begun:
-            self._begun = True
+    def _write(self, text: str) -> None:
+        self._last_write_s, lines = time.monotonic(), [text]
+        if not self._has_entries:
+            self._has_entries = True
             versions = f"marsyard {version('marsyard')}, Python {platform.python_version()}, {platform.platform()}"
             lines = [f"session: {shlex.join(['marsyard', *sys.argv[1:]])}", versions, text]
-        now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        utc = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         with suppress(OSError), self._path.open("a", encoding="utf-8") as file:
-            file.writelines(f"{now} {' '.join(line.split())}\n" for line in lines)
+            file.writelines(f"{utc} {' '.join(line.split())}\n" for line in lines)
 
 
 @contextmanager
 def campaign_progress(console: Console) -> Iterator[Watch]:
-    """Report a running campaign as suits the console: by bars on a terminal, by lines elsewhere."""
+    """Report progress by bars on a terminal, and by text lines otherwise."""
     if not console.is_terminal:
         yield LineProgress(console)
         return
-    shown = BarProgress(console)
-    with shown.bars:
-        yield shown
+    progress = BarProgress(console)
+    with progress.bars:
+        yield progress

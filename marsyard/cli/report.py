@@ -1,4 +1,4 @@
-"""`marsyard report`, `compare`, `dashboard` and `nightly`: verdicts, differences, a static site, and planned runs."""
+"""Commands `marsyard report`, `compare`, `dashboard` and `nightly`: evaluate, compare, publish and schedule runs."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ LOOPBACK = "127.0.0.1"
 def report(
     directory: DirectoryArgument,
     requirements: Annotated[
-        Path | None, Option(metavar="FILE", help="Use this file's requirements for the campaign, not its own.")
+        Path | None, Option(metavar="FILE", help="Evaluate against the requirements in FILE instead.")
     ] = None,
-    pdf: Annotated[bool, Option("--pdf", help="Also print the page to report.pdf (needs Chromium).")] = False,
+    pdf: Annotated[bool, Option("--pdf", help="Also print the report to report.pdf (requires Chromium).")] = False,
     csv: Annotated[bool, Option("--csv", help="Also write all rows to cases.csv.")] = False,
     gallery: Annotated[
         bool,
-        Option("--gallery", help="First rerun the worst, some unanswered and some random cases for their pictures."),
+        Option("--gallery", help="First rerun the worst, some unanswered and some random cases to store their images."),
     ] = False,
 ) -> None:
     """Evaluate a campaign from its stored rows, complete or not, and write its report.
@@ -39,13 +39,13 @@ def report(
 
     if gallery:
         outcome.rerun_notable_cases(directory)
-    asked = None
+    selected = None
     if requirements is not None:
         name = str(record.read(directory)["name"])
-        asked = select_applicable(read_requirements(requirements), name)
-        if not asked:
-            raise CampaignError(f"{requirements}: no requirement names the campaign '{name}' in its campaigns")
-    status = outcome.conclude(directory, console(), asked)
+        selected = select_applicable(read_requirements(requirements), name)
+        if not selected:
+            raise CampaignError(f"{requirements}: no requirement lists the campaign '{name}' in its campaigns")
+    status = outcome.evaluate_and_report(directory, console(), selected)
     if csv:
         typer.echo(f"rows: {outcome.write_csv(directory)}")
     if pdf:
@@ -55,13 +55,13 @@ def report(
 
 @handle_user_errors
 def compare(
-    first: Annotated[Path, Argument(metavar="DIR", help="Folder of a campaign that was run.")],
-    second: Annotated[Path, Argument(metavar="DIR", help="Folder of another.")],
+    first: Annotated[Path, Argument(metavar="DIR", help="Folder of the first campaign.")],
+    second: Annotated[Path, Argument(metavar="DIR", help="Folder of the second campaign.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Compare two stored campaigns: success, answers and errors, with tests of their differences.
+    """Compare two stored campaigns: success rate, availability and errors, with significance tests of the differences.
 
-    Exit status 0 in any case: a difference is not a verdict.
+    The exit status is 0 even if the campaigns differ: a difference is not a verdict.
     """
     from marsyard.cli.showing import grid_table
     from marsyard.reports import comparison
@@ -77,9 +77,9 @@ def compare(
     out = console()
     out.print(grid_table("Side by side", comparison.campaign_diff_grid(["first", "second"], differences)))
     out.print(f"first: {names[0]}\nsecond: {names[1]}", markup=False, highlight=False, soft_wrap=True)
-    grounds = "terrain by terrain" if same_terrains else "terrains of their own against one another"
-    how = "the same draws, compared in pairs" if paired else f"draws of their own, compared {grounds}"
-    out.print(f"Cases: {how}. p: two-sided, corrected for the number of figures (Holm).", soft_wrap=True)
+    unpaired = "on the same terrains: comparison by terrain" if same_terrains else "on different terrains: unpaired"
+    method = "same draws: paired comparison" if paired else f"different draws {unpaired}"
+    out.print(f"Cases: {method}. p: two-sided, corrected for the number of metrics (Holm).", soft_wrap=True)
 
 
 @handle_user_errors
@@ -87,40 +87,42 @@ def dashboard(
     directories: Annotated[
         list[Path], Argument(metavar="DIR...", help="Folders of campaigns, or their parent folders.")
     ],
-    out: Annotated[Path, Option(metavar="DIR", help="The site's folder.")] = Path("site"),
-    requirements: Annotated[Path | None, Option(metavar="FILE", help="Requirements to show in place of ours.")] = None,
-    serve: Annotated[int | None, Option(metavar="PORT", help="Serve the site on this machine only.", min=0)] = None,
+    out: Annotated[Path, Option(metavar="DIR", help="Folder of the dashboard.")] = Path("site"),
+    requirements: Annotated[
+        Path | None, Option(metavar="FILE", help="Requirements file to use instead of the built-in requirements.")
+    ] = None,
+    serve: Annotated[int | None, Option(metavar="PORT", help="Serve it on this machine only.", min=0)] = None,
     host: Annotated[str, Option(metavar="ADDRESS", help="With --serve: address to listen on.")] = LOOPBACK,
 ) -> None:
-    """Write a dashboard over stored campaigns: requirements, latest verdicts, trends, pages of campaigns and cases."""
+    """Write a dashboard of stored campaigns: requirements, latest verdicts, trends, pages of campaigns and cases."""
     from marsyard.campaigns.definition.requirements import read_requirements
     from marsyard.campaigns.errors import CampaignError, report_write_errors
     from marsyard.reports.dashboard.site import write_site
 
-    missing = [str(one) for one in directories if not one.is_dir()]
+    missing = [str(directory) for directory in directories if not directory.is_dir()]
     if missing:
         raise CampaignError(f"no such folder: {', '.join(missing)}")
-    stated = None if requirements is None else {one.id: one for one in read_requirements(requirements)}
+    listed = None if requirements is None else {item.id: item for item in read_requirements(requirements)}
     with report_write_errors(out):
-        site = write_site(out, directories, stated)
+        site = write_site(out, directories, listed)
     for problem in site.problems:
         typer.echo(f"not shown: {problem}", err=True)
     typer.echo(f"campaigns: {site.campaigns}")
     typer.echo(f"dashboard: {site.index}")
     if serve is None:
         return
-    from marsyard.cli.outcome import server
+    from marsyard.cli.outcome import create_server
 
     try:
-        serving = server(out, host, serve)
+        server = create_server(out, host, serve)
     except (OSError, OverflowError) as error:
         raise CampaignError(f"--serve {serve}: {error}") from error
-    with serving:
-        typer.echo(f"serving: http://{host}:{serving.server_port}/ (Ctrl-C ends it)")
+    with server:
+        typer.echo(f"serving: http://{host}:{server.server_port}/ (stop with Ctrl-C)")
         try:
-            serving.serve_forever()
+            server.serve_forever()
         except KeyboardInterrupt:
-            typer.echo("ended")
+            typer.echo("stopped")
 
 
 @handle_user_errors
@@ -129,35 +131,37 @@ def nightly(
     out: Annotated[Path, Option(metavar="DIR", help="Folder of history, runs, page and dashboard.")] = Path("nightly"),
     jobs: JobsOption = None,
 ) -> None:
-    """Run the plan's campaigns, compare each figure with the nights before, write nightly.md and the dashboard.
+    """Run the planned campaigns, compare each metric with previous nightly runs, write nightly.md and the dashboard.
 
-    Exit status: as of the campaigns, the worst; 1 also for a regression, or a campaign that could not be run.
+    Exit status: the worst of all campaigns; 1 if a metric regressed or a campaign could not be run.
     """
     from marsyard.campaigns.errors import report_write_errors
     from marsyard.campaigns.store.record import folder_lock, git_commit
     from marsyard.cli import nightly_plan as plans
     from marsyard.cli.progress import campaign_progress
-    from marsyard.reports.history import FINISHED, INTERRUPTED, History, changes, compare_night
+    from marsyard.reports.history import FINISHED, INTERRUPTED, History, find_changes, list_comparisons
 
     path = plan or plans.PLAN_FILE
-    stated, executor = plans.read_plan(path), make_executor(jobs, None)
+    plan_definition, executor = plans.read_plan(path), make_executor(jobs, None)
     with report_write_errors(out):
         (out / plans.RUNS).mkdir(parents=True, exist_ok=True)
     with folder_lock(out), History(out / plans.HISTORY_FILE) as history:
         night = history.begin(git_commit())
-        # the page of a night that is killed
+        # write a first page in case this run is killed
         plans.write_page(history, night, out, ())
         try:
             with stop_on_signals(), campaign_progress(console(stderr=True)) as watch:
-                for one in stated.campaigns:
-                    plans.run_planned(plans.Night(history, night, out, executor, stated), one, path.parent, watch)
+                run = plans.NightlyRun(history, night, out, executor, plan_definition)
+                for planned in plan_definition.campaigns:
+                    plans.run_scheduled_campaign(run, planned, path.parent, watch)
         except KeyboardInterrupt:
             history.finish(night, INTERRUPTED)
-            plans.publish(history, night, out, ())
+            plans.publish_page(history, night, out, ())
             raise typer.Exit(Exit.INTERRUPTED) from None
-        flagged = changes(compare_night(history, night))
-        history.finish(night, FINISHED, [(one.campaign, one.figure, one.p_value, one.worse) for one in flagged])
-        plans.publish(history, night, out, flagged)
-        statuses = {one.exit_code for one in history.campaigns(night)}
-    statuses |= {int(Exit.FAILED) for one in flagged if one.worse}
-    raise typer.Exit(next((one for one in (Exit.FAILED, Exit.INSUFFICIENT) if one in statuses), Exit.MET))
+        significant = find_changes(list_comparisons(history, night))
+        rows = [(change.campaign, change.figure, change.p_value, change.worse) for change in significant]
+        history.finish(night, FINISHED, rows)
+        plans.publish_page(history, night, out, significant)
+        statuses = {campaign.exit_code for campaign in history.campaigns(night)}
+    statuses |= {int(Exit.FAILED) for change in significant if change.worse}
+    raise typer.Exit(next((status for status in (Exit.FAILED, Exit.INSUFFICIENT) if status in statuses), Exit.MET))

@@ -1,4 +1,4 @@
-"""A campaign on the terminal: its definition and draws; the stages of a case as files."""
+"""Print a campaign's definition and drawn values on the terminal; write the stages of a case to files."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from collections.abc import Mapping
 
 import numpy as np
 
-#: Width of a column of drawn values with its margin.
+#: Width of a column of drawn values with its margin, characters.
 _VALUE_WIDTH = 12
-_EXTENT = ("minimum", "mean", "maximum")
+_STATISTICS = ("minimum", "mean", "maximum")
 #: Number of quantiles of a distribution in the figure.
 _QUANTILES = 2000
-_FIGURES = (".svg", ".png")
+_FIGURE_FORMATS = (".svg", ".png")
 
 
 def show_campaign(campaign: Campaign, console: Console) -> None:
     """Print a campaign: description, parameters, dispersions and requirements."""
     configuration = campaign.configuration
-    _print_head(configuration, console)
+    _print_header(configuration, console)
     table = _table("Parameters", "parameter", "value")
     for path, value in leaves(configuration.parameters):
         nominal = f"; nominal {value}" if configuration.design.nominal else ""
@@ -48,9 +48,9 @@ def show_campaign(campaign: Campaign, console: Console) -> None:
         name = Text(path)
         if data["description"]:
             name.append(f"\n{data['description']}", style="dim")
-        source = Text(dispersion.source) if dispersion.source else Text("not stated", style="yellow")
+        source = Text(dispersion.source) if dispersion.source else Text("no source", style="yellow")
         if bounds is None:
-            bounds_text = "by formula" if dispersion.formulas else "kinds"
+            bounds_text = "by formula" if dispersion.formulas else "categories"
         else:
             low, high = bounds
             lower, upper = "" if math.isinf(low) else f"≥ {low:g}", "" if math.isinf(high) else f"≤ {high:g}"
@@ -63,43 +63,44 @@ def show_campaign(campaign: Campaign, console: Console) -> None:
             rows = "\n".join(" ".join(f"{value:8.3g}" for value in row) for row in getattr(group, group.kind))
             table.add_row(Text("\n".join(group.parameters)), Text(group.kind), Text(rows), Text(group.source))
         console.print(table)
-    table = _table("Requirements", "id", "statement", "asked")
-    for asked in configuration.requirements:
-        table.add_row(Text(asked.id), Text(asked.statement), Text(requirement_text(asked, asked.metric)))
+    table = _table("Requirements", "id", "statement", "criterion")
+    for item in configuration.requirements:
+        table.add_row(Text(item.id), Text(item.statement), Text(requirement_text(item, item.metric)))
     console.print(table)
 
 
 def show_draws(campaign: Campaign, cases: int, console: Console) -> None:
-    """Print the draws of the first cases: a row for each parameter, with as many cases as fit the terminal.
+    """Print the drawn values of the first cases: a row per parameter, with as many cases as fit the terminal.
 
-    A row begins with minimum, mean and maximum over all cases; of values other than numbers, the number of kinds.
+    A row starts with minimum, mean and maximum over all cases, or the number of distinct values if not numeric.
     """
     drawn, nominal = list_drawn_values(campaign, cases), int(campaign.configuration.design.nominal)
-    _print_head(campaign.configuration, console)
+    _print_header(campaign.configuration, console)
     cases = cases if drawn else 0
     units = {path: campaign.marginals[path].unit for path in drawn}
     names = {path: f"{path} ({unit})" if unit else path for path, unit in units.items()}
     longest = max((len(name) for name in names.values()), default=0)
-    shown = min(cases, max(1, (console.width - longest) // _VALUE_WIDTH - len(_EXTENT)))
-    title = f"Draws of {count(cases - nominal, 'case')}" + ("" if shown == cases else "; all of them with --json")
-    table = _table(title, "parameter")
+    visible = min(cases, max(1, (console.width - longest) // _VALUE_WIDTH - len(_STATISTICS)))
+    hint = "" if visible == cases else "; --json prints all cases"
+    table = _table(f"Draws of {count(cases - nominal, 'case')}{hint}", "parameter")
     table.box = box.SIMPLE_HEAD
-    headings = ["nominal" if nominal and case == 0 else f"case {case}" for case in range(shown)]
-    for heading in (*_EXTENT, *headings):
+    headings = ["nominal" if nominal and case == 0 else f"case {case}" for case in range(visible)]
+    for heading in (*_STATISTICS, *headings):
         table.add_column(heading, justify="right", overflow="fold")
     for path, values in drawn.items():
         random = values[nominal:]
-        extent = ["", "", ""]
+        statistics = ["", "", ""]
         if any(isinstance(value, bool) or not isinstance(value, int | float) for value in random):
-            extent[1] = count(len({_value(value) for value in random}), "kind")
+            statistics[1] = count(len({_format_value(value) for value in random}), "distinct value")
         elif random:
-            extent = [_value(value) for value in (min(random), sum(random) / len(random), max(random))]
-        table.add_row(Text(names[path]), *map(Text, extent), *(Text(_value(value)) for value in values[:shown]))
+            statistics = [_format_value(value) for value in (min(random), sum(random) / len(random), max(random))]
+        texts = [Text(_format_value(value)) for value in values[:visible]]
+        table.add_row(Text(names[path]), *map(Text, statistics), *texts)
     console.print(table)
 
 
 def describe_campaign(campaign: Campaign, cases: int | None) -> dict[str, Any]:
-    """A campaign as plain data, optionally with the draws of its first cases; infinite bounds are None."""
+    """Convert a campaign to plain data, optionally with the draws of its first cases; infinite bounds become None."""
     configuration = campaign.configuration
     data: dict[str, Any] = configuration.model_dump(mode="json")
     data["design"]["text"] = _sampling_text(configuration)
@@ -113,32 +114,32 @@ def describe_campaign(campaign: Campaign, cases: int | None) -> dict[str, Any]:
 
 
 def write_draws_figure(campaign: Campaign, cases: int, path: Path) -> None:
-    """Plot the draws of the first cases to an SVG or PNG file.
+    """Plot the drawn values of the first cases to an SVG or PNG file.
 
-    Raises CampaignError where the file has another ending or cannot be written, or there is nothing to draw.
+    Raises CampaignError if the file has another extension, cannot be written, or no parameter is drawn.
     """
-    from marsyard.reports.draws import Drawn, draws_figure, save_figure
+    from marsyard.reports.draws import ParameterSample, draws_figure, save_figure
 
-    if path.suffix not in _FIGURES:
-        raise CampaignError(f"--figure {path}: unknown kind of picture; allowed: {', '.join(_FIGURES)}")
+    if path.suffix not in _FIGURE_FORMATS:
+        raise CampaignError(f"--figure {path}: unknown file format; allowed: {', '.join(_FIGURE_FORMATS)}")
     nominal = int(campaign.configuration.design.nominal)
     drawn = {name: values[nominal:] for name, values in list_drawn_values(campaign, cases).items()}
     if not any(drawn.values()):
-        raise CampaignError(f"--figure {path}: nothing is drawn in {count(cases, 'case')}")
-    of_each = []
+        raise CampaignError(f"--figure {path}: no parameter is drawn in {count(cases, 'case')}")
+    marginals = []
     for name, values in drawn.items():
         dispersion, quantiles = campaign.marginals[name], None
         if not dispersion.formulas:
             quantiles = [dispersion.quantile((index + 0.5) / _QUANTILES) for index in range(_QUANTILES)]
-        of_each.append(Drawn(name, values, quantiles))
+        marginals.append(ParameterSample(name, values, quantiles))
     with report_write_errors(f"--figure {path}:"):
-        save_figure(draws_figure(campaign.configuration.name, of_each), path)
+        save_figure(draws_figure(campaign.configuration.name, marginals), path)
 
 
 def list_drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
-    """The draws of each dispersion in the first cases, by parameter.
+    """Return the drawn values of the first cases by parameter.
 
-    Raises CampaignError where the campaign has fewer cases, or a case cannot be drawn.
+    Raises CampaignError if the campaign has fewer cases or the values of a case cannot be drawn.
     """
     total = campaign.configuration.total_cases
     if not 1 <= cases <= total:
@@ -154,7 +155,7 @@ def list_drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
     return drawn
 
 
-def _print_head(configuration: CampaignConfiguration, console: Console) -> None:
+def _print_header(configuration: CampaignConfiguration, console: Console) -> None:
     for line in (
         f"{configuration.name}: {configuration.description}",
         f"scenario {configuration.scenario}, {count(configuration.total_cases, 'case')}, seed {configuration.seed}",
@@ -169,25 +170,25 @@ def _sampling_text(configuration: CampaignConfiguration) -> str:
 
 
 def _dispersion_data(campaign: Campaign, path: str) -> dict[str, Any]:
-    """One dispersion as plain data, with unit and description of the parameter where it states none itself."""
+    """Convert a dispersion to plain data; unit and description default to those of the parameter."""
     dispersion = campaign.marginals[path]
     bounds = dispersion.bounds()
     groups = (group.parameters for group in campaign.configuration.correlations if path in group.parameters)
-    stated = dispersion.description
+    description = dispersion.description
     return {
         "parameter": path,
         **dispersion.model_dump(mode="json", exclude_none=True),
         "text": dispersion.describe(),
         "bounds": None if bounds is None else [value if math.isfinite(value) else None for value in bounds],
         "unit": split_unit(path.rstrip(".0123456789"))[1] if dispersion.unit is None else dispersion.unit,
-        "description": description_at(campaign.scenario.parameters_type, path) if stated is None else stated,
+        "description": description_at(campaign.scenario.parameters_type, path) if description is None else description,
         "source": dispersion.source,
         "correlated_with": [name for group in groups for name in group if name != path],
         "nominal": value_at(campaign.configuration.parameters, path),
     }
 
 
-def _value(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.5g}"
     return value if isinstance(value, str) else json.dumps(value, default=str)
@@ -201,7 +202,7 @@ def _table(title: str, *headings: str) -> Table:
 
 
 def grid_table(title: str, grid: Grid) -> Table:
-    """A report's table on the terminal: names to the left, numbers to the right."""
+    """Convert a report's table for the terminal: names left-aligned, numbers right-aligned."""
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
     for index, heading in enumerate(grid.head):
         table.add_column(heading, justify="right" if index else "left", overflow="fold")
@@ -210,42 +211,42 @@ def grid_table(title: str, grid: Grid) -> Table:
     return table
 
 
-_PIXELS = (np.uint8, np.uint16)
+_PIXEL_TYPES = (np.uint8, np.uint16)
 
 
 def write_stages(directory: Path, products: Mapping[str, Any]) -> int:
-    """Write each product to its own file, numbered in the order of the stages; return the number of files.
+    """Write each product to a separate file, numbered in the order of the stages; return the number of files.
 
-    A picture (8 or 16 bits, two dimensions, or three with three bands) is a PNG with unchanged counts; any other array
-    is `.npy`; all else is JSON. A table or list of products is a folder. Raises StoreError.
+    An image (8 or 16 bits, 1 or 3 channels) is written as PNG with unchanged counts, other arrays as `.npy`, and other
+    values as JSON. A table or list with arrays becomes a folder. Raises StoreError.
     """
     with report_write_errors(directory):
-        return _write(directory, products)
+        return _write_products(directory, products)
 
 
-def _write(directory: Path, products: Mapping[str, Any]) -> int:
+def _write_products(directory: Path, products: Mapping[str, Any]) -> int:
     directory.mkdir(parents=True, exist_ok=True)
-    written = 0
+    files = 0
     for position, (name, value) in enumerate(products.items(), start=1):
         path = directory / f"{position:02d}-{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}"
-        if isinstance(value, list) and any(isinstance(inner, np.ndarray | Mapping) for inner in value):
-            value = {str(number): inner for number, inner in enumerate(value)}
-        if isinstance(value, Mapping) and _holds_arrays(value):
-            written += _write(path, value)
+        if isinstance(value, list) and any(isinstance(item, np.ndarray | Mapping) for item in value):
+            value = {str(number): item for number, item in enumerate(value)}
+        if isinstance(value, Mapping) and _contains_arrays(value):
+            files += _write_products(path, value)
             continue
-        written += 1
+        files += 1
         if not isinstance(value, np.ndarray):
             path.with_name(f"{path.name}.json").write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
-        elif (value.ndim == 2 or value.shape[2:] == (3,)) and value.dtype in _PIXELS and min(value.shape[:2]) > 1:
+        elif (value.ndim == 2 or value.shape[2:] == (3,)) and value.dtype in _PIXEL_TYPES and min(value.shape[:2]) > 1:
             import cv2
 
             cv2.imwrite(f"{path}.png", value)
         else:
             np.save(path.with_name(f"{path.name}.npy"), value, allow_pickle=False)
-    return written
+    return files
 
 
-def _holds_arrays(value: Any) -> bool:
+def _contains_arrays(value: Any) -> bool:
     if isinstance(value, Mapping):
-        return any(_holds_arrays(inner) for inner in value.values())
-    return isinstance(value, np.ndarray) or (isinstance(value, list) and any(_holds_arrays(inner) for inner in value))
+        return any(_contains_arrays(item) for item in value.values())
+    return isinstance(value, np.ndarray) or (isinstance(value, list) and any(_contains_arrays(item) for item in value))

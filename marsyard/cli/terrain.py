@@ -1,4 +1,4 @@
-"""`marsyard render`, `gallery` and `terrain`: pictures of sites, and statistics of their terrain."""
+"""Commands `marsyard render`, `gallery` and `terrain`: images of sites and statistics of their terrain."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from dataclasses import dataclass
 
 from marsyard.cli.options import OverwriteOption, with_options
 
-#: Longest side of a picture; colours are blue, green, red.
+#: Maximum side length of an image, pixels. Colours are (blue, green, red).
 MAX_PIXELS = 2048
 HOLE_COLOUR, OUTLINE_COLOUR = (40, 40, 220), (0, 200, 255)
 
-app = typer.Typer(no_args_is_help=True, help="Sites and the figures of their terrain.")
+app = typer.Typer(no_args_is_help=True, help="List sites and print statistics of their terrain.")
 
 
 @app.command(name="list")
@@ -41,11 +41,11 @@ def list_sites(as_json: JsonOption = False) -> None:
     rows, table = [], Table(box=None, pad_edge=False)
     for heading in ("site", "planet", "terrain", "description"):
         table.add_column(heading)
-    for one in sites().values():
-        planet = one.environment.planet
-        scales = [name for name in ("descent", "ground") if getattr(one, name) is not None]
-        rows.append({"name": one.name, "planet": planet, "terrain": scales, "description": one.description})
-        table.add_row(one.name, planet, ", ".join(scales), one.description)
+    for site in sites().values():
+        planet = site.environment.planet
+        scales = [name for name in ("descent", "ground") if getattr(site, name) is not None]
+        rows.append({"name": site.name, "planet": planet, "terrain": scales, "description": site.description})
+        table.add_row(site.name, planet, ", ".join(scales), site.description)
     if as_json:
         typer.echo(json.dumps(rows, indent=2))
     else:
@@ -55,30 +55,30 @@ def list_sites(as_json: JsonOption = False) -> None:
 @app.command()
 def stats(
     site: SiteArgument,
-    scale: Annotated[str | None, Option(metavar="SCALE", help="descent or ground; by default the coarser one.")] = None,
+    scale: Annotated[str | None, Option(metavar="SCALE", help="descent or ground; default: the coarser scale.")] = None,
     seed: Annotated[int, Option(metavar="S", min=0, help="Seed of the terrain.")] = 1,
     as_json: JsonOption = False,
     max_holes: MaxHolesOption = None,
-    picture: Annotated[Path | None, Option(metavar="PNG", help="Write a nadir picture; filled holes are red.")] = None,
+    picture: Annotated[Path | None, Option(metavar="PNG", help="Write a nadir image; filled holes are red.")] = None,
 ) -> None:
-    """Print albedo, slopes, relief and image contrast of a site's terrain next to the paper's figures."""
+    """Print albedo, slopes, relief and image contrast of a site's terrain next to the values in the paper."""
     import numpy as np
 
-    from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, grid_north_deg, site_or_file
+    from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, grid_north_deg, load_site
     from marsyard.sim.terrain.bank import synthesise
     from marsyard.sim.terrain.imported import embed
     from marsyard.sim.terrain.sites import PAPER
     from marsyard.sim.terrain.surface import terrain_statistics
 
     try:
-        known = site_or_file(site, MAX_HOLE_FRACTION if max_holes is None else max_holes)
-        parameters = known.terrain(scale)
+        definition = load_site(site, MAX_HOLE_FRACTION if max_holes is None else max_holes)
+        parameters = definition.terrain(scale)
         source = parameters.source
         real = None if source is None else embed(source, parameters.samples, parameters.spacing_m)
         grid_north = None if source is None else grid_north_deg(source.dtm)
         surface = synthesise(parameters, np.random.default_rng(seed))
         if picture is not None:
-            write_terrain_picture(picture, surface, real)
+            write_terrain_image(picture, surface, real)
     except ValueError as error:
         fail(error)
     measured = terrain_statistics(surface, None if real is None else real.real_samples(parameters.samples))
@@ -87,17 +87,17 @@ def stats(
         _print_statistics(site, parameters, seed, measured, extent, grid_north)
         return
     paper = PAPER.get(site)
-    stated: dict[str, Any] | None = None
+    published: dict[str, Any] | None = None
     if paper is not None:
-        stated = {"albedo": paper.albedo, "mean_slope_deg": paper.mean_slope_deg}
-        stated |= {"relief_at_least_m": paper.relief_m and paper.relief_m[0], "contrast": paper.contrast}
+        published = {"albedo": paper.albedo, "mean_slope_deg": paper.mean_slope_deg}
+        published |= {"relief_at_least_m": paper.relief_m and paper.relief_m[0], "contrast": paper.contrast}
     record = {
         "site": site,
         "side_m": parameters.samples * parameters.spacing_m,
         "spacing_m": parameters.spacing_m,
         "seed": seed,
         "measured": {key: value if math.isfinite(value) else None for key, value in asdict(measured).items()},
-        "paper": stated,
+        "paper": published,
         "real": None if extent is None else asdict(extent),
         "grid_north_deg": grid_north,
     }
@@ -132,27 +132,27 @@ def _print_statistics(
     table.add_row("relief, m", f"{measured.relief_m:.{1 if measured.relief_m >= 10.0 else 2}f}", relief)
     table.add_row("image contrast, RMS / mean", f"{measured.contrast:.3f}", contrast)
     out = console()
-    out.print(f"{name}: {side:g} m x {side:g} m, samples {parameters.spacing_m:g} m apart, seed {seed}")
+    out.print(f"{name}: {side:g} m x {side:g} m, sample spacing {parameters.spacing_m:g} m, seed {seed}")
     out.print(table)
     out.print(
-        "Slopes are along lines to the east and north (bidirectional). Contrast is that of the terrain seen from "
-        f"straight above in pixels of about {CONTRAST_PIXEL_M:g} m, Lunar-Lambert, sun "
-        f"{CONTRAST_SUN_ELEVATION_DEG:g} deg high in the west, without shadows or detector."
+        "Slopes are measured along lines to the east and to the north (bidirectional). Contrast is computed for a "
+        f"nadir image with pixels of about {CONTRAST_PIXEL_M:g} m, Lunar-Lambert reflection, sun in the west at "
+        f"{CONTRAST_SUN_ELEVATION_DEG:g} deg elevation, without shadows and without detector."
     )
     if extent is not None:
         out.print(
-            f"Real from east {extent.west_m:g} to {extent.east_m:g} m and north {extent.south_m:g} to "
-            f"{extent.north_m:g} m, posts {extent.posting_m:g} m apart, synthetic around it; the figures are those of "
-            f"the real part, without holes. Filled: {extent.holes} posts without height ({extent.hole_fraction:.1%}), "
-            f"{extent.ortho_holes} pixels without brightness."
+            f"The DTM covers east {extent.west_m:g} to {extent.east_m:g} m and north {extent.south_m:g} to "
+            f"{extent.north_m:g} m with posts every {extent.posting_m:g} m; the terrain around it is synthetic. The "
+            f"statistics use the DTM without its holes. Filled: {extent.holes} posts without height "
+            f"({extent.hole_fraction:.1%}), {extent.ortho_holes} orthoimage pixels without brightness."
         )
     if grid_north is not None:
-        towards, sign = ("east", "-") if grid_north >= 0.0 else ("west", "+")
-        away = f"{abs(grid_north):.2f} deg"
+        direction, sign = ("east", "-") if grid_north >= 0.0 else ("west", "+")
+        angle = f"{abs(grid_north):.2f} deg"
         out.print(
-            f"Grid north (the y axis) points {away} {towards} of true north in the middle of the file. All azimuths, "
-            "the sun's too, count from grid north: azimuth from grid north = azimuth from true north "
-            f"{sign} {away}."
+            f"Grid north (the y axis) points {angle} {direction} of true north at the centre of the file. All azimuths "
+            "are relative to grid north, including that of the sun: azimuth from grid north = azimuth from true north "
+            f"{sign} {angle}."
         )
 
 
@@ -161,10 +161,10 @@ def _range(values: tuple[float, float], digits: int) -> str:
     return f"{low:.{digits}f}" if low == high else f"{low:.{digits}f}-{high:.{digits}f}"
 
 
-def write_terrain_picture(path: Path, surface: Surface, real: Embedded | None) -> None:
-    """Write a shaded picture of a terrain, grid north up, as PNG; of an imported one the real part and its holes.
+def write_terrain_image(path: Path, surface: Surface, real: Embedded | None) -> None:
+    """Write a shaded nadir image as PNG, grid north up; for a DTM, mark its outline and filled holes.
 
-    Raises ValueError where the file exists, or cannot be written.
+    Raises ValueError if the file exists or cannot be written.
     """
     import cv2
     import numpy as np
@@ -172,26 +172,26 @@ def write_terrain_picture(path: Path, surface: Surface, real: Embedded | None) -
     from marsyard.sim.terrain.surface import CONTRAST_SUN_ELEVATION_DEG, nadir_picture
 
     if path.suffix.lower() != ".png":
-        raise ValueError(f"--picture {path}: a file that ends in .png is needed")
+        raise ValueError(f"--picture {path}: the file name must end in .png")
     if path.exists():
         raise ValueError(f"--picture {path}: exists; choose another name")
     side = len(surface.levels[0])
     level = max(int(np.ceil(np.log2(side / MAX_PIXELS))), 0)
     shaded = nadir_picture(surface, level, np.radians(315.0), np.radians(CONTRAST_SUN_ELEVATION_DEG))
     grey = np.clip(255.0 * shaded / np.percentile(shaded, 99.8), 0.0, 255.0).astype(np.uint8)
-    picture = np.repeat(grey[..., None], 3, axis=2)
+    image = np.repeat(grey[..., None], 3, axis=2)
     if real is not None:
         step = 2**level
         holes = real.filled_samples(side)[::step, ::step]
-        picture[holes] = (0.4 * picture[holes] + 0.6 * np.array(HOLE_COLOUR)).astype(np.uint8)
+        image[holes] = (0.4 * image[holes] + 0.6 * np.array(HOLE_COLOUR)).astype(np.uint8)
         south_west = real.columns.start // step, real.rows.start // step
         north_east = real.columns.stop // step, real.rows.stop // step
-        cv2.rectangle(picture, south_west, north_east, OUTLINE_COLOUR, 1)
+        cv2.rectangle(image, south_west, north_east, OUTLINE_COLOUR, 1)
     try:
-        written = cv2.imwrite(str(path), picture[::-1])
-    except cv2.error as fault:
-        raise ValueError(f"--picture {path}: cannot be written ({fault})") from fault
-    if not written:
+        is_written = cv2.imwrite(str(path), image[::-1])
+    except cv2.error as error:
+        raise ValueError(f"--picture {path}: cannot be written ({error})") from error
+    if not is_written:
         raise ValueError(f"--picture {path}: cannot be written")
 
 
@@ -200,46 +200,46 @@ class RenderOptions:
     """Arguments and options of `marsyard render`."""
 
     site: SiteArgument
-    camera: Annotated[str, Option(metavar="NAME", help="Such as mer-navcam; a wrong name lists all.")]
+    camera: Annotated[str, Option(metavar="NAME", help="Camera such as mer-navcam; an unknown name prints all.")]
     out: Annotated[Path, Option(metavar="PREFIX", help="Path of the files without extension.")]
     scale: Annotated[str | None, Option(metavar="SCALE", help="descent or ground; by default the camera's.")] = None
     altitude: Annotated[float | None, Option(metavar="M", help="Height above the ground; by default the camera's.")] = (
         None
     )
-    east: Annotated[float | None, Option(metavar="M", help="By default 0, or the middle of a DTM; periodic.")] = None
-    north: Annotated[float | None, Option(metavar="M", help="By default 0, or the middle of a DTM; periodic.")] = None
+    east: Annotated[float | None, Option(metavar="M", help="By default 0, or the centre of a DTM; periodic.")] = None
+    north: Annotated[float | None, Option(metavar="M", help="By default 0, or the centre of a DTM; periodic.")] = None
     azimuth: Annotated[float, Option(metavar="DEG", help="Viewing direction, clockwise from north.")] = 0.0
-    elevation: Annotated[float | None, Option(metavar="DEG", help="Of the optical axis; -90: down.")] = None
-    sun_azimuth: Annotated[float, Option(metavar="DEG", help="Clockwise from north.")] = 250.0
-    sun_elevation: Annotated[float, Option(metavar="DEG", help="Above the horizon.")] = 35.0
+    elevation: Annotated[float | None, Option(metavar="DEG", help="Elevation of the optical axis; -90: down.")] = None
+    sun_azimuth: Annotated[float, Option(metavar="DEG", help="Sun azimuth, clockwise from north.")] = 250.0
+    sun_elevation: Annotated[float, Option(metavar="DEG", help="Sun elevation above the horizon.")] = 35.0
     detector: Annotated[bool, Option("--detector/--radiance", help="Detector counts, or radiance factor.")] = True
-    seed: Annotated[int, Option(metavar="S", min=0, help="Of the terrain and the noise.")] = 1
+    seed: Annotated[int, Option(metavar="S", min=0, help="Seed of the terrain and the noise.")] = 1
     overwrite: OverwriteOption = False
     max_holes: MaxHolesOption = None
 
 
 @with_options(RenderOptions)
-def render(given: RenderOptions) -> None:
-    """Render a site or DTM: PREFIX.png (16 bits), .npz (truth), .cahvor (camera), .json; -left, -right of a pair."""
-    from marsyard.cli.pictures import Shot, check_files, take, write
+def render(arguments: RenderOptions) -> None:
+    """Render a site or DTM: PREFIX.png (16 bits), .npz (truth), .cahvor (camera), .json; pairs: -left and -right."""
+    from marsyard.cli.pictures import ImageRequest, check_files, render_images, write_image
 
-    with report_picture_errors(given.out):
-        settings = {"scale": given.scale, "seed": given.seed, "max_hole_fraction": given.max_holes}
-        settings |= {f"{name}_m": getattr(given, name) for name in ("altitude", "east", "north")}
+    with report_image_errors(arguments.out):
+        settings = {"scale": arguments.scale, "seed": arguments.seed, "max_hole_fraction": arguments.max_holes}
+        settings |= {f"{name}_m": getattr(arguments, name) for name in ("altitude", "east", "north")}
         angles = ("azimuth", "elevation", "sun_azimuth", "sun_elevation")
-        settings |= {f"{name}_deg": getattr(given, name) for name in angles}
-        shot = Shot.usual(given.site, given.camera, **settings)
-        check_files(given.out, given.camera, given.overwrite)
-        for picture in take(shot, detector=given.detector):
-            if picture.filled is not None and picture.filled.any():
-                part = f"{picture.filled.mean():.1%} of the pixels{picture.suffix and f' ({picture.suffix[1:]})'}"
-                typer.echo(f"note: {part} see filled holes of the DTM (`filled` in the .npz)", err=True)
-            typer.echo(", ".join(str(path) for path in write(picture, shot, given.out)))
+        settings |= {f"{name}_deg": getattr(arguments, name) for name in angles}
+        request = ImageRequest.from_defaults(arguments.site, arguments.camera, **settings)
+        check_files(arguments.out, arguments.camera, arguments.overwrite)
+        for image in render_images(request, detector=arguments.detector):
+            if image.filled is not None and image.filled.any():
+                fraction = f"{image.filled.mean():.1%} of the pixels{image.suffix and f' ({image.suffix[1:]})'}"
+                typer.echo(f"note: {fraction} see filled holes of the DTM (`filled` in the .npz)", err=True)
+            typer.echo(", ".join(str(path) for path in write_image(image, request, arguments.out)))
 
 
 @contextmanager
-def report_picture_errors(out: Path) -> Iterator[None]:
-    """End the command with status 2 where pictures cannot be rendered or written."""
+def report_image_errors(out: Path) -> Iterator[None]:
+    """End the command with status 2 if images cannot be rendered or written."""
     from marsyard.sim.render.backend import RenderingError
 
     try:
@@ -251,11 +251,11 @@ def report_picture_errors(out: Path) -> Iterator[None]:
 
 
 def gallery(
-    out: Annotated[Path, Option(metavar="DIR", help="Folder of the page and pictures.")] = Path("gallery"),
+    out: Annotated[Path, Option(metavar="DIR", help="Folder of the page and images.")] = Path("gallery"),
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Render every site through the cameras that fit it: one page, and a contact sheet. Takes about a minute."""
+    """Render each site with suitable cameras; write one page and a contact sheet. Takes about a minute."""
     from marsyard.cli.gallery import render_gallery
 
-    with report_picture_errors(out):
+    with report_image_errors(out):
         typer.echo(render_gallery(out, overwrite))

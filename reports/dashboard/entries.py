@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.requirements import StatedRequirement
+from marsyard.campaigns.definition.requirements import SharedRequirement
 from marsyard.campaigns.errors import CampaignError
-from marsyard.reports.campaign import SCHEMA, TWIN_FILE, write_report
+from marsyard.reports.campaign import REPORT_JSON, SCHEMA, write_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
 from marsyard.reports.traceability import Algorithm, format_tested_algorithms, tested_algorithms
 from marsyard.reports.verdicts import ESTIMATE
@@ -26,7 +26,7 @@ _DEPTH = 3
 
 
 @dataclass(frozen=True)
-class ShownRequirement:
+class RequirementVerdict:
     """Verdict of a campaign on one requirement."""
 
     requirement: str
@@ -45,11 +45,11 @@ class ShownRequirement:
 
 @dataclass(frozen=True)
 class Entry:
-    """A stored campaign, from its record and its report; empty fields where these state nothing.
+    """A stored campaign, from its record and its report; fields are empty if not recorded.
 
-    slug: its folder's name in the site: letters, digits, dots and hyphens, with a hash of its path.
-    tested: algorithms under test with versions, options and sources; those that are only compared follow.
-    kept, worst: cases with kept products, and those with the largest errors.
+    slug: name of its folder in the site: letters, digits, dots and hyphens, with a hash of its path.
+    tested: algorithms with versions, options and sources: under test, then only compared.
+    showcases, worst: cases with stored products, and cases with the largest errors.
     """
 
     slug: str
@@ -66,14 +66,14 @@ class Entry:
     crashed: int
     verdict: str
     sentence: str
-    shown: tuple[ShownRequirement, ...]
-    kept: tuple[int, ...]
+    requirements: tuple[RequirementVerdict, ...]
+    showcases: tuple[int, ...]
     worst: tuple[str, ...]
     outcomes: Mapping[str, int]
 
     @property
     def tested_names(self) -> str:
-        """Names and versions of the algorithm under test; names from the rows where the record states none."""
+        """Names and versions of the algorithm under test; names from the rows if the record contains none."""
         return format_tested_algorithms(self.tested) or ", ".join(self.algorithms)
 
     @property
@@ -83,24 +83,24 @@ class Entry:
 
 
 def find_campaigns(directories: Sequence[Path]) -> list[Path]:
-    """Campaigns in or below folders, each once, ordered by path."""
-    reports: dict[Path, Path] = {}
-    for one in (below for directory in directories for below in _below(directory, _DEPTH)):
-        reports.setdefault(one.resolve(), one)
-    return sorted(reports.values())
+    """Find campaigns in or below folders, each once, ordered by path."""
+    campaigns: dict[Path, Path] = {}
+    for path in (path for directory in directories for path in _find_below(directory, _DEPTH)):
+        campaigns.setdefault(path.resolve(), path)
+    return sorted(campaigns.values())
 
 
-def _below(directory: Path, depth: int) -> Iterator[Path]:
+def _find_below(directory: Path, depth: int) -> Iterator[Path]:
     if (directory / RECORD_FILE).is_file() and (directory / TABLE_FILE).is_file():
         yield directory
     elif depth and directory.is_dir():
         for inner in sorted(directory.iterdir()):
             if inner.is_dir() and not inner.is_symlink():
-                yield from _below(inner, depth - 1)
+                yield from _find_below(inner, depth - 1)
 
 
 def read_entries(paths: Iterable[Path]) -> tuple[list[Entry], list[str]]:
-    """Campaigns, the latest first, and the problems of those that cannot be shown.
+    """Read the campaigns, the latest first, and the problems of campaigns that cannot be displayed.
 
     A report that is missing, older than the rows, or of another schema is written again.
     """
@@ -110,43 +110,43 @@ def read_entries(paths: Iterable[Path]) -> tuple[list[Entry], list[str]]:
             entries.append(_read_entry(path))
         except (CampaignError, OSError, ValueError, KeyError, TypeError) as error:
             problems.append(f"{path}: {error}")
-    return sorted(entries, key=lambda one: (one.started, one.name, one.slug), reverse=True), problems
+    return sorted(entries, key=lambda entry: (entry.started, entry.name, entry.slug), reverse=True), problems
 
 
 def _read_entry(path: Path) -> Entry:
-    file, twin = path / TWIN_FILE, table(None)
+    file, report = path / REPORT_JSON, table(None)
     with suppress(OSError, ValueError):
-        twin = table(json.loads(file.read_text(encoding="utf-8")))
-    if twin.get("schema") != SCHEMA or file.stat().st_mtime < (path / TABLE_FILE).stat().st_mtime:
+        report = table(json.loads(file.read_text(encoding="utf-8")))
+    if report.get("schema") != SCHEMA or file.stat().st_mtime < (path / TABLE_FILE).stat().st_mtime:
         write_report(path)
-        twin = table(json.loads(file.read_text(encoding="utf-8")))
+        report = table(json.loads(file.read_text(encoding="utf-8")))
     record = table(json.loads((path / RECORD_FILE).read_text(encoding="utf-8")))
     parameters = table(table(record.get("configuration")).get("parameters"))
     system = find_system(str(table(record.get("configuration")).get("scenario")))
-    name = str(twin.get("campaign") or path.name)
+    name = str(report.get("campaign") or path.name)
     return Entry(
         slug=make_slug(path, name),
         directory=path,
         name=name,
         system="other" if system is None else system.name,
-        sites=_named(twin, "sites", parameters, "site"),
-        algorithms=_named(twin, "algorithms", parameters, "algorithm"),
+        sites=_read_names(report, "sites", parameters, "site"),
+        algorithms=_read_names(report, "algorithms", parameters, "algorithm"),
         tested=tuple(tested_algorithms(record)),
-        commit=str(twin.get("git_commit") or "")[:10],
-        started=str(twin.get("started_utc") or ""),
-        state=str(twin.get("state") or ""),
-        cases=int(twin.get("cases") or 0),
-        crashed=int(twin.get("crashed") or 0),
-        verdict=str(twin.get("verdict") or ""),
-        sentence=str(twin.get("sentence") or ""),
-        shown=tuple(_shown_requirement(table(one)) for one in twin.get("verdicts") or ()),
-        kept=tuple(int(case) for case in twin.get("showcases") or ()),
-        worst=tuple(str(case) for case in twin.get("worst_cases") or ()),
-        outcomes={str(key): int(value) for key, value in table(twin.get("outcomes")).items()},
+        commit=str(report.get("git_commit") or "")[:10],
+        started=str(report.get("started_utc") or ""),
+        state=str(report.get("state") or ""),
+        cases=int(report.get("cases") or 0),
+        crashed=int(report.get("crashed") or 0),
+        verdict=str(report.get("verdict") or ""),
+        sentence=str(report.get("sentence") or ""),
+        requirements=tuple(_read_verdict(table(verdict)) for verdict in report.get("verdicts") or ()),
+        showcases=tuple(int(case) for case in report.get("showcases") or ()),
+        worst=tuple(str(case) for case in report.get("worst_cases") or ()),
+        outcomes={str(key): int(value) for key, value in table(report.get("outcomes")).items()},
     )
 
 
-def _shown_requirement(verdict: Mapping[str, Any]) -> ShownRequirement:
+def _read_verdict(verdict: Mapping[str, Any]) -> RequirementVerdict:
     values: dict[str, Any] = {
         name: str(verdict.get(name) or "") for name in ("statement", "status", "decide_by", "note")
     }
@@ -154,30 +154,30 @@ def _shown_requirement(verdict: Mapping[str, Any]) -> ShownRequirement:
         values[name] = _number(verdict.get(name))
     for name in ("n", "failures"):
         values[name] = int(verdict.get(name) or 0)
-    return ShownRequirement(requirement=str(verdict.get("requirement_id") or "?"), **values)
+    return RequirementVerdict(requirement=str(verdict.get("requirement_id") or "?"), **values)
 
 
 def make_slug(path: Path, name: str) -> str:
-    """Folder name that is unique and cannot lead out of the site."""
-    plain = re.sub(r"[^A-Za-z0-9-]+", "-", name)[:60].strip("-") or "campaign"
-    return f"{plain}-{hashlib.sha256(str(path.resolve()).encode('utf-8', 'replace')).hexdigest()[:10]}"
+    """Create a folder name that is unique and stays inside the site."""
+    safe_name = re.sub(r"[^A-Za-z0-9-]+", "-", name)[:60].strip("-") or "campaign"
+    return f"{safe_name}-{hashlib.sha256(str(path.resolve()).encode('utf-8', 'replace')).hexdigest()[:10]}"
 
 
-def _named(twin: Mapping[str, Any], key: str, parameters: Mapping[str, Any], stated: str) -> tuple[str, ...]:
-    """Names in the rows, or that of the parameters where the rows have none."""
-    names = tuple(str(one) for one in twin.get(key) or () if str(one))
-    one = _first(parameters, stated)
-    return names or ((one,) if one else ())
+def _read_names(report: Mapping[str, Any], key: str, parameters: Mapping[str, Any], parameter: str) -> tuple[str, ...]:
+    """Names from the stored rows; else the name from the parameters."""
+    names = tuple(str(name) for name in report.get(key) or () if str(name))
+    name = _find_text(parameters, parameter)
+    return names or ((name,) if name else ())
 
 
-def _first(parameters: Mapping[str, Any], key: str) -> str:
-    """First text under a key at any depth of nested tables; empty where there is none."""
+def _find_text(parameters: Mapping[str, Any], key: str) -> str:
+    """Find the first text under a key at any depth of nested tables; empty if there is none."""
     for name, value in parameters.items():
         if name == key and isinstance(value, str):
             return value
-        inner = _first(value, key) if isinstance(value, Mapping) else ""
-        if inner:
-            return inner
+        nested_value = _find_text(value, key) if isinstance(value, Mapping) else ""
+        if nested_value:
+            return nested_value
     return ""
 
 
@@ -185,19 +185,19 @@ def _number(value: Any) -> float:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
 
 
-#: Maximum number of further campaigns next to a requirement's verdict.
-MAX_FURTHER_VERDICTS = 7
+#: Maximum number of other campaigns next to a requirement's verdict.
+MAX_OTHER_VERDICTS = 7
 #: Maximum number of campaigns in a sparkline, and its size in pixels.
-_TREND, _WIDTH, _HEIGHT = 24, 120.0, 26.0
+_MAX_TREND, _WIDTH, _HEIGHT = 24, 120.0, 26.0
 
 
 @dataclass(frozen=True)
 class Sparkline:
-    """Observed rates over time, oldest first: points of the line, the last one, and the height of the required rate."""
+    """Observed rates over time, oldest first: points of the line, the last one, and y of the required rate."""
 
     points: str
     last: tuple[float, float]
-    asked: float
+    required_y: float
     text: str
 
 
@@ -206,7 +206,7 @@ class Cell:
     """Verdict of a campaign on a requirement."""
 
     entry: Entry
-    shown: ShownRequirement
+    verdict: RequirementVerdict
 
 
 @dataclass(frozen=True)
@@ -227,69 +227,70 @@ class RequirementRow:
 
     @property
     def latest(self) -> Cell | None:
-        """Verdict of the latest campaign, a finished one where there is any."""
+        """Verdict of the latest campaign, of a finished one if there is any."""
         return self.cells[0] if self.cells else None
 
 
-def requirement_rows(entries: Sequence[Entry], stated: Mapping[str, StatedRequirement]) -> list[RequirementRow]:
-    """A row for every requirement that is stated or that a campaign verifies; the stated ones first."""
-    cells: dict[str, list[Cell]] = {name: [] for name in stated}
+def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequirement]) -> list[RequirementRow]:
+    """Create a row for every requirement of `shared` and every other requirement of a campaign, in this order."""
+    cells: dict[str, list[Cell]] = {name: [] for name in shared}
     for entry in entries:
-        for shown in entry.shown:
-            cells.setdefault(shown.requirement, []).append(Cell(entry, shown))
+        for verdict in entry.requirements:
+            cells.setdefault(verdict.requirement, []).append(Cell(entry, verdict))
     rows = []
-    for name, listed in cells.items():
-        found, requirement = sorted(listed, key=lambda cell: not cell.entry.finished), stated.get(name)
-        latest: dict[str, Cell] = {}
-        for cell in found:
-            latest.setdefault(cell.entry.name, cell)
-        ours = list(latest.values())
-        same = [cell.shown for cell in found if cell.entry.name == ours[0].entry.name and cell.entry.finished]
-        statement = requirement.statement if requirement else (ours[0].shown.statement if ours else "")
-        kind, source = (requirement.kind or "", requirement.source) if requirement else ("", "")
-        rows.append(RequirementRow(name, statement, kind, source, ours, found, sparkline(same[::-1])))
+    for name, unsorted_cells in cells.items():
+        sorted_cells = sorted(unsorted_cells, key=lambda cell: not cell.entry.finished)
+        by_campaign: dict[str, Cell] = {}
+        for cell in sorted_cells:
+            by_campaign.setdefault(cell.entry.name, cell)
+        latest = list(by_campaign.values())
+        history = [c.verdict for c in sorted_cells if c.entry.name == latest[0].entry.name and c.entry.finished]
+        requirement, kind, source = shared.get(name), "", ""
+        statement = latest[0].verdict.statement if latest else ""
+        if requirement:
+            statement, kind, source = requirement.statement, requirement.kind or "", requirement.source
+        rows.append(RequirementRow(name, statement, kind, source, latest, sorted_cells, sparkline(history[::-1])))
     return rows
 
 
-def sparkline(shown: Sequence[ShownRequirement]) -> Sparkline | None:
+def sparkline(verdicts: Sequence[RequirementVerdict]) -> Sparkline | None:
     """Observed rates over time against the required rate; None for fewer than two campaigns."""
-    finite = [one for one in shown if math.isfinite(one.estimate) and math.isfinite(one.probability)][-_TREND:]
+    finite = [v for v in verdicts if math.isfinite(v.estimate) and math.isfinite(v.probability)][-_MAX_TREND:]
     if len(finite) < 2:
         return None
-    rates = [one.estimate for one in finite]
-    low = min(*rates, *(one.probability for one in finite))
+    rates = [verdict.estimate for verdict in finite]
+    low = min(*rates, *(verdict.probability for verdict in finite))
     low -= 0.15 * (1.0 - low) + 1e-9
     step = (_WIDTH - 8.0) / (len(finite) - 1)
 
     def height(rate: float) -> float:
         return round(3.0 + (_HEIGHT - 6.0) * (1.0 - rate) / (1.0 - low), 2)
 
-    places = [(round(4.0 + step * k, 2), height(rate)) for k, rate in enumerate(rates)]
+    points = [(round(4.0 + step * k, 2), height(rate)) for k, rate in enumerate(rates)]
     text = f"{len(finite)} campaigns, rates {percent(rates[0])} to {percent(rates[-1])}"
-    return Sparkline(" ".join(f"{x},{y}" for x, y in places), places[-1], height(finite[-1].probability), text)
+    return Sparkline(" ".join(f"{x},{y}" for x, y in points), points[-1], height(finite[-1].probability), text)
 
 
-def coverage(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
-    """Number of requirements of each latest verdict, those without a campaign last."""
-    words = [row.latest.shown.status for row in rows if row.latest is not None]
-    known = [word for word in dict.fromkeys(("FAIL", "INSUFFICIENT", "MET BY RATE", "PASS", *words)) if word in words]
-    counts = [(word, words.count(word)) for word in known]
+def count_verdicts(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
+    """Count the requirements per latest verdict; requirements without a campaign come last."""
+    statuses = [row.latest.verdict.status for row in rows if row.latest is not None]
+    ordered = dict.fromkeys(("FAIL", "INSUFFICIENT", "MET BY RATE", "PASS", *statuses))
+    present = [status for status in ordered if status in statuses]
+    counts = [(status, statuses.count(status)) for status in present]
     missing = sum(row.latest is None for row in rows)
     return [*counts, ("NO CAMPAIGN", missing)] if missing else counts
 
 
-def evidence_text(shown: ShownRequirement) -> str:
-    """Cases behind a verdict."""
-    return f"{shown.failures:,} of {shown.n:,} failed" if shown.n else "no case yet"
+def evidence_text(verdict: RequirementVerdict) -> str:
+    """Describe the number of cases of a verdict."""
+    return f"{verdict.failures:,} of {verdict.n:,} failed" if verdict.n else "no case yet"
 
 
-def basis_text(shown: ShownRequirement) -> str:
-    """Basis of a verdict without a confidence; empty otherwise."""
-    return "decided by rate" if shown.decide_by == ESTIMATE else ""
+def basis_text(verdict: RequirementVerdict) -> str:
+    """Describe the basis of a verdict without a confidence; empty otherwise."""
+    return "evaluated by observed rate" if verdict.decide_by == ESTIMATE else ""
 
 
-def margin_text(shown: ShownRequirement) -> str:
-    """Margin of the deciding value above or below the required rate, in percentage points."""
-    if math.isnan(shown.margin):
-        return NOTHING
-    return f"{100.0 * shown.margin:+.2f} pp".replace("-", "−")
+def margin_text(verdict: RequirementVerdict) -> str:
+    """Format the margin of the deciding value relative to the required rate, in percentage points."""
+    return NOTHING if math.isnan(verdict.margin) else f"{100.0 * verdict.margin:+.2f} pp".replace("-", "−")

@@ -1,6 +1,6 @@
-"""Static site of the dashboard: an index of requirements and campaigns, and a page for each campaign and kept case.
+"""Static site of the dashboard: an index of requirements and campaigns, and a page for each campaign and stored case.
 
-All pages lie in the site's folder and need nothing outside of it; reports of campaigns are linked or copied into it.
+All pages lie in the site's folder and need no other files; reports of campaigns are linked or copied into it.
 Pages of unchanged campaigns are not rewritten, so the cost of an update depends on the new campaigns only.
 """
 
@@ -14,40 +14,40 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.requirements import StatedRequirement, shipped_requirements
-from marsyard.reports.campaign import PAGE_FILE, TWIN_FILE, VERIFICATION_FILE, page_environment, write_whole
+from marsyard.campaigns.definition.requirements import SharedRequirement, shipped_requirements
+from marsyard.reports.campaign import PAGE_FILE, REPORT_JSON, VERIFICATION_FILE, page_environment, write_atomic
 from marsyard.reports.dashboard import entries as stored
 from marsyard.reports.dashboard.entries import Entry, RequirementRow, basis_text, evidence_text, margin_text
-from marsyard.reports.presentation import shown_case
+from marsyard.reports.presentation import showcase_view
 from marsyard.reports.sections import embed_json, replay_command, script_hash
 from marsyard.reports.stored import read_run
 from marsyard.reports.traceability import algorithm_cells, verification_csv
 from marsyard.reports.wording import percent
 
 INDEX = "index.html"
-#: Maximum number of kept cases of a campaign with a page.
+#: Maximum number of cases of a campaign with a page.
 _MAX_CASES = 24
 _TEMPLATES = Path(__file__).parents[1] / "templates"
-#: Functions by which the templates format numbers.
+#: Functions of the templates that format numbers.
 _FORMATS = {"margin": margin_text, "basis": basis_text, "evidence": evidence_text, "percent": percent}
 
 
 @dataclass(frozen=True)
 class Site:
-    """Result of writing: the index, the number of campaigns, and the problems of those left out."""
+    """Result of writing: the index, the number of campaigns, and the problems of campaigns that were left out."""
 
     index: Path
     campaigns: int
     problems: Sequence[str]
 
 
-def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, StatedRequirement] | None = None) -> Site:
+def write_site(directory: Path, sources: Sequence[Path], shared: Mapping[str, SharedRequirement] | None = None) -> Site:
     """Write the dashboard of all campaigns in or below the folders `sources`.
 
-    `stated` are the requirements to be shown, by id; the shipped ones by default.
+    shared: shared requirements by id; by default those of Marsyard
     """
     entries, problems = stored.read_entries(stored.find_campaigns(sources))
-    rows = stored.requirement_rows(entries, shipped_requirements() if stated is None else stated)
+    rows = stored.requirement_rows(entries, shipped_requirements() if shared is None else shared)
     (directory / "c").mkdir(parents=True, exist_ok=True)
     for entry in entries:
         _write_campaign(directory / "c" / entry.slug, entry)
@@ -63,22 +63,22 @@ def write_site(directory: Path, sources: Sequence[Path], stated: Mapping[str, St
         rows=rows,
         entries=entries,
         problems=problems,
-        filters=[(name.lower(), name, sorted(found - {""})) for name, found in values.items()],
-        most=stored.MAX_FURTHER_VERDICTS,
-        coverage=stored.coverage(rows),
+        filters=[(name.lower(), name, sorted(choices - {""})) for name, choices in values.items()],
+        most=stored.MAX_OTHER_VERDICTS,
+        coverage=stored.count_verdicts(rows),
         data=embed_json(_data(rows)),
         script=script,
         hash=script_hash(script),
         **_FORMATS,
     )
-    write_whole(directory / INDEX, index)
-    write_whole(directory / VERIFICATION_FILE, _matrix(rows))
+    write_atomic(directory / INDEX, index)
+    write_atomic(directory / VERIFICATION_FILE, _matrix(rows))
     return Site(directory / INDEX, len(entries), problems)
 
 
 def _write_campaign(folder: Path, entry: Entry) -> None:
     page, report = folder / INDEX, entry.directory / PAGE_FILE
-    if page.is_file() and page.stat().st_mtime > (entry.directory / TWIN_FILE).stat().st_mtime:
+    if page.is_file() and page.stat().st_mtime > (entry.directory / REPORT_JSON).stat().st_mtime:
         return
     folder.mkdir(parents=True, exist_ok=True)
     if report.is_file():
@@ -91,52 +91,52 @@ def _write_campaign(folder: Path, entry: Entry) -> None:
             shutil.copyfile(report, partial)
         partial.replace(folder / PAGE_FILE)
     cases = _write_cases(folder, entry)
-    write_whole(page, _render("dashboard_campaign.html.j2", entry=entry, cases=cases, **_FORMATS))
+    write_atomic(page, _render("dashboard_campaign.html.j2", entry=entry, cases=cases, **_FORMATS))
 
 
 def _write_cases(folder: Path, entry: Entry) -> list[dict[str, str]]:
-    if not entry.kept:
+    if not entry.showcases:
         return []
-    run, listed = read_run(entry.directory), []
-    # the worst first
-    kept = sorted(entry.kept, key=lambda case: _rank_among_worst(entry, case))
-    for case in kept[:_MAX_CASES]:
-        shown = shown_case(run, case)
-        if shown is None:
+    run, links = read_run(entry.directory), []
+    # largest errors first
+    cases = sorted(entry.showcases, key=lambda case: _rank_among_worst(entry, case))
+    for case in cases[:_MAX_CASES]:
+        showcase = showcase_view(run, case)
+        if showcase is None:
             continue
-        row = run.whole[run.whole["case"] == case] if "case" in run.whole else run.whole[:0]
+        row = run.all_cases[run.all_cases["case"] == case] if "case" in run.all_cases else run.all_cases[:0]
         values = {str(name): str(value) for name, value in row.iloc[0].items()} if len(row) else {}
         command = replay_command(run, str(case))
-        text = _render("dashboard_case.html.j2", entry=entry, shown=shown, values=values, command=command)
-        write_whole(folder / f"case-{case}.html", text)
-        place = _rank_among_worst(entry, case)
-        rank = "" if place == len(entry.worst) else ("the largest error" if place == 0 else "among the largest errors")
-        listed.append({"case": str(case), "outcome": shown.outcome, "file": f"case-{case}.html", "rank": rank})
-    return listed
+        page = _render("dashboard_case.html.j2", entry=entry, showcase=showcase, values=values, command=command)
+        write_atomic(folder / f"case-{case}.html", page)
+        index = _rank_among_worst(entry, case)
+        rank = "" if index == len(entry.worst) else ("the largest error" if index == 0 else "among the largest errors")
+        links.append({"case": str(case), "outcome": showcase.outcome, "file": f"case-{case}.html", "rank": rank})
+    return links
 
 
 def _rank_among_worst(entry: Entry, case: int) -> int:
-    """Index of a case among those of the largest errors; their number where it is none of them."""
+    """Index of a case among the cases with the largest errors; the number of these cases if it is not one of them."""
     return entry.worst.index(str(case)) if str(case) in entry.worst else len(entry.worst)
 
 
 def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
-    """Data with which the page's script finds the latest verdict among the filtered campaigns."""
+    """Data from which the page's script selects the latest verdict among the filtered campaigns."""
     return {
         row.requirement: [
             {
                 "slug": cell.entry.slug,
                 "name": cell.entry.name,
                 "algorithm": cell.entry.tested_names,
-                "status": cell.shown.status,
-                "margin": margin_text(cell.shown),
+                "status": cell.verdict.status,
+                "margin": margin_text(cell.verdict),
                 "date": cell.entry.started[:10],
-                "evidence": evidence_text(cell.shown),
+                "evidence": evidence_text(cell.verdict),
                 "finished": cell.entry.finished,
-                "rate": cell.shown.estimate if math.isfinite(cell.shown.estimate) else None,
-                "asked": cell.shown.probability if math.isfinite(cell.shown.probability) else None,
-                "rate_text": percent(cell.shown.estimate),
-                "basis": basis_text(cell.shown),
+                "rate": cell.verdict.estimate if math.isfinite(cell.verdict.estimate) else None,
+                "asked": cell.verdict.probability if math.isfinite(cell.verdict.probability) else None,
+                "rate_text": percent(cell.verdict.estimate),
+                "basis": basis_text(cell.verdict),
             }
             for cell in row.all_cells
         ]
@@ -147,21 +147,15 @@ def _data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
 def _matrix(rows: Sequence[RequirementRow]) -> str:
     """Traceability matrix as CSV: the latest verdict of each campaign, also requirements without a campaign."""
     exported: list[dict[str, Any]] = []
-    shown_as = {
-        "verdict": "status",
-        "decided_by": "decide_by",
-        "cases": "n",
-        "rate": "estimate",
-        "lower_bound": "lower",
-    }
-    shown_as |= {name: name for name in ("probability", "confidence", "failures", "note")}
+    fields = {"verdict": "status", "decided_by": "decide_by", "cases": "n", "rate": "estimate", "lower_bound": "lower"}
+    fields |= {name: name for name in ("probability", "confidence", "failures", "note")}
     for row in rows:
-        about = {"requirement": row.requirement, "statement": row.statement, "kind": row.kind, "source": row.source}
+        head = {"requirement": row.requirement, "statement": row.statement, "kind": row.kind, "source": row.source}
         if not row.cells:
-            exported.append({**about, "verdict": "NO CAMPAIGN"})
+            exported.append({**head, "verdict": "NO CAMPAIGN"})
         for cell in row.cells:
-            shown = {column: getattr(cell.shown, name) for column, name in shown_as.items()}
-            exported.append({**about, "campaign": cell.entry.name, **algorithm_cells(cell.entry.tested), **shown})
+            verdict = {column: getattr(cell.verdict, name) for column, name in fields.items()}
+            exported.append({**head, "campaign": cell.entry.name, **algorithm_cells(cell.entry.tested), **verdict})
     return verification_csv(exported)
 
 

@@ -2,7 +2,7 @@
 
 Two image pairs side by side. Below, the pictures as delivered, with templates (red) and tracked positions (green);
 above, the pictures rectified to a nadir view, with search windows (blue). Between them the correlated templates and
-windows, which the paper does not show. Dashed squares belong to tracks that failed a validity check.
+windows, which the paper does not show. Dashed squares: tracks that failed a validity check.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import Polygon, Rectangle
 from scipy import ndimage
 
-from marsyard.reports.presentation import numeric_product, plane, save_figures
+from marsyard.reports.presentation import numeric_product, save_figures, to_matrix
 from marsyard.reports.section import INK, draw_pictures, in_page_style, show_subframe
 
 Picture = Float[np.ndarray, "_ _"]
 TEMPLATE, MATCH, WINDOW = "#ff4b3e", "#35d46b", "#4aa3ff"
-#: Side of a template's square on a delivered picture if the products lack it, pixels.
+#: Side of a template's square on a delivered picture if it is missing from the products, pixels.
 _DEFAULT_SIDE = 15.0
 _PAIRS = (0, 1)
 _MAX_TRACKS = 2
@@ -35,18 +35,16 @@ _INCHES = 8.3 / 4.9
 _RECTIFIED_PX = 384
 #: Valid template numbers; two templates a pair are drawn, the table lists all.
 _TEMPLATES = range(100)
-_DASHES = (0, (2, 1.5))
+_DASHED = (0, (2, 1.5))
 
 
 @dataclass(frozen=True)
 class Track:
     """One template and its track.
 
-    pair, template: numbers from 0
-    valid: whether it passed the validity checks
-    values: its columns of the products' table
-    patch, window: rectified template and search window
-    position: row and column of the matched template's centre in the window
+    pair, template: numbers from 0 valid: whether it passed the validity checks values: values of the track in the
+    products' table, by column patch, window: rectified template and search window position: row and column of the
+    matched template's centre in the window
     """
 
     pair: int
@@ -59,12 +57,12 @@ class Track:
 
 
 def is_dimes_case(products: Mapping[str, Any]) -> bool:
-    """Whether products hold the three pictures of a DIMES case."""
-    return all(plane(products.get(f"image_{number}")) is not None for number in (1, 2, 3))
+    """Whether products contain the three pictures of a DIMES case."""
+    return all(to_matrix(products.get(f"image_{number}")) is not None for number in (1, 2, 3))
 
 
-def tracks(products: Mapping[str, Any]) -> list[Track]:
-    """The tracks of a case, those that the products hold in a form that can be read."""
+def read_tracks(products: Mapping[str, Any]) -> list[Track]:
+    """Read the tracks of a case; invalid tracks are ignored."""
     try:
         table = np.atleast_2d(np.asarray(products.get("tracks", ()), dtype=np.float64))
         names = [str(name) for name in np.asarray(products.get("tracks_columns", ())).ravel()]
@@ -72,38 +70,38 @@ def tracks(products: Mapping[str, Any]) -> list[Track]:
         return []
     if table.size == 0 or table.shape[1] != len(names):
         return []
-    panels = []
+    case_tracks = []
     for row in (dict(zip(names, (float(value) for value in values), strict=True)) for values in table):
         if row.get("pair") not in _PAIRS or row.get("template") not in _TEMPLATES:
             continue
         pair, template = int(row["pair"]), int(row["template"])
-        patch, window = (plane(products.get(f"{part}_{pair}_{template}")) for part in ("template", "window"))
+        patch, window = (to_matrix(products.get(f"{part}_{pair}_{template}")) for part in ("template", "window"))
         match = numeric_product(products.get(f"match_{pair}_{template}"))
         position = (float(match[0]), float(match[1])) if match is not None and match.size == 2 else None
-        panels.append(Track(pair, template, row.get("valid", 0.0) == 1.0, row, patch, window, position))
-    return panels
+        case_tracks.append(Track(pair, template, row.get("valid", 0.0) == 1.0, row, patch, window, position))
+    return case_tracks
 
 
 @in_page_style
 def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
-    """Both image pairs of a case, side by side; raises ValueError without the three pictures."""
+    """Draw both image pairs of a case, side by side; raises ValueError without the three pictures."""
     figure = Figure(figsize=(12.0, max(_height_in(products, pair) for pair in _PAIRS)), layout="constrained")
-    halves = figure.add_gridspec(1, 2)
+    columns = figure.add_gridspec(1, 2)
     for pair in _PAIRS:
-        _draw_pair(figure.add_subfigure(halves[pair]), products, pair)
+        _draw_pair(figure.add_subfigure(columns[pair]), products, pair)
     return figure
 
 
 @in_page_style
 def draw_dimes_pair(products: Mapping[str, Any], pair: int) -> Figure:
-    """One image pair of a case, 0 or 1; raises ValueError without its pictures."""
+    """Draw one image pair of a case, 0 or 1; raises ValueError without its pictures."""
     figure = Figure(figsize=(6.0, _height_in(products, pair)), layout="constrained")
     _draw_pair(figure, products, pair)
     return figure
 
 
 def draw_delivered_pictures(products: Mapping[str, Any]) -> Figure:
-    """The three pictures with binned columns; raises ValueError if one is missing."""
+    """Draw the three pictures with binned columns; raises ValueError if one is missing."""
     return draw_pictures([_picture(products, f"image_{number}") for number in (1, 2, 3)])
 
 
@@ -115,13 +113,13 @@ def write_dimes_figures(directory: Path, products: Mapping[str, Any]) -> list[Pa
 
 
 def _row_heights(products: Mapping[str, Any], pair: int) -> dict[str, float]:
-    """Relative heights of the rows that a pair has something to show in, from above."""
-    shown = {
+    """Relative heights of the non-empty rows of a pair, from top to bottom."""
+    has_content = {
         "rectified": any(numeric_product(products.get(f"rectified_{pair}_{side}")) is not None for side in (0, 1)),
-        "templates": any(one.pair == pair and one.patch is not None for one in tracks(products)),
+        "templates": any(track.pair == pair and track.patch is not None for track in read_tracks(products)),
         "delivered": True,
     }
-    return {name: _ROW_HEIGHTS[name] for name, has in shown.items() if has}
+    return {name: _ROW_HEIGHTS[name] for name, is_drawn in has_content.items() if is_drawn}
 
 
 def _height_in(products: Mapping[str, Any], pair: int) -> float:
@@ -130,37 +128,37 @@ def _height_in(products: Mapping[str, Any], pair: int) -> float:
 
 def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> None:
     pictures = [_picture(products, f"image_{number}") for number in (pair + 1, pair + 2)]
-    ours = [track for track in tracks(products) if track.pair == pair][:_MAX_TRACKS]
+    pair_tracks = [track for track in read_tracks(products) if track.pair == pair][:_MAX_TRACKS]
     heights = _row_heights(products, pair)
     cells = figure.add_gridspec(len(heights), 1, height_ratios=[*heights.values()])
-    grid = {name: cells[place] for place, name in enumerate(heights)}
+    grid = {name: cells[index] for index, name in enumerate(heights)}
     if "rectified" in grid:
-        upper = grid["rectified"].subgridspec(1, 2)
+        rectified_cells = grid["rectified"].subgridspec(1, 2)
         for side, picture in enumerate(pictures):
-            _draw_rectified(figure.add_subplot(upper[side]), products, picture, ours, pair, side)
+            _draw_rectified(figure.add_subplot(rectified_cells[side]), products, picture, pair_tracks, pair, side)
     if "templates" in grid:
-        middle = grid["templates"].subgridspec(1, 2 * _MAX_TRACKS)
-        for place in range(_MAX_TRACKS):
-            panels = [figure.add_subplot(middle[2 * place + k]) for k in (0, 1)]
-            if place < len(ours):
-                _draw_template_window(panels, ours[place])
+        template_cells = grid["templates"].subgridspec(1, 2 * _MAX_TRACKS)
+        for index in range(_MAX_TRACKS):
+            panels = [figure.add_subplot(template_cells[2 * index + k]) for k in (0, 1)]
+            if index < len(pair_tracks):
+                _draw_template_window(panels, pair_tracks[index])
             else:
                 for axes in panels:
                     axes.set_axis_off()
-    lower = grid["delivered"].subgridspec(1, 2)
+    delivered_cells = grid["delivered"].subgridspec(1, 2)
     for side, (picture, stem, colour) in enumerate(
         zip(pictures, ("template", "match"), (TEMPLATE, MATCH), strict=True)
     ):
-        axes = figure.add_subplot(lower[side])
+        axes = figure.add_subplot(delivered_cells[side])
         show_subframe(axes, picture)
         axes.set_facecolor(INK)
-        _mark_tracks(axes, ours, stem, colour)
+        _mark_tracks(axes, pair_tracks, stem, colour)
         _outline_overlap(axes, products, pair, side)
         axes.set_title(f"Picture {pair + side + 1}: {'templates' if side == 0 else 'tracked'}", fontsize=9)
 
 
 def _draw_rectified(
-    axes: Axes, products: Mapping[str, Any], picture: Picture, ours: Sequence[Track], pair: int, side: int
+    axes: Axes, products: Mapping[str, Any], picture: Picture, pair_tracks: Sequence[Track], pair: int, side: int
 ) -> None:
     lattice = numeric_product(products.get(f"rectified_{pair}_{side}"))
     frame, gsd = numeric_product(products.get(f"rectified_frame_{pair}")), numeric_product(products.get(f"gsd_{pair}"))
@@ -171,57 +169,57 @@ def _draw_rectified(
     show_subframe(axes, rectified)
     axes.set_facecolor(INK)
     step = float(frame[2]) * (lattice.shape[0] - 1) / (rectified.shape[0] - 1)
-    spacing = float(gsd[0]) if gsd is not None and gsd.size == 1 else np.nan
+    spacing_m = float(gsd[0]) if gsd is not None and gsd.size == 1 else np.nan
 
-    def square(ground: Float[np.ndarray, "2"], side_px: int, colour: str, valid: bool) -> None:
+    def draw_square(ground: Float[np.ndarray, "2"], side_px: int, colour: str, valid: bool) -> None:
         centre = ((ground[0] - frame[0]) / step, (frame[1] - ground[1]) / step)
-        _draw_square(axes, centre, side_px * spacing / step, colour, valid)
+        _draw_square(axes, centre, side_px * spacing_m / step, colour, valid)
 
-    for track in ours:
+    for track in pair_tracks:
         ground = np.array([track.values.get(f"ground_{axis}_m", np.nan) for axis in ("east", "north")])
         if track.patch is None or track.window is None:
             continue
         if side == 0:
-            square(ground, len(track.patch), TEMPLATE, track.valid)
+            draw_square(ground, len(track.patch), TEMPLATE, track.valid)
         else:
-            square(ground, len(track.window), WINDOW, True)
+            draw_square(ground, len(track.window), WINDOW, True)
             if track.position is not None:
                 # the window is centred on `ground`
-                middle = 0.5 * (len(track.window) - 1)
-                offset = np.array([track.position[1] - middle, middle - track.position[0]])
-                square(ground + spacing * offset, len(track.patch), MATCH, track.valid)
+                centre = 0.5 * (len(track.window) - 1)
+                offset = np.array([track.position[1] - centre, centre - track.position[0]])
+                draw_square(ground + spacing_m * offset, len(track.patch), MATCH, track.valid)
     axes.set_title(f"Picture {pair + side + 1} rectified{'' if side == 0 else ': windows'}", fontsize=9)
 
 
 def _rectify(picture: Picture, lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndarray, "m m"]:
     """Resample the picture at the interpolated pixels of a lattice; NaN outside the picture."""
-    places = np.linspace(0.0, lattice.shape[0] - 1.0, _RECTIFIED_PX)
-    v, u = np.meshgrid(places, places, indexing="ij")
+    indices = np.linspace(0.0, lattice.shape[0] - 1.0, _RECTIFIED_PX)
+    v, u = np.meshgrid(indices, indices, indexing="ij")
     pixels = [ndimage.map_coordinates(lattice[..., k], [v, u], order=1, mode="nearest") for k in (1, 0)]
     rows, columns = picture.shape
-    seen = (pixels[0] >= -0.5) & (pixels[0] <= rows - 0.5) & (pixels[1] >= -0.5) & (pixels[1] <= columns - 0.5)
+    is_inside = (pixels[0] >= -0.5) & (pixels[0] <= rows - 0.5) & (pixels[1] >= -0.5) & (pixels[1] <= columns - 0.5)
     values = ndimage.map_coordinates(picture, np.nan_to_num(pixels, nan=-1.0), order=1, mode="nearest")
-    return np.asarray(np.where(seen, values, np.nan))
+    return np.asarray(np.where(is_inside, values, np.nan))
 
 
 def _draw_template_window(axes: Sequence[Axes], track: Track) -> None:
-    line = "-" if track.valid else _DASHES
+    line = "-" if track.valid else _DASHED
     parts = ((track.patch, f"Template {track.template + 1}", TEMPLATE, line), (track.window, "Window", WINDOW, "-"))
-    for one, (picture, title, colour, style) in zip(axes, parts, strict=True):
+    for panel, (picture, title, colour, style) in zip(axes, parts, strict=True):
         if picture is None:
-            one.set_axis_off()
+            panel.set_axis_off()
             continue
-        show_subframe(one, picture)
-        one.set_facecolor(INK)
-        one.spines[:].set(visible=True, edgecolor=colour, linewidth=2.2, linestyle=style)
-        one.set_title(title, fontsize=9)
+        show_subframe(panel, picture)
+        panel.set_facecolor(INK)
+        panel.spines[:].set(visible=True, edgecolor=colour, linewidth=2.2, linestyle=style)
+        panel.set_title(title, fontsize=9)
     if track.position is not None and track.patch is not None and track.window is not None:
         _draw_square(axes[1], track.position[::-1], float(len(track.patch)), MATCH, track.valid)
 
 
-def _mark_tracks(axes: Axes, ours: Sequence[Track], stem: str, colour: str) -> None:
+def _mark_tracks(axes: Axes, pair_tracks: Sequence[Track], stem: str, colour: str) -> None:
     box = {"facecolor": "#000000", "alpha": 0.55, "pad": 1.0, "linewidth": 0.0}
-    for track in ours:
+    for track in pair_tracks:
         u, v = track.values.get(f"{stem}_u", np.nan), track.values.get(f"{stem}_v", np.nan)
         side = track.values.get("template_side_px", _DEFAULT_SIDE)
         if np.isfinite((u, v)).all():
@@ -233,8 +231,8 @@ def _mark_tracks(axes: Axes, ours: Sequence[Track], stem: str, colour: str) -> N
 
 
 def _outline_overlap(axes: Axes, products: Mapping[str, Any], pair: int, side: int) -> None:
-    """Outline the overlap in the first picture, and mark the centre of the zero-phase spot."""
-    polygon, spot = plane(products.get(f"overlap_{pair}")), plane(products.get(f"zero_phase_{pair}"))
+    """Outline the overlap in the first picture, and mark the zero-phase point."""
+    polygon, spot = to_matrix(products.get(f"overlap_{pair}")), to_matrix(products.get(f"zero_phase_{pair}"))
     if side == 0 and polygon is not None and polygon.shape[1] == 2:
         axes.add_patch(Polygon(polygon, fill=False, edgecolor="#f2e35a", linewidth=0.9, linestyle=":"))
     if spot is not None and spot.shape == (2, 2) and np.isfinite(spot[side]).all():
@@ -246,14 +244,14 @@ def _outline_overlap(axes: Axes, products: Mapping[str, Any], pair: int, side: i
 
 def _draw_square(axes: Axes, centre: tuple[float, float], side: float, colour: str, valid: bool) -> None:
     if np.isfinite([*centre, side]).all():
-        corner, line = (centre[0] - side / 2, centre[1] - side / 2), "-" if valid else _DASHES
+        corner, line = (centre[0] - side / 2, centre[1] - side / 2), "-" if valid else _DASHED
         axes.add_patch(Rectangle(corner, side, side, fill=False, edgecolor=colour, linewidth=1.8, linestyle=line))
 
 
 def _picture(products: Mapping[str, Any], key: str) -> Picture:
-    counts = plane(products.get(key))
+    counts = to_matrix(products.get(key))
     if counts is None:
-        raise ValueError(f"the products hold no picture '{key}'")
+        raise ValueError(f"the products contain no picture '{key}'")
     rows, columns = counts.shape
     binning = columns // rows
     if binning < 2 or columns % rows:

@@ -13,35 +13,27 @@ from matplotlib.figure import Figure
 from marsyard.reports import presentation
 from marsyard.reports.dimes import case_figures as figures
 from marsyard.reports.dimes.sections import FIRING, LANDING, field_test_section, sensitivity_section
-from marsyard.reports.presentation import (
-    CaseKind,
-    CaseView,
-    Presentation,
-    TableRow,
-    numeric_product,
-    plane,
-    read_arrays,
-)
-from marsyard.reports.section import INK, MARKERS, MUTED, SERIES, in_page_style, plate
+from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow, numeric_product, to_matrix
+from marsyard.reports.section import INK, MARKERS, MUTED, SERIES, in_page_style, svg_figure
 from marsyard.reports.wording import label, note_text, number
 
-#: Columns of the tracks that the page shows elsewhere or has no width for.
-_NOT_SHOWN = ("pair", "template", "valid", "ground_east_m", "ground_north_m")
+#: Columns of the tracks that are not in the table: shown elsewhere, or too wide.
+_HIDDEN_COLUMNS = ("pair", "template", "valid", "ground_east_m", "ground_north_m")
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
-    """A DIMES case; its pictures alone if the algorithm left no DIMES details."""
+    """Create the view of a DIMES case; only its pictures if the algorithm provides no DIMES details."""
     if "tracks" not in products:
         pictures = figures.draw_delivered_pictures(products)
-        shown = plate(pictures, f"{key}pictures", "The three pictures that the algorithm was given.", wide=True)
-        return CaseView(_velocities(products), [shown], [], [], note_text("dimes.plain_legend"))
+        figure = svg_figure(pictures, f"{key}pictures", "The three pictures that the algorithm received.", wide=True)
+        return CaseView(_velocities(products), [figure], [], [], note_text("dimes.plain_legend"))
     pairs = enumerate(("first and second picture", "second and third picture"))
-    plates = [
-        plate(figures.draw_dimes_pair(products, k), f"{key}pair{k}", f"Pair {k + 1}: {name}.") for k, name in pairs
-    ]
-    tracks = figures.tracks(products)
+    svg_figures = []
+    for k, name in pairs:
+        svg_figures.append(svg_figure(figures.draw_dimes_pair(products, k), f"{key}pair{k}", f"Pair {k + 1}: {name}."))
+    tracks = figures.read_tracks(products)
     names = dict.fromkeys(name for track in tracks for name in track.values)
-    quantities = [name for name in names if name not in _NOT_SHOWN and not name.startswith("failed_")]
+    quantities = [name for name in names if name not in _HIDDEN_COLUMNS and not name.startswith("failed_")]
     head = ["Pair", "Template", "Failed checks", *(label(name) for name in quantities)]
     rows = []
     for track in tracks:
@@ -50,11 +42,11 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
         texts = [str(track.pair + 1), str(track.template + 1), checks or ("none" if track.valid else "unknown")]
         texts += [number(track.values.get(name, np.nan)) for name in quantities]
         rows.append(TableRow(texts, track.valid))
-    return CaseView(_velocities(products), plates, head, rows)
+    return CaseView(_velocities(products), svg_figures, head, rows)
 
 
 def _velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Estimated and true velocity, if the products hold them."""
+    """Format the estimated and the true velocity, if the products contain them."""
     facts = []
     for key, name in (("velocity_estimated_m_s", "Estimated velocity"), ("velocity_true_m_s", "True velocity")):
         velocity = numeric_product(products.get(key))
@@ -64,61 +56,63 @@ def _velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
     return facts
 
 
-#: Pictures in a row of a stream's figure.
-_MAX_IN_ROW = 10
+#: Maximum number of pictures in a row of a stream's figure.
+_MAX_PER_ROW = 10
 
 
-def _stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"] | None:
-    """Begin and end of the time span, estimate and truth (east, north) after each picture; NaN where none was given."""
-    parts = read_arrays(products, dict.fromkeys(("after_spans_s", "after_velocities_m_s", "after_true_m_s"), (None, 2)))
+def _read_stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"] | None:
+    """Read start and end of the time span, estimate and truth (east, north) after each picture; NaN if missing."""
+    parts = presentation.read_arrays(
+        products, dict.fromkeys(("after_spans_s", "after_velocities_m_s", "after_true_m_s"), (None, 2))
+    )
     if parts is None or len({len(part) for part in parts}) > 1 or not len(parts[0]):
         return None
     return np.concatenate(parts, axis=1)
 
 
 def is_stream_case(products: Mapping[str, Any]) -> bool:
-    """Whether products hold the answers of a velocity stream after each of its pictures."""
-    table = _stream(products)
-    return table is not None and all(plane(products.get(f"image_{k + 1}")) is not None for k in range(len(table)))
+    """Whether products contain the answers of a velocity stream after each of its pictures."""
+    table = _read_stream(products)
+    return table is not None and all(to_matrix(products.get(f"image_{k + 1}")) is not None for k in range(len(table)))
 
 
 def view_stream(products: Mapping[str, Any], key: str) -> CaseView:
-    """A velocity stream: its pictures, and the estimate after each."""
+    """Create the view of a velocity stream: its pictures, and the estimate after each picture."""
     rows = []
-    for place, row in enumerate(_require_stream(products), start=1):
+    for picture_number, row in enumerate(_require_stream(products), start=1):
         answered = bool(np.isfinite(row[2]))
         values = [number(float(value)) for value in (*row, np.hypot(row[2] - row[4], row[3] - row[5]))]
-        rows.append(TableRow([str(place), *(values if answered else ["" for _ in values])], answered))
+        rows.append(TableRow([str(picture_number), *(values if answered else ["" for _ in values])], answered))
     head = ["After picture", "From (s)", "To (s)", "East (m/s)", "North (m/s)"]
     head += ["True east", "True north", "Error (m/s)"]
-    drawn = plate(draw_stream_case(products), f"{key}stream", "Pictures, and the estimate after each.", wide=True)
-    return CaseView([], [drawn], head, rows)
+    caption = "Pictures, and the estimate after each."
+    return CaseView([], [svg_figure(draw_stream_case(products), f"{key}stream", caption, wide=True)], head, rows)
 
 
 def _require_stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"]:
-    table = _stream(products)
+    table = _read_stream(products)
     if table is None:
-        raise ValueError("the products hold no velocity stream")
+        raise ValueError("the products contain no velocity stream")
     return table
 
 
 @in_page_style
 def draw_stream_case(products: Mapping[str, Any]) -> Figure:
-    """The pictures in rows, and both components of the velocity after each."""
+    """Draw the pictures in rows, and both components of the velocity after each picture."""
     table = _require_stream(products)
-    lines = -(-len(table) // _MAX_IN_ROW)
-    figure = Figure(figsize=(12.0, 3.4 + 1.6 * lines), layout="constrained")
-    parts = figure.add_gridspec(2, 1, height_ratios=(1.6 * lines, 3.4))
-    upper, lower = (figure.add_subfigure(part) for part in (parts[0], parts[1]))
-    panels = upper.subplots(lines, min(len(table), _MAX_IN_ROW), squeeze=False)
-    for place, axes in enumerate(panels.ravel()):
+    n_rows = -(-len(table) // _MAX_PER_ROW)
+    figure = Figure(figsize=(12.0, 3.4 + 1.6 * n_rows), layout="constrained")
+    cells = figure.add_gridspec(2, 1, height_ratios=(1.6 * n_rows, 3.4))
+    upper, lower = (figure.add_subfigure(part) for part in (cells[0], cells[1]))
+    panels = upper.subplots(n_rows, min(len(table), _MAX_PER_ROW), squeeze=False)
+    for index, axes in enumerate(panels.ravel()):
         axes.set_axis_off()
-        picture = plane(products.get(f"image_{place + 1}"))
-        if picture is not None and place < len(table):
+        picture = to_matrix(products.get(f"image_{index + 1}"))
+        if picture is not None and index < len(table):
             low, high = np.quantile(picture, (0.01, 0.99))
             axes.imshow(picture, cmap="gray", vmin=low, vmax=max(high, low + 1.0), aspect="auto")
             axes.set_box_aspect(1.0)
-            axes.set_title(str(place + 1), fontsize=9)
+            axes.set_title(str(index + 1), fontsize=9)
     answered = table[np.isfinite(table[:, 2])]
     start, end = answered[:, 0], answered[:, 1]
     centres = 0.5 * (start + end)

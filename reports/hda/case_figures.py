@@ -1,9 +1,8 @@
 """Figures of one landing as Figs. 1 to 5 and 7 of `papers/vision-guided-landing.txt`.
 
-Colours as the paper's text names them, in tones for colour-blind readers: cameras red and green, features white;
-structure pixels red, segments green, matches blue; maps green, yellow and red; a-priori site a black X, safe site a
-purple plus. Added to the paper: the true maps of Fig. 5 and the true motion of Fig. 2. Figures raise ValueError if the
-products lack what they show.
+Colours follow the paper's text, in tones for colour-blind readers: cameras red and green, features white; structure
+pixels red, segments green, matches blue; maps green, yellow and red; a-priori site a black X, safe site a purple plus.
+Not in the paper: the true maps of Fig. 5, the true motion of Fig. 2. Missing products raise ValueError.
 """
 
 from __future__ import annotations
@@ -25,33 +24,33 @@ from marsyard.reports.section import MUTED, in_page_style, show_picture
 
 T = TypeVar("T")
 
-#: Green, yellow and red that readers with any colour vision tell apart (after Okabe & Ito).
+#: Green, yellow and red that readers with any colour vision can distinguish (after Okabe & Ito).
 GREEN, YELLOW, RED = "#009e73", "#f0e442", "#c83a12"
 BLUE, PURPLE, BLACK, WHITE = "#3da5ff", "#8f1fb0", "#000000", "#ffffff"
-FOUND, LOST = "#f0a202", "#c9d1d9"
-#: Full at half of the limit, yellow up to the limit, red beyond; the scale ends at twice the limit.
+TRACKED_COLOUR, LOST_COLOUR = "#f0a202", "#c9d1d9"
+#: Green in the lower half of the limit, yellow up to the limit, red above; the scale ends at twice the limit.
 HAZARD_COLOURS = LinearSegmentedColormap.from_list(
     "hazard", [(0.0, GREEN), (0.2, GREEN), (0.42, YELLOW), (0.5, YELLOW), (0.5, RED), (1.0, "#7d1f06")]
 ).with_extremes(bad="#8a929b")
 SAFETY_COLOURS = ListedColormap([GREEN, YELLOW, RED])
-#: Dark is high, bright is low.
+#: High ground is dark, low ground is bright.
 ELEVATION_COLOURS = "gray_r"
 #: Maximum number of structure pixels drawn: Table I has 600.
 _MAX_MATCHES = 600
-#: Cells of a terrain's longer side as drawn.
-_DRAWN_CELLS = 90
-#: Minimum height of the drawn relief over the terrain's side; heights are exaggerated up to ten times.
+#: Maximum number of drawn cells along the terrain's longer side.
+_MAX_DRAWN_CELLS = 90
+#: Minimum ratio of the drawn relief to the terrain's side; heights are exaggerated up to ten times.
 _MIN_RELIEF = 0.12
 _BACKGROUND = "#15191e"
 
 
 @in_page_style
 def draw_tracks(products: Mapping[str, Any]) -> Figure:
-    """Fig. 1: features in the first picture, their tracks in the second."""
-    figure, left, right = _picture_pair(products)
-    tracks = _require(stages.tracked_features(products), "tracks")
+    """Draw Fig. 1: features in the first picture, their tracks in the second."""
+    figure, left, right = _draw_picture_pair(products)
+    tracks = _require(stages.read_tracked_features(products), "tracks")
     _draw_features(left, tracks.first, tracks)
-    _draw_segments(right, tracks.first[tracks.accepted], tracks.second[tracks.accepted], FOUND, alpha=0.9)
+    _draw_segments(right, tracks.first[tracks.accepted], tracks.second[tracks.accepted], TRACKED_COLOUR, alpha=0.9)
     _draw_features(right, tracks.second, tracks, lost=False)
     left.set_title(f"First picture: {len(tracks.first)} features", fontsize=9)
     right.set_title(f"Second picture: {int(tracks.accepted.sum())} tracks", fontsize=9)
@@ -61,8 +60,8 @@ def draw_tracks(products: Mapping[str, Any]) -> Figure:
 
 @in_page_style
 def draw_motion(products: Mapping[str, Any]) -> Figure:
-    """Fig. 2: three orthographic views of motion and structure."""
-    motion, maps = _require(stages.solved_motion(products), "motion"), stages.landing_maps(products)
+    """Draw Fig. 2: three orthographic views of motion and structure."""
+    motion, maps = _require(stages.read_motion(products), "motion"), stages.read_landing_maps(products)
     # without a map the vertical is unknown: the first camera's optical axis replaces it
     upright = np.diag([1.0, -1.0, -1.0]) if maps is None else maps.surface_from_camera
     figure = Figure(figsize=(9.0, 3.6), layout="constrained", facecolor="none")
@@ -76,113 +75,116 @@ def draw_motion(products: Mapping[str, Any]) -> Figure:
 
 @in_page_style
 def draw_epipolar(products: Mapping[str, Any]) -> Figure:
-    """Fig. 3: structure pixels in the first picture, their segments and matches in the second."""
-    figure, left, right = _picture_pair(products)
-    matches = _require(stages.epipolar_matches(products), "matches")
-    # on a coarser grid, so that no more than `_MAX_MATCHES` are drawn
-    every, chosen = 1, np.arange(len(matches.grid))
+    """Draw Fig. 3: structure pixels in the first picture, their segments and matches in the second."""
+    figure, left, right = _draw_picture_pair(products)
+    matches = _require(stages.read_matches(products), "matches")
+    # on a coarser grid, so that at most `_MAX_MATCHES` are drawn
+    step, indices = 1, np.arange(len(matches.grid))
     v, u = (np.unique(matches.grid[:, k], return_inverse=True)[1] for k in (1, 0))
-    while len(chosen) > _MAX_MATCHES:
-        every += 1
-        chosen = np.flatnonzero((v % every == every // 2) & (u % every == every // 2))
-    _draw_squares(left, matches.grid[chosen], "#ff4b3e")
-    _draw_segments(right, matches.starts[chosen], matches.ends[chosen], "#35d46b")
-    _draw_squares(right, matches.matched[chosen][matches.accepted[chosen]], BLUE)
-    thinned = "" if len(chosen) == len(matches.grid) else f", {len(chosen)} shown"
-    left.set_title(f"First picture: {len(matches.grid):,} structure pixels{thinned}", fontsize=9)
+    while len(indices) > _MAX_MATCHES:
+        step += 1
+        indices = np.flatnonzero((v % step == step // 2) & (u % step == step // 2))
+    _draw_squares(left, matches.grid[indices], "#ff4b3e")
+    _draw_segments(right, matches.starts[indices], matches.ends[indices], "#35d46b")
+    _draw_squares(right, matches.matched[indices][matches.accepted[indices]], BLUE)
+    count_text = "" if len(indices) == len(matches.grid) else f", {len(indices)} shown"
+    left.set_title(f"First picture: {len(matches.grid):,} structure pixels{count_text}", fontsize=9)
     right.set_title(f"Second: segments, {int(matches.accepted.sum()):,} matches", fontsize=9)
     return figure
 
 
 @in_page_style
 def draw_elevation(products: Mapping[str, Any]) -> Figure:
-    """Fig. 4: two views of the elevation map."""
-    maps = _require(stages.landing_maps(products), "maps")
+    """Draw Fig. 4: two views of the elevation map."""
+    maps = _require(stages.read_landing_maps(products), "maps")
     figure = Figure(figsize=(9.0, 3.9), layout="constrained")
-    for place, azimuth in enumerate((-115.0, -25.0)):
-        axes = figure.add_subplot(1, 2, place + 1, projection="3d", computed_zorder=False)
+    for index, azimuth in enumerate((-115.0, -25.0)):
+        axes = figure.add_subplot(1, 2, index + 1, projection="3d", computed_zorder=False)
         _draw_terrain(axes, maps, np.broadcast_to(np.array(to_rgb("#b9bec4")), (*maps.elevation_m.shape, 3)), azimuth)
     return figure
 
 
 @in_page_style
 def draw_maps(products: Mapping[str, Any]) -> Figure:
-    """Fig. 5 (A): elevation, roughness, slope and safe landing map; below, the truth in the same coordinates."""
-    maps, truth = _require(stages.landing_maps(products), "maps"), _require(stages.true_ground(products), "truth")
+    """Draw Fig. 5 (A): elevation, roughness, slope and safe landing map; below, the truth in the same coordinates."""
+    maps = _require(stages.read_landing_maps(products), "maps")
+    truth = _require(stages.read_ground_truth(products), "truth")
     figure = Figure(figsize=(11.0, 5.6), layout="constrained")
-    upper, lower = figure.subplots(2, 4)
+    map_row, truth_row = figure.subplots(2, 4)
     degrees, limits = np.degrees(maps.slope_rad), maps.limits
-    middle = np.nanmedian(maps.elevation_m)
-    reach = float(np.nanquantile(np.abs(maps.elevation_m - middle), 0.99)) or 1.0
-    at = maps.cells(truth.away_m)
+    median = np.nanmedian(maps.elevation_m)
+    max_deviation_m = float(np.nanquantile(np.abs(maps.elevation_m - median), 0.99)) or 1.0
+    cells = maps.world_to_cell(truth.offset_from_nadir_m)
     covered = np.where(truth.covered, 1.0, np.nan)
-    planes = (
-        ("elevation (m)", maps.elevation_m - middle, truth.elevation_m - middle, None),
+    maps_by_name = (
+        ("elevation (m)", maps.elevation_m - median, truth.elevation_m - median, None),
         ("roughness (m)", maps.roughness_m, truth.roughness_m * covered, float(limits[1])),
         ("slope (deg)", degrees, np.degrees(truth.slope_rad) * covered, float(np.degrees(limits[0]))),
     )
-    for above, below, (name, ours, true, limit) in zip(upper, lower, planes, strict=False):
-        scale = {"vmin": -reach, "vmax": reach, "cmap": ELEVATION_COLOURS}
+    for upper, lower, (name, estimated, true_values, limit) in zip(map_row, truth_row, maps_by_name, strict=False):
+        scale = {"vmin": -max_deviation_m, "vmax": max_deviation_m, "cmap": ELEVATION_COLOURS}
         if limit is not None:
             scale = {"vmin": 0.0, "vmax": 2.0 * limit, "cmap": HAZARD_COLOURS}
-        image = above.imshow(ours, interpolation="nearest", **scale)
-        below.pcolormesh(at[..., 1], at[..., 0], true, shading="nearest", rasterized=True, **scale)
-        bar = figure.colorbar(image, ax=[above, below], orientation="horizontal", shrink=0.9, pad=0.02, aspect=30)
+        image = upper.imshow(estimated, interpolation="nearest", **scale)
+        lower.pcolormesh(cells[..., 1], cells[..., 0], true_values, shading="nearest", rasterized=True, **scale)
+        bar = figure.colorbar(image, ax=[upper, lower], orientation="horizontal", shrink=0.9, pad=0.02, aspect=30)
         bar.outline.set_visible(False)
         bar.ax.tick_params(labelsize=7)
-        above.set_title(f"Map: {name}", fontsize=9)
-        below.set_title("Truth of footprints" if limit is not None else "Truth", fontsize=9)
-    _draw_safety(upper[3], lower[3], maps, truth)
+        upper.set_title(f"Map: {name}", fontsize=9)
+        lower.set_title("Truth of footprints" if limit is not None else "Truth", fontsize=9)
+    _draw_safety(map_row[3], truth_row[3], maps, truth)
     rows, columns = maps.elevation_m.shape
-    for axes in (*upper, *lower):
+    for axes in (*map_row, *truth_row):
         for name, (row, column) in (("apriori", maps.apriori), ("site", maps.site)):
             if 0 <= row <= rows - 1 and 0 <= column <= columns - 1:
-                _mark(axes, np.array([column, row]), name)
+                _mark_site(axes, np.array([column, row]), name)
         axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xticks=[], yticks=[], aspect="equal")
         axes.set_facecolor("#8a929b")
         axes.grid(visible=False)
     return figure
 
 
-def _draw_safety(above: Axes, below: Axes, maps: stages.LandingMaps, truth: stages.TrueGround) -> None:
+def _draw_safety(map_axes: Axes, truth_axes: Axes, maps: stages.LandingMaps, truth: stages.GroundTruth) -> None:
     scale: dict[str, Any] = {"vmin": 0, "vmax": 2, "cmap": SAFETY_COLOURS}
-    above.imshow(maps.safety, interpolation="nearest", **scale)
+    map_axes.imshow(maps.safety, interpolation="nearest", **scale)
     if (maps.safety > 1.5).any() and (maps.safety < 1.5).any():
-        above.contourf(maps.safety, levels=[1.5, 2.5], colors="none", hatches=["////"])
-    at, safety = maps.cells(truth.away_m), np.where(truth.covered, np.where(truth.safe, 0.0, 2.0), 1.0)
-    below.pcolormesh(at[..., 1], at[..., 0], safety, shading="nearest", rasterized=True, **scale)
-    above.set_title("Safe landing map", fontsize=9)
-    below.set_title("Truth: a lander's middle", fontsize=9)
+        map_axes.contourf(maps.safety, levels=[1.5, 2.5], colors="none", hatches=["////"])
+    cells = maps.world_to_cell(truth.offset_from_nadir_m)
+    safety = np.where(truth.covered, np.where(truth.safe, 0.0, 2.0), 1.0)
+    truth_axes.pcolormesh(cells[..., 1], cells[..., 0], safety, shading="nearest", rasterized=True, **scale)
+    map_axes.set_title("Safe landing map", fontsize=9)
+    truth_axes.set_title("Truth: a lander's centre", fontsize=9)
     for name, colour in (("safe", GREEN), ("unknown", YELLOW), ("hazard", RED)):
-        below.plot([], [], "s", color=colour, label=name)
-    for mark, label in zip(_SITE_MARKS.values(), ("a-priori site", "safe site"), strict=True):
-        below.plot([], [], **mark, label=label)
-    below.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, fontsize=7, columnspacing=1.0)
+        truth_axes.plot([], [], "s", color=colour, label=name)
+    for marker, label in zip(_SITE_MARKERS.values(), ("a-priori site", "safe site"), strict=True):
+        truth_axes.plot([], [], **marker, label=label)
+    truth_axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, fontsize=7, columnspacing=1.0)
 
 
 @in_page_style
 def draw_site(products: Mapping[str, Any]) -> Figure:
-    """Fig. 7 and Fig. 5 (B): the first picture, the safe landing map and the site on the picture and on the terrain."""
-    shown, maps = _require(stages.pictures(products), "pictures"), _require(stages.landing_maps(products), "maps")
+    """Draw Fig. 7 and Fig. 5 (B): the first picture, the safe landing map and the site on it and on the terrain."""
+    images = _require(stages.read_images(products), "pictures")
+    maps = _require(stages.read_landing_maps(products), "maps")
     figure = Figure(figsize=(11.0, 3.6), layout="constrained")
-    plain, over = figure.add_subplot(1, 3, 1), figure.add_subplot(1, 3, 2)
-    for axes in (plain, over):
-        show_picture(axes, shown[0])
-    limits = {"xlim": over.get_xlim(), "ylim": over.get_ylim()}
+    plain, overlay = figure.add_subplot(1, 3, 1), figure.add_subplot(1, 3, 2)
+    for axes in (plain, overlay):
+        show_picture(axes, images[0])
+    limits = {"xlim": overlay.get_xlim(), "ylim": overlay.get_ylim()}
     if np.isfinite(maps.pixels).all():
         finite = np.where(np.isfinite(maps.elevation_m), maps.safety, np.nan)
-        over.pcolormesh(
+        overlay.pcolormesh(
             maps.pixels[..., 0], maps.pixels[..., 1], finite, shading="nearest", alpha=0.38,
             vmin=0, vmax=2, cmap=SAFETY_COLOURS, rasterized=True, linewidth=0.0,
         )  # fmt: skip
-    over.set(**limits)
-    for axes in (plain, over):
+    overlay.set(**limits)
+    for axes in (plain, overlay):
         for name, cell in (("apriori", maps.apriori), ("site", maps.site)):
-            pixel = _at_cell(maps.pixels, cell)
+            pixel = _value_at_cell(maps.pixels, cell)
             if pixel is not None:
-                _mark(axes, pixel, name)
+                _mark_site(axes, pixel, name)
     plain.set_title("First picture", fontsize=9)
-    over.set_title("Safe landing map on it", fontsize=9)
+    overlay.set_title("Safe landing map on it", fontsize=9)
     terrain = figure.add_subplot(1, 3, 3, projection="3d", computed_zorder=False)
     colours = SAFETY_COLOURS(np.clip(np.nan_to_num(maps.safety, nan=1.0), 0, 2).astype(np.int64))[..., :3]
     _draw_terrain(terrain, maps, colours, -115.0)
@@ -190,40 +192,40 @@ def draw_site(products: Mapping[str, Any]) -> Figure:
 
 
 Products = Mapping[str, Any]
-#: The stage that each figure shows, and its drawing, by file name in the paper's order.
+#: Function that reads the figure's products, and function that draws it, by file name in the paper's order.
 _FIGURES: Mapping[str, tuple[Callable[[Products], object], Callable[[Products], Figure]]] = {
-    "fig1-tracks": (stages.tracked_features, draw_tracks),
-    "fig2-motion": (stages.solved_motion, draw_motion),
-    "fig3-epipolar": (stages.epipolar_matches, draw_epipolar),
-    "fig4-elevation": (stages.landing_maps, draw_elevation),
-    "fig5-maps": (stages.landing_maps, draw_maps),
-    "fig7-site": (stages.landing_maps, draw_site),
+    "fig1-tracks": (stages.read_tracked_features, draw_tracks),
+    "fig2-motion": (stages.read_motion, draw_motion),
+    "fig3-epipolar": (stages.read_matches, draw_epipolar),
+    "fig4-elevation": (stages.read_landing_maps, draw_elevation),
+    "fig5-maps": (stages.read_landing_maps, draw_maps),
+    "fig7-site": (stages.read_landing_maps, draw_site),
 }
 FIGURES = {name: draw for name, (_, draw) in _FIGURES.items()}
 
 
-def figures_reached(products: Products) -> list[str]:
-    """Names of the figures whose stages a case reached."""
-    return [name for name, (stage, _) in _FIGURES.items() if stage(products) is not None]
+def available_figures(products: Products) -> list[str]:
+    """List the names of the figures whose stages a case reached."""
+    return [name for name, (read_stage, _) in _FIGURES.items() if read_stage(products) is not None]
 
 
 def write_hda_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
     """Write the figures of the stages that a case reached into a folder; returns their paths."""
-    return save_figures(directory, {name: FIGURES[name](products) for name in figures_reached(products)}, dpi=130)
+    return save_figures(directory, {name: FIGURES[name](products) for name in available_figures(products)}, dpi=130)
 
 
 def _require(part: T | None, name: str) -> T:
     if part is None:
-        raise ValueError(f"the products hold no {name}")
+        raise ValueError(f"the products contain no {name}")
     return part
 
 
 def _draw_features(axes: Axes, pixels: stages.Pixels, tracks: stages.TrackedFeatures, *, lost: bool = True) -> None:
-    kept = pixels[tracks.accepted]
-    axes.plot(*kept.T, "s", markersize=5.5, markerfacecolor="none", color=FOUND, markeredgewidth=1.3, label="tracked")
+    style: dict[str, Any] = {"markersize": 5.5, "markerfacecolor": "none", "markeredgewidth": 1.3}
+    axes.plot(*pixels[tracks.accepted].T, "s", color=TRACKED_COLOUR, label="tracked", **style)
     if lost and not tracks.accepted.all():
-        gone = pixels[~tracks.accepted]
-        axes.plot(*gone.T, "x", markersize=5.0, color=LOST, markeredgewidth=1.2, label="not tracked")
+        untracked = pixels[~tracks.accepted]
+        axes.plot(*untracked.T, "x", markersize=5.0, color=LOST_COLOUR, markeredgewidth=1.2, label="not tracked")
 
 
 def _draw_squares(axes: Axes, pixels: stages.Pixels, colour: str) -> None:
@@ -234,40 +236,40 @@ def _draw_segments(axes: Axes, starts: stages.Pixels, ends: stages.Pixels, colou
     axes.plot(*np.stack([starts, ends]).transpose(2, 0, 1), color=colour, linewidth=0.8, alpha=alpha)
 
 
-def _picture_pair(products: Mapping[str, Any]) -> tuple[Figure, Axes, Axes]:
-    shown = _require(stages.pictures(products), "pictures")
+def _draw_picture_pair(products: Mapping[str, Any]) -> tuple[Figure, Axes, Axes]:
+    images = _require(stages.read_images(products), "pictures")
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    show_picture(left, shown[0])
-    show_picture(right, shown[1])
+    show_picture(left, images[0])
+    show_picture(right, images[1])
     return figure, left, right
 
 
 def _draw_motion_view(
-    axes: Axes, motion: stages.SolvedMotion, upright: Float[np.ndarray, "3 3"], pair: list[int]
+    axes: Axes, motion: stages.EstimatedMotion, upright: Float[np.ndarray, "3 3"], pair: list[int]
 ) -> None:
     """Draw an orthographic view onto two axes of an upright frame at the first camera."""
     depth = float(np.median(motion.points[:, 2]))
 
-    def seen(points: np.ndarray) -> np.ndarray:
+    def project(points: np.ndarray) -> np.ndarray:
         return np.asarray((points @ upright.T)[..., pair])
 
-    axes.plot(*seen(motion.points).T, "o", color=WHITE, markersize=2.2, label="features")
+    axes.plot(*project(motion.points).T, "o", color=WHITE, markersize=2.2, label="features")
     poses = (
         (np.eye(3), np.zeros(3), "#ff4b3e", "-", "first camera"),
         (motion.rotation, motion.translation, "#35d46b", "-", "second camera"),
         (motion.true_rotation, motion.true_translation, WHITE, ":", "second, true"),
     )
     for number, (rotation, translation, colour, line, name) in enumerate(poses):
-        middle = -rotation.T @ translation
+        centre = -rotation.T @ translation
         rays = motion.corner_rays[min(number, 1)] * depth
-        field = middle + rays @ rotation
-        axes.plot(*seen(field[[0, 1, 2, 3, 0]]).T, color=colour, linestyle=line, linewidth=1.1, label=name)
+        field = centre + rays @ rotation
+        axes.plot(*project(field[[0, 1, 2, 3, 0]]).T, color=colour, linestyle=line, linewidth=1.1, label=name)
         if line == "-":
             for corner in field:
-                axes.plot(*seen(np.array([middle, corner])).T, color=colour, linewidth=0.5, alpha=0.5)
+                axes.plot(*project(np.array([centre, corner])).T, color=colour, linewidth=0.5, alpha=0.5)
             for axis in 0.12 * depth * rotation:
-                axes.plot(*seen(np.array([middle, middle + axis])).T, color=colour, linewidth=1.8)
+                axes.plot(*project(np.array([centre, centre + axis])).T, color=colour, linewidth=1.8)
     axes.set_facecolor(_BACKGROUND)
     axes.grid(visible=False)
     axes.set_aspect("equal", adjustable="datalim")
@@ -279,34 +281,33 @@ def _draw_motion_view(
 def _draw_terrain(
     axes: Any, maps: stages.LandingMaps, colours: Float[np.ndarray, "rows columns 3"], azimuth_deg: float
 ) -> None:
-    """The elevation map as a lit surface in these colours, with the sites on it; the axes are three-dimensional."""
+    """Draw the elevation map as a shaded surface in these colours, with the sites on it; the axes are 3-D."""
     rows, columns = maps.elevation_m.shape
-    step = max(1, round(max(rows, columns) / _DRAWN_CELLS))
+    step = max(1, round(max(rows, columns) / _MAX_DRAWN_CELLS))
     x = maps.corner_m[0] + maps.cell_m * np.arange(columns)
     y = maps.corner_m[1] - maps.cell_m * np.arange(rows)
     heights = maps.elevation_m - np.nanmedian(maps.elevation_m)
     sides = maps.cell_m * np.array([columns, rows])
-    reach = float(np.nanmax(heights) - np.nanmin(heights))
+    height_range_m = float(np.nanmax(heights) - np.nanmin(heights))
     # heights are exaggerated so that gentle ground shows its relief
-    raised = next((times for times in (1.0, 2.0, 5.0) if times * reach >= _MIN_RELIEF * sides.max()), 10.0)
-    lit = LightSource(315.0, 45.0).shade_rgb(
-        np.asarray(colours), np.nan_to_num(heights), vert_exag=raised, dx=maps.cell_m, dy=maps.cell_m, blend_mode="soft"
-    )
-    pick = np.s_[::step, ::step]
+    scale = next((k for k in (1.0, 2.0, 5.0) if k * height_range_m >= _MIN_RELIEF * sides.max()), 10.0)
+    style: dict[str, Any] = {"vert_exag": scale, "dx": maps.cell_m, "dy": maps.cell_m, "blend_mode": "soft"}
+    shaded = LightSource(315.0, 45.0).shade_rgb(np.asarray(colours), np.nan_to_num(heights), **style)
+    part = np.s_[::step, ::step]
     axes.plot_surface(
-        *(one[pick] for one in np.meshgrid(x, y)), heights[pick], facecolors=lit[pick], rcount=200, ccount=200,
+        *(grid[part] for grid in np.meshgrid(x, y)), heights[part], facecolors=shaded[part], rcount=200, ccount=200,
         shade=False, antialiased=False, linewidth=0.0, rasterized=True, zorder=1,
     )  # fmt: skip
-    lift = 0.02 * float(sides.max()) / raised
+    offset_m = 0.02 * float(sides.max()) / scale
     for name, cell in (("apriori", maps.apriori), ("site", maps.site)):
-        height = _at_cell(heights[..., None], cell)
+        height = _value_at_cell(heights[..., None], cell)
         if height is not None and np.isfinite(height).all():
-            place = maps.corner_m + maps.cell_m * cell[::-1] * np.array([1.0, -1.0])
-            axes.plot([place[0]], [place[1]], [float(height[0]) + lift], **_SITE_MARKS[name], zorder=5)
-    axes.set_box_aspect((sides[0], sides[1], max(raised * reach, 0.05 * sides.max())), zoom=1.3)
+            position = maps.corner_m + maps.cell_m * cell[::-1] * np.array([1.0, -1.0])
+            axes.plot([position[0]], [position[1]], [float(height[0]) + offset_m], **_SITE_MARKERS[name], zorder=5)
+    axes.set_box_aspect((sides[0], sides[1], max(scale * height_range_m, 0.05 * sides.max())), zoom=1.3)
     axes.view_init(elev=38.0, azim=azimuth_deg)
     axes.set(xlabel="x (m)", ylabel="y (m)")
-    axes.set_title("Heights in m" if raised == 1.0 else f"Heights in m, drawn {raised:g} times as high", fontsize=9)
+    axes.set_title("Heights in m" if scale == 1.0 else f"Heights in m, drawn {scale:g} times as high", fontsize=9)
     axes.tick_params(labelsize=6, pad=-2, colors=MUTED)
     for name, axis, bins in (("x", axes.xaxis, 4), ("y", axes.yaxis, 4), ("z", axes.zaxis, 3)):
         axes.locator_params(axis=name, nbins=bins)
@@ -315,22 +316,22 @@ def _draw_terrain(
         axis.set_pane_color((0.0, 0.0, 0.0, 0.0))
 
 
-_SITE_MARKS: Mapping[str, Mapping[str, Any]] = {
+_SITE_MARKERS: Mapping[str, Mapping[str, Any]] = {
     "apriori": {"marker": "x", "color": BLACK, "markersize": 8, "markeredgewidth": 2.0, "linestyle": ""},
     "site": {"marker": "+", "color": PURPLE, "markersize": 11, "markeredgewidth": 2.6, "linestyle": ""},
 }
-_RIM = [patheffects.Stroke(linewidth=3.6, foreground=WHITE), patheffects.Normal()]
+_WHITE_OUTLINE = [patheffects.Stroke(linewidth=3.6, foreground=WHITE), patheffects.Normal()]
 
 
-def _mark(axes: Axes, place: Float[np.ndarray, "2"], name: str) -> None:
-    axes.plot([place[0]], [place[1]], **_SITE_MARKS[name], path_effects=_RIM, zorder=6)
+def _mark_site(axes: Axes, pixel: Float[np.ndarray, "2"], name: str) -> None:
+    axes.plot([pixel[0]], [pixel[1]], **_SITE_MARKERS[name], path_effects=_WHITE_OUTLINE, zorder=6)
 
 
-def _at_cell(values: Float[np.ndarray, "rows columns k"], cell: Float[np.ndarray, "2"]) -> np.ndarray | None:
-    """Values at the nearest cell; None outside."""
+def _value_at_cell(values: Float[np.ndarray, "rows columns k"], cell: Float[np.ndarray, "2"]) -> np.ndarray | None:
+    """Return the values at the nearest cell; None outside the map."""
     if not np.isfinite(cell).all():
         return None
-    row, column = (int(part) for part in np.rint(cell))
+    row, column = (int(coordinate) for coordinate in np.rint(cell))
     if not (0 <= row < values.shape[0] and 0 <= column < values.shape[1]):
         return None
     return values[row, column] if np.isfinite(values[row, column]).all() else None

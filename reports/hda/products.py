@@ -1,4 +1,4 @@
-"""Products of a landing case, read from files and checked: pictures, tracks, motion, matches, maps and truth."""
+"""Products of a landing case, read from files and checked: images, tracks, motion, matches, maps and ground truth."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from marsyard.reports.presentation import check_shape, numeric_product, plane, read_arrays
+from marsyard.reports.presentation import check_shape, numeric_product, read_arrays, to_matrix
 
-Plane = Float[np.ndarray, "rows columns"]
+MapArray = Float[np.ndarray, "rows columns"]
 Pixels = Float[np.ndarray, "n 2"]
 
 
@@ -25,11 +25,11 @@ class TrackedFeatures:
 
 
 @dataclass(frozen=True)
-class SolvedMotion:
-    """Motion of the second from the first camera, and structure in the first camera's frame, metres.
+class EstimatedMotion:
+    """Pose of the second camera relative to the first, and structure in the first camera's frame, metres.
 
     points: positions of the accepted tracks
-    corner_rays: rays of each picture's corners in its camera's frame, of depth one
+    corner_rays: rays of each picture's corners in its camera's frame, with depth 1
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -53,20 +53,18 @@ class EpipolarMatches:
 
 @dataclass(frozen=True)
 class LandingMaps:
-    """The maps of a case on the cells of the elevation map, row 0 farthest along y.
+    """The maps of a case on the cells of the elevation map; row 0 has the largest y.
 
-    elevation_m: from the first camera
-    safety: 0 safe, 1 unknown, 2 hazard
-    pixels: of the first picture for the centre of every cell; extrapolated where the elevation is unknown
-    corner_m: centre of the first cell (x, y) in the surface frame
-    site, apriori: row and column; NaN for no site
-    limits: of slope (radians) and roughness (metres), and the lander's diameter
+    elevation_m: height relative to the first camera safety: 0 safe, 1 unknown, 2 hazard pixels: pixel in the first
+    picture of the centre of every cell; extrapolated if the elevation is unknown corner_m: centre of the first cell (x,
+    y) in the surface frame site, apriori: row and column; NaN for no site limits: limits of slope (radians) and
+    roughness (metres), and the lander's diameter (metres)
     """
 
-    elevation_m: Plane
-    roughness_m: Plane
-    slope_rad: Plane
-    safety: Plane
+    elevation_m: MapArray
+    roughness_m: MapArray
+    slope_rad: MapArray
+    safety: MapArray
     pixels: Float[np.ndarray, "rows columns 2"]
     corner_m: Float[np.ndarray, "2"]
     apriori: Float[np.ndarray, "2"]
@@ -76,109 +74,109 @@ class LandingMaps:
     cell_m: float
     site: Float[np.ndarray, "2"]
 
-    def cells(self, away_m: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-        """Fractional (row, column) of positions (x, y) along the world's axes from the camera's nadir point."""
-        local = away_m @ self.world_from_surface[:2, :2]
-        return np.asarray(((local - self.corner_m) / self.cell_m * np.array([1.0, -1.0]))[..., ::-1])
+    def world_to_cell(self, offset_from_nadir_m: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Fractional (row, column) of offsets (x, y) along the world's axes from the camera's nadir point."""
+        offset_m = offset_from_nadir_m @ self.world_from_surface[:2, :2]
+        return np.asarray(((offset_m - self.corner_m) / self.cell_m * np.array([1.0, -1.0]))[..., ::-1])
 
 
 @dataclass(frozen=True)
-class TrueGround:
-    """The truth on its lattice.
+class GroundTruth:
+    """Ground truth on its sampling grid.
 
-    away_m: world (x, y) from the camera's true nadir point
-    elevation_m: exact height from the camera
-    slope_rad, roughness_m, safe: of a lander's footprint centred there
-    covered: whether both pictures show the whole footprint
+    offset_from_nadir_m: world (x, y) relative to the camera's true nadir point elevation_m: exact height relative to
+    the camera slope_rad, roughness_m, safe: values of a lander's footprint centred at the position covered: whether
+    both pictures contain the complete footprint
     """
 
-    away_m: Float[np.ndarray, "rows columns 2"]
-    elevation_m: Plane
-    slope_rad: Plane
-    roughness_m: Plane
+    offset_from_nadir_m: Float[np.ndarray, "rows columns 2"]
+    elevation_m: MapArray
+    slope_rad: MapArray
+    roughness_m: MapArray
     safe: Bool[np.ndarray, "rows columns"]
     covered: Bool[np.ndarray, "rows columns"]
 
 
 def is_hda_case(products: Mapping[str, Any]) -> bool:
-    """Whether products hold two pictures and the truth of a landing."""
-    return pictures(products) is not None and true_ground(products) is not None
+    """Whether products contain two pictures and the ground truth of a landing."""
+    return read_images(products) is not None and read_ground_truth(products) is not None
 
 
-def pictures(products: Mapping[str, Any]) -> tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, "_ _"]] | None:
-    """The two pictures; None if one is missing."""
-    first, second = (plane(products.get(f"image_{number}")) for number in (1, 2))
+def read_images(products: Mapping[str, Any]) -> tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, "_ _"]] | None:
+    """Read the two pictures; None if one is missing."""
+    first, second = (to_matrix(products.get(f"image_{number}")) for number in (1, 2))
     return None if first is None or second is None else (first, second)
 
 
-def tracked_features(products: Mapping[str, Any]) -> TrackedFeatures | None:
-    """Features and tracks; None if missing."""
+def read_tracked_features(products: Mapping[str, Any]) -> TrackedFeatures | None:
+    """Read features and tracks; None if missing."""
     arrays = read_arrays(products, {"features": (None, 2), "tracked": (None, 2), "tracks_accepted": (None,)})
-    if arrays is None or len({len(one) for one in arrays}) > 1:
+    if arrays is None or len({len(array) for array in arrays}) > 1:
         return None
     return TrackedFeatures(arrays[0], arrays[1], arrays[2] > 0.5)
 
 
-def solved_motion(products: Mapping[str, Any]) -> SolvedMotion | None:
-    """Motion and structure; None if the motion was not solved."""
+def read_motion(products: Mapping[str, Any]) -> EstimatedMotion | None:
+    """Read motion and structure; None if the motion was not estimated."""
     rotation, translation, rays = (3, 3), (3,), (4, 3)
     shapes = {"rotation": rotation, "translation": translation, "frustum_0": rays, "frustum_1": rays}
     arrays = read_arrays(products, shapes | {"true_rotation": rotation, "true_translation": translation}, finite=True)
     points = check_shape(products.get("sparse_points"), None, 3)
     if arrays is None or points is None or not len(points):
         return None
-    return SolvedMotion(arrays[0], arrays[1], (arrays[2], arrays[3]), arrays[4], arrays[5], points)
+    return EstimatedMotion(arrays[0], arrays[1], (arrays[2], arrays[3]), arrays[4], arrays[5], points)
 
 
-def epipolar_matches(products: Mapping[str, Any]) -> EpipolarMatches | None:
-    """Structure pixels and matches; None if missing."""
+def read_matches(products: Mapping[str, Any]) -> EpipolarMatches | None:
+    """Read structure pixels and matches; None if missing."""
     shapes = dict.fromkeys(("grid", "segment_starts", "segment_ends", "matched"), (None, 2))
     arrays = read_arrays(products, {**shapes, "matches_accepted": (None,)})
-    if arrays is None or len({len(one) for one in arrays}) > 1:
+    if arrays is None or len({len(array) for array in arrays}) > 1:
         return None
     return EpipolarMatches(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4] > 0.5)
 
 
-def landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
-    """The maps; None if the ground was not mapped."""
-    planes = read_arrays(products, dict.fromkeys(("elevation", "roughness", "slope", "safety"), (None, None)))
-    if planes is None or len({one.shape for one in planes}) > 1 or min(planes[0].shape) < 2:
+def read_landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
+    """Read the maps; None if the ground was not mapped."""
+    maps = read_arrays(products, dict.fromkeys(("elevation", "roughness", "slope", "safety"), (None, None)))
+    if maps is None or len({values.shape for values in maps}) > 1 or min(maps[0].shape) < 2:
         return None
     shapes = {"corner": (2,), "apriori": (2,), "surface_from_camera": (3, 3), "world_from_surface": (3, 3)}
     frames = read_arrays(products, shapes | {"limits": (3,)}, finite=True)
-    pixels, cell_m = check_shape(products.get("map_pixels"), *planes[0].shape, 2), _positive(products, "cell")
+    pixels, cell_m = check_shape(products.get("map_pixels"), *maps[0].shape, 2), _read_positive(products, "cell")
     if frames is None or pixels is None or cell_m is None or not np.all(frames[-1] > 0.0):
         return None
     observed = np.isfinite(pixels).all(axis=-1)
     if not observed.all() and observed.sum() >= 3:
-        # unknown pixels by an affine map of the known ones, as for level ground
+        # unknown pixels: affine map of the known ones, exact for level ground
         cells = np.concatenate([np.moveaxis(np.indices(observed.shape), 0, -1), np.ones((*observed.shape, 1))], axis=-1)
-        level = np.linalg.lstsq(cells[observed], pixels[observed], rcond=None)[0]
-        pixels = np.where(observed[..., None], pixels, cells @ level)
+        affine = np.linalg.lstsq(cells[observed], pixels[observed], rcond=None)[0]
+        pixels = np.where(observed[..., None], pixels, cells @ affine)
     (site,) = read_arrays(products, {"site": (2,)}, finite=True) or [np.full(2, np.nan)]
     names = ("elevation_m", "roughness_m", "slope_rad", "safety", "corner_m", "apriori", "surface_from_camera")
-    arrays = dict(zip((*names, "world_from_surface", "limits"), (*planes, *frames), strict=True))
+    arrays = dict(zip((*names, "world_from_surface", "limits"), (*maps, *frames), strict=True))
     return LandingMaps(pixels=pixels, cell_m=cell_m, site=site, **arrays)
 
 
-def true_ground(products: Mapping[str, Any]) -> TrueGround | None:
-    """The truth; None if missing."""
-    places, heights = check_shape(products.get("true_places"), None, None, 2), plane(products.get("true_heights"))
+def read_ground_truth(products: Mapping[str, Any]) -> GroundTruth | None:
+    """Read the ground truth; None if missing."""
+    positions = check_shape(products.get("true_places"), None, None, 2)
+    heights = to_matrix(products.get("true_heights"))
     frames = read_arrays(products, {"camera_true": (4, 4), "true_corner": (2,)}, finite=True)
-    spacing_m = _positive(products, "true_spacing")
-    if places is None or min(places.shape[:2]) < 2 or heights is None or frames is None or spacing_m is None:
+    spacing_m = _read_positive(products, "true_spacing")
+    if positions is None or min(positions.shape[:2]) < 2 or heights is None or frames is None or spacing_m is None:
         return None
     names = ("true_slope", "true_roughness", "true_safe", "true_covered")
-    planes = read_arrays(products, dict.fromkeys(names, places.shape[:2]), finite=True)
-    if planes is None:
+    maps = read_arrays(products, dict.fromkeys(names, positions.shape[:2]), finite=True)
+    if maps is None:
         return None
     camera, corner = frames
-    at = np.nan_to_num((places - corner)[..., ::-1] / spacing_m)
-    rows, columns = np.moveaxis(np.clip(np.rint(at), 0, np.array(heights.shape) - 1).astype(np.int64), -1, 0)
+    indices = np.nan_to_num((positions - corner)[..., ::-1] / spacing_m)
+    rows, columns = np.moveaxis(np.clip(np.rint(indices), 0, np.array(heights.shape) - 1).astype(np.int64), -1, 0)
     elevation_m = heights[rows, columns] - camera[2, 3]
-    return TrueGround(places - camera[:2, 3], elevation_m, planes[0], planes[1], planes[2] > 0.5, planes[3] > 0.5)
+    return GroundTruth(positions - camera[:2, 3], elevation_m, maps[0], maps[1], maps[2] > 0.5, maps[3] > 0.5)
 
 
-def _positive(products: Mapping[str, Any], name: str) -> float | None:
+def _read_positive(products: Mapping[str, Any], name: str) -> float | None:
     value = numeric_product(products.get(name))
     return float(value.item()) if value is not None and value.size == 1 and value.item() > 0.0 else None

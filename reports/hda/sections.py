@@ -19,16 +19,16 @@ from marsyard.reports.wording import NOTHING, count, format_fraction, note_text,
 from marsyard.scenarios.landing.parameters import LanderParameters
 
 PAPER = read_paper(Path(__file__).with_name("paper.toml"))
-#: Columns of every row of a landing case.
-_OWN = ("site_safe", "site_reported", "no_site_reported", "true_safe_fraction")
+#: Columns of all rows of landing cases.
+_REQUIRED_COLUMNS = ("site_safe", "site_reported", "no_site_reported", "true_safe_fraction")
 #: Minimum number of cases with a map for the section on map errors.
 MIN_MAPS = 8
 
 
 def landing_rows(subject: Subject) -> pd.DataFrame | None:
-    """The rows of landing cases; None for other rows."""
+    """Return the rows of landing cases; None for other rows."""
     frame = subject.frame
-    return frame if all(name in frame for name in _OWN) and len(frame) > 0 else None
+    return frame if all(name in frame for name in _REQUIRED_COLUMNS) and len(frame) > 0 else None
 
 
 def _threshold_rows(subject: Subject) -> pd.DataFrame | None:
@@ -65,20 +65,17 @@ THRESHOLD = kinds.SectionDeclaration(
                     kinds.pooled_fraction("footprints_called_safe_unsafe", "footprints_called_safe"),
                 ),
                 kinds.Rate(
-                    "found",
-                    "Site found, of those with one",
-                    kinds.flag_rate("site_reported", "wide_site_exists"),
-                    False,
+                    "found", "Site found, if one exists", kinds.flag_rate("site_reported", "wide_site_exists"), False
                 ),
                 kinds.Rate("safe", "Sites truly safe", kinds.flag_rate("site_safe", "site_reported"), False),
             ),
             cases="Flights",
-            ylabel="share of footprints",
+            ylabel="fraction of footprints",
             text="The paper: both results of its Fig. 7 have false positive hazards, caused by a low threshold of "
-            "roughness and by noise of the map; a higher one would remove them. It gives no numbers.",
+            "roughness and by noise of the map; a higher threshold would remove them. It gives no numbers.",
             note="False alarms: of truly safe footprints. Missed: of footprints that are not truly safe, for slope or "
             "roughness.",
-            caption="Shares of footprints against the threshold; dashed: what the lander can stand on.",
+            caption="Fractions of footprints against the threshold; dashed: roughness limit of the lander.",
             limit=("the lander's limit", _lander_limit_m),
             data="thresholds",
         ),
@@ -86,7 +83,7 @@ THRESHOLD = kinds.SectionDeclaration(
 )
 
 
-def _fault_words(fault: str, size: float) -> tuple[str, str]:
+def _describe_fault(fault: str, size: float) -> tuple[str, str]:
     description = PAPER["fault_names"].get(fault, {"name": fault.replace("_", " "), "unit": "number"})
     name, unit = description["name"], description.get("unit")
     if unit is None or math.isnan(size):
@@ -96,8 +93,8 @@ def _fault_words(fault: str, size: float) -> tuple[str, str]:
     return name, f"{size:g}" if unit == "number" else f"{size:g} {unit}"
 
 
-def answers(frame: pd.DataFrame) -> dict[str, Bool[np.ndarray, " n"]]:
-    """Outcomes of the search; each row has one of them."""
+def classify_answers(frame: pd.DataFrame) -> dict[str, Bool[np.ndarray, " n"]]:
+    """Masks of the outcomes of the search; each row has exactly one outcome."""
     reported, safe, refused = (rates.flag(frame, name) for name in ("site_reported", "site_safe", "no_site_reported"))
     finished = frame["site_reported"].notna().to_numpy(dtype=np.bool_)
     return {
@@ -110,7 +107,7 @@ def answers(frame: pd.DataFrame) -> dict[str, Bool[np.ndarray, " n"]]:
 
 
 def _median(frame: pd.DataFrame, column: str) -> float:
-    return rates.quantile(rates.known(frame, column), 0.5)
+    return rates.quantile(rates.finite_values(frame, column), 0.5)
 
 
 def _two_digits(value: float) -> str:
@@ -118,7 +115,7 @@ def _two_digits(value: float) -> str:
 
 
 FAULT_OUTCOMES = kinds.OutcomesBySize(
-    outcomes=lambda frame, _: answers(frame),
+    outcomes=lambda frame, _: classify_answers(frame),
     styles={
         "safe": ("safe site", "full"),
         "refused": ("no safe site", "hatched"),
@@ -126,8 +123,8 @@ FAULT_OUTCOMES = kinds.OutcomesBySize(
         "wrong": ("wrong", "crossed"),
     },
     cases="Flights",
-    wording=_fault_words,
-    further=(
+    wording=_describe_fault,
+    extra_columns=(
         ("Touchdown off (m)", "off_m", lambda rows: _median(rows, "touchdown_error_m"), _two_digits),
         ("Sinking (m/s)", "sink_m_s", lambda rows: _median(rows, "touchdown_sink_m_s"), _two_digits),
     ),
@@ -138,17 +135,17 @@ FAULTS = kinds.SectionDeclaration("landing-faults", "Faults", "Faults by size", 
 
 
 def map_rows(subject: Subject) -> pd.DataFrame | None:
-    """Cases with a map, with errors as fractions of height and range; None if few, or without varying conditions."""
+    """Select cases with a map, with errors relative to height and range; None for few cases or constant conditions."""
     frame = landing_rows(subject)
     if frame is None or not (rates.varies(frame, "texture") and rates.varies(frame, "baseline_fraction")):
         return None
-    shares = {
+    fractions = {
         "rms_share": numbers(frame, "elevation_rms_m") / numbers(frame, "height_m"),
         "noise_share": numbers(frame, "elevation_noise_m") / numbers(frame, "height_m"),
         "altimeter_share": np.abs(numbers(frame, "range_error_m")) / numbers(frame, "range_m"),
     }
-    mapped = pd.DataFrame(frame.assign(**shares)[np.isfinite(shares["rms_share"])])
-    return mapped if len(mapped) >= MIN_MAPS else None
+    rows_with_map = pd.DataFrame(frame.assign(**fractions)[np.isfinite(fractions["rms_share"])])
+    return rows_with_map if len(rows_with_map) >= MIN_MAPS else None
 
 
 #: Errors of the map; columns of `map_rows`.
@@ -157,11 +154,11 @@ _MAP_ERRORS = (
     kinds.Quantity("noise_share", "elevation error rms without its plane (% of height)", 100.0),
     kinds.Quantity("slope_error_rms_deg", "slope error rms (deg)"),
 )
-#: Conditions of the map errors, as applied.
+#: Effects of the applied conditions on the map errors.
 MAP_EFFECTS = kinds.Scatter(
     x=(
-        kinds.Quantity("baseline_fraction", "baseline over height"),
-        kinds.Quantity("texture", "texture over the site's"),
+        kinds.Quantity("baseline_fraction", "baseline / height"),
+        kinds.Quantity("texture", "texture relative to the site"),
         kinds.Quantity("grid_px", "grid spacing (px)"),
         kinds.Quantity("level_error_deg", "error of the vertical (deg)"),
         kinds.Quantity("altimeter_share", "altimeter's error (% of the range)", 100.0),
@@ -192,50 +189,49 @@ MAP_ERRORS = kinds.SectionDeclaration(
 TOUCHDOWN_ERRORS = (
     kinds.Quantity("touchdown_error_gps_m", "by averaged GPS, as in the paper"),
     kinds.Quantity("touchdown_error_m", "by truth"),
-    kinds.Quantity("touchdown_error_estimated_m", "by the filter's estimate"),
+    kinds.Quantity("touchdown_error_estimated_m", "navigation filter estimate"),
 )
 _DEVIATIONS = ("gps_deviation_north_m", "gps_deviation_east_m")
 
 
-def _landing_rows(subject: Subject) -> pd.DataFrame | None:
+def _landed_rows(subject: Subject) -> pd.DataFrame | None:
     frame = landing_rows(subject)
     return None if frame is None else frame[rates.flag(frame, "landed")]
 
 
-def _table_2(landed: pd.DataFrame, subject: Subject, key: str) -> kinds.Drawn:
-    """The paper's runs, their mean, and ours by each measure."""
+def _draw_table_2(landed: pd.DataFrame, subject: Subject, key: str) -> kinds.BlocksAndData:
+    """Draw Table II: the paper's runs, their mean, and Marsyard's landings by each measure."""
     runs: Sequence[Mapping[str, float]] = PAPER["landings"]
     columns = ("error_m", "north_m", "east_m", "run_time_s")
     paper = {f"run {run['run']}": (1, [run[name] for name in columns]) for run in runs}
     paper["mean"] = len(runs), [float(np.mean([run[name] for run in runs])) for name in columns]
     rows = [
-        [f"paper, {name}", str(n), f"{error:.2f}", NOTHING, f"{north:.2f}", f"{east:.2f}", f"{taken:.1f} s"]
-        for name, (n, (error, north, east, taken)) in paper.items()
+        [f"paper, {name}", str(n), f"{error:.2f}", NOTHING, f"{north:.2f}", f"{east:.2f}", f"{run_time_s:.1f} s"]
+        for name, (n, (error, north, east, run_time_s)) in paper.items()
     ]
-    deviations = {name: rates.known(landed, name) for name in _DEVIATIONS}
-    taken_s = rates.known(landed, "estimation_time_s")
+    deviations = {name: rates.finite_values(landed, name) for name in _DEVIATIONS}
+    run_times_s = rates.finite_values(landed, "estimation_time_s")
     groups, means, intervals = rates.terrain_groups(landed), {}, {}
-    for one in TOUCHDOWN_ERRORS:
-        values = one.values(landed)
+    for measure in TOUCHDOWN_ERRORS:
+        values = measure.values(landed)
         finite = np.isfinite(values)
         if finite.any():
             low, high = mean_interval(values[finite], CONFIDENCE, None if groups is None else groups[finite])
-            means[one.column], intervals[one.column] = float(values[finite].mean()), (low, high)
-            text = f"mean {number(means[one.column])} ({number(low)} to {number(high)})"
-            spread = " to ".join(number(float(end)) for end in np.quantile(values[finite], (0.05, 0.95)))
-            run_time = f"{1e3 * float(np.median(taken_s)):.0f} ms here" if taken_s.size else NOTHING
-            off = [f"{each.mean():.2f}" if each.size else NOTHING for each in deviations.values()]
-            rows.append([f"ours, {one.title}", f"{int(finite.sum()):,}", text, spread, *off, run_time])
-    head = ["", "Landings", "Position error (m)", "90 % of errors (m)", "Northing dev. (m)", "Easting dev. (m)"]
-    note = note_text("hda.touchdown", confidence=format_fraction(CONFIDENCE))
+            means[measure.column], intervals[measure.column] = float(values[finite].mean()), (low, high)
+            text = f"mean {number(means[measure.column])} ({number(low)} to {number(high)})"
+            range_text = " to ".join(number(float(quantile)) for quantile in np.quantile(values[finite], (0.05, 0.95)))
+            run_time = f"{1e3 * float(np.median(run_times_s)):.0f} ms here" if run_times_s.size else NOTHING
+            means_m = [f"{x.mean():.2f}" if x.size else NOTHING for x in deviations.values()]
+            rows.append([f"ours, {measure.title}", f"{int(finite.sum()):,}", text, range_text, *means_m, run_time])
+    head = ["", "Landings", "Position error (m)", "5 % to 95 % quantiles (m)", "GPS SD north (m)", "GPS SD east (m)"]
+    note, column = note_text("hda.touchdown", confidence=format_fraction(CONFIDENCE)), "touchdown_safe"
+    safe_fraction = rates.flag_fraction(landed, column).share if column in landed else math.nan
     data = {
         "landings": len(landed),
         "mean_m": means,
         "mean_interval_m": intervals,
         "deviations_m": {name: float(values.mean()) for name, values in deviations.items() if values.size},
-        "touchdown_safe": rates.flag_fraction(landed, "touchdown_safe").share
-        if "touchdown_safe" in landed
-        else math.nan,
+        "touchdown_safe": safe_fraction,
         "paper_m": {str(run["run"]): run["error_m"] for run in runs},
     }
     return [Block(heading="Table II", grid=Grid([*head, "Run time"], rows), note=note)], data
@@ -244,95 +240,95 @@ def _table_2(landed: pd.DataFrame, subject: Subject, key: str) -> kinds.Drawn:
 TOUCHDOWN = kinds.SectionDeclaration(
     "touchdown",
     "Touchdown",
-    "Touchdown, next to Table II",
-    rows=_landing_rows,
+    "Touchdown error compared with Table II of the paper",
+    rows=_landed_rows,
     requires=("touchdown_error_gps_m", "touchdown_error_m"),
     parts=(
         kinds.Distribution(
             TOUCHDOWN_ERRORS,
-            ("distance of the touchdown from the site (m)", "share of landings"),
+            ("distance of the touchdown from the site (m)", "fraction of landings"),
             "Fraction of landings up to each distance from the site; vertical: the paper's runs, by averaged GPS.",
             limits={"paper, runs 1, 3, 4": [run["error_m"] for run in PAPER["landings"]]},
         ),
-        kinds.MadeBy(_table_2),
+        kinds.CustomBlocks(_draw_table_2),
         kinds.RateTable(
             (
                 kinds.Rate("touchdown", "touchdown on safe ground", kinds.flag_rate("touchdown_safe")),
                 kinds.Rate("site", "safe site", kinds.flag_rate("site_safe")),
             ),
             cases="Landings",
-            heading="Ground under the helicopter",
+            heading="Safety of the touchdown point",
             data="ground",
             shared=False,
         ),
     ),
 )
 
-#: Truth of the ground in both pictures, best first, and outcomes of the search. A wide safe site is safe with its whole
-#: surroundings up to a lander's radius.
+#: Classes of the true ground in both pictures, best first, and outcomes of the search. The surroundings of a wide safe
+#: site are safe up to a lander's radius.
 GROUNDS = ("wide safe site", "narrow safe site", "no safe site")
 ANSWERS = ("safe site, truly safe", "site, not safe", "no safe site", "not converged", "not finished")
 
 
-def site_shares(frame: pd.DataFrame) -> dict[str, rates.Share]:
-    """Fractions of right answers by the truth of the ground, as far as they have cases."""
-    reported, none, roomy, landed = (
+def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
+    """Fractions of correct answers by class of the true ground; classes without cases are omitted."""
+    reported, no_site, wide_site, landed = (
         rates.flag(frame, name) for name in ("site_reported", "no_safe_site_exists", "wide_site_exists", "landed")
     )
     refused, safe = rates.flag(frame, "no_site_reported"), rates.flag(frame, "site_safe")
-    narrow, right = rates.flag(frame, "safe_site_exists") & ~roomy, refused | (reported & safe)
-    shares = {
+    narrow, correct = rates.flag(frame, "safe_site_exists") & ~wide_site, refused | (reported & safe)
+    fractions = {
         "chosen sites that are truly safe": rates.fraction_of(safe[reported], frame[reported]),
-        "'no safe site', where none exists": rates.fraction_of(refused[none], frame[none]),
-        "a site reported, where none exists": rates.fraction_of(reported[none], frame[none]),
-        "a site reported, where a wide safe site exists": rates.fraction_of(reported[roomy], frame[roomy]),
+        "'no safe site', where none exists": rates.fraction_of(refused[no_site], frame[no_site]),
+        "a site reported, where none exists": rates.fraction_of(reported[no_site], frame[no_site]),
+        "a site reported, where a wide safe site exists": rates.fraction_of(reported[wide_site], frame[wide_site]),
         "a truly safe site or 'no safe site', where all safe sites are narrow": rates.fraction_of(
-            right[narrow], frame[narrow]
+            correct[narrow], frame[narrow]
         ),
-        "ground mapped, of all flights": rates.fraction_of(rates.flag(frame, "converged"), frame),
+        "converged (of all flights)": rates.fraction_of(rates.flag(frame, "converged"), frame),
         "landings on safe ground": rates.fraction_of(rates.flag(frame, "touchdown_safe")[landed], frame[landed]),
     }
-    return {name: one for name, one in shares.items() if one.n}
+    return {name: fraction for name, fraction in fractions.items() if fraction.n}
 
 
 def outcome_counts(frame: pd.DataFrame) -> dict[str, dict[str, int]]:
-    """Flights by truth (`GROUNDS`) and outcome (`ANSWERS`)."""
-    roomy, exists, none = (
+    """Count flights by true ground (`GROUNDS`) and outcome (`ANSWERS`)."""
+    wide_site, safe_site, no_site = (
         rates.flag(frame, name) for name in ("wide_site_exists", "safe_site_exists", "no_safe_site_exists")
     )
-    given = dict(zip(ANSWERS, answers(frame).values(), strict=True))
-    truths = dict(zip(GROUNDS, (roomy, exists & ~roomy, none), strict=True))
+    answer_masks = dict(zip(ANSWERS, classify_answers(frame).values(), strict=True))
+    ground_masks = dict(zip(GROUNDS, (wide_site, safe_site & ~wide_site, no_site), strict=True))
     return {
-        ground: {answer: int((of_ground & mask).sum()) for answer, mask in given.items()}
-        for ground, of_ground in truths.items()
+        ground: {answer: int((ground_mask & mask).sum()) for answer, mask in answer_masks.items()}
+        for ground, ground_mask in ground_masks.items()
     }
 
 
-def draw_outcomes(frame: pd.DataFrame, subject: Subject, key: str) -> kinds.Drawn:
-    """Outcomes of the search by the truth of the ground."""
+def draw_outcomes(frame: pd.DataFrame, subject: Subject, key: str) -> kinds.BlocksAndData:
+    """Draw the outcomes of the search by class of the true ground."""
     counts = outcome_counts(frame)
-    rows = [[ground, *(f"{of_answer[name]:,}" for name in ANSWERS)] for ground, of_answer in counts.items()]
+    rows = [[ground, *(f"{answer_counts[name]:,}" for name in ANSWERS)] for ground, answer_counts in counts.items()]
     note = note_text("hda.outcomes")
-    block = Block(heading="By true ground", grid=Grid(["The pictures show", *ANSWERS], rows), note=note)
+    block = Block(heading="Answers by ground truth", grid=Grid(["Ground in the pictures", *ANSWERS], rows), note=note)
     return [block], {"outcomes": counts}
 
 
-def distances(frame: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
+def hazard_distances(frame: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
     """Distances of reported sites and of touchdowns to the nearest true hazard, metres."""
     reported = frame[rates.flag(frame, "site_reported")]
     return {
-        "site, where one was reported": rates.known(reported, "site_hazard_distance_m"),
-        "touchdown": rates.known(frame, "touchdown_hazard_distance_m"),
+        "site, where one was reported": rates.finite_values(reported, "site_hazard_distance_m"),
+        "touchdown": rates.finite_values(frame, "touchdown_hazard_distance_m"),
     }
 
 
 def distance_grid(curves: Mapping[str, Float[np.ndarray, " n"]]) -> Grid:
-    """Minimum distance, low quantiles, and the bound of the 5 % quantile."""
+    """Table of minimum distance, low quantiles, and the bound of the 5 % quantile."""
     rows = []
     for name, values in curves.items():
         if values.size:
             bound = quantile_bounds(values, 0.05, CONFIDENCE)[0]
-            texts = [number(float(one)) for one in (values.min(), *np.quantile(values, (0.05, 0.5)))]
+            texts = [number(float(value)) for value in (values.min(), *np.quantile(values, (0.05, 0.5)))]
             rows.append([name, f"{values.size:,}", *texts, NOTHING if math.isinf(bound) else number(bound)])
     return Grid(["Distance (m)", "Cases", "Minimum", "5 % quantile", "Median", "Bound of the 5 % quantile"], rows)
 
@@ -344,21 +340,23 @@ def run_times_section(subject: Subject) -> Section | None:
         return None
     durations = np.column_stack([numbers(frame, stage["column"]) for stage in stages])
     complete = np.isfinite(durations).all(axis=1)
-    durations, chosen, cases = durations[complete], frame[complete], int(complete.sum())
+    durations, rows_with_times, cases = durations[complete], frame[complete], int(complete.sum())
     if not cases or not durations.sum() > 0.0:
         return None
-    median, late = np.median(durations, axis=0), np.quantile(durations, 0.95, axis=0)
-    paper, ours = sum(stage["seconds"] for stage in stages), float(median.sum())
-    factor, rows, data = paper / ours, [], []
-    for stage, middle, slow in zip(stages, median.tolist(), late.tolist(), strict=True):
-        sizes = [rates.quantile(rates.known(chosen, name), 0.5) for name in stage["ours"]]
+    median, p95 = np.median(durations, axis=0), np.quantile(durations, 0.95, axis=0)
+    paper_total_s, total_s = sum(stage["seconds"] for stage in stages), float(median.sum())
+    factor, rows, data = paper_total_s / total_s, [], []
+    for stage, median_s, p95_s in zip(stages, median.tolist(), p95.tolist(), strict=True):
+        sizes = [rates.quantile(rates.finite_values(rows_with_times, name), 0.5) for name in stage["ours"]]
         text = NOTHING if np.isnan(sizes).any() else stage["wording"].format(*sizes)
-        seconds = {"paper_s": stage["seconds"], "median_s": middle, "late_s": slow, "scaled_s": factor * middle}
+        seconds = {"paper_s": stage["seconds"], "median_s": median_s, "late_s": p95_s, "scaled_s": factor * median_s}
         data.append({"name": stage["name"], **seconds, "parameters": text})
-        times = [f"{stage['seconds']:.2f}", f"{1e3 * middle:.1f}", f"{1e3 * slow:.1f}", f"{factor * middle:.2f}"]
+        times = [f"{stage['seconds']:.2f}", f"{1e3 * median_s:.1f}", f"{1e3 * p95_s:.1f}", f"{factor * median_s:.2f}"]
         rows.append([stage["name"], *times, stage["parameters"], text])
-    rows.append(["Together", f"{paper:.2f}", f"{1e3 * ours:.1f}", NOTHING, f"{ours * factor:.2f}", NOTHING, NOTHING])
-    head = ["Stage", "Paper (s)", "Here, median (ms)", "95 %", "Scaled (s)", "Paper's parameters", "Parameters here"]
+    times = [f"{paper_total_s:.2f}", f"{1e3 * total_s:.1f}", NOTHING, f"{total_s * factor:.2f}"]
+    rows.append(["Total", *times, NOTHING, NOTHING])
+    head = ["Stage", "Paper (s)", "Median (ms)", "95 % quantile (ms)", "Scaled (s)", "Paper's parameters", "Parameters"]
     note = note_text("hda.run_times", cases=count(cases, "case"), factor=number(factor))
     block, data_of_section = Block(grid=Grid(head, rows), note=note), {"factor": factor, "cases": cases, "stages": data}
-    return Section("run-times", "Run time", "Run time by stage, next to Table I", [block], data_of_section)
+    title = "Run time by stage, compared with Table I of the paper"
+    return Section("run-times", "Run time", title, [block], data_of_section)

@@ -16,7 +16,7 @@ from scipy import optimize, stats
 
 #: Minimum number of cases.
 MIN_CASES = 20
-#: Cases in a bin of the fraction of variance, and the maximum number of bins.
+#: Number of cases per bin for the fraction of variance, and the maximum number of bins.
 _CASES_PER_BIN, _MAX_BINS = 15, 20
 
 
@@ -24,12 +24,11 @@ _CASES_PER_BIN, _MAX_BINS = 15, 20
 class Driver:
     """Effect of a condition on a response.
 
-    n, effective_n: cases with both, and the equivalent number of independent ones.
-    correlation, lower, upper: Spearman's rank correlation and its interval.
-    share, share_lower, share_upper: fraction of the variance of the response's ranks that the condition alone explains,
-    for any form of the curve, and its interval: the first-order index of a variance-based analysis, estimated from the
-    given cases; 0 to 1.
-    p_value: p-value of the null hypothesis that it explains nothing.
+    n, effective_n: number of cases with both, and the equivalent number of independent cases. correlation, lower,
+    upper: Spearman's rank correlation and its interval. share, share_lower, share_upper: fraction of the variance of
+    the response's ranks that the condition alone explains, for any form of the curve, and its interval: the first-order
+    index of a variance-based analysis, estimated from the given cases; 0 to 1. p_value: p-value of the null hypothesis
+    that the condition has no effect.
     """
 
     n: int
@@ -43,17 +42,16 @@ class Driver:
     p_value: float
 
 
-def driver(
+def estimate_driver(
     condition: Float[np.ndarray, " n"],
     response: Float[np.ndarray, " n"],
     groups: Int[np.ndarray, " n"] | None,
     confidence: float,
 ) -> Driver | None:
-    """Effect of a condition on a response over the cases with both; None for fewer than twenty or a constant.
+    """Estimate the effect of a condition on a response from cases with both; None for fewer than twenty or a constant.
 
-    condition, response: NaN where missing.
-    groups: terrain of each case; None where no terrain is shared.
-    confidence: of the two-sided intervals.
+    condition, response: NaN where missing. groups: terrain of each case; None if no terrain is shared. confidence:
+    confidence of the two-sided intervals.
 
     Correlation: Fisher's z with Bonett & Wright's variance (Psychometrika 65, 2000). Fraction of variance: ranks of the
     response in bins of equally many cases (the "given data" estimate of the first-order index: Plischke, Borgonovo &
@@ -70,18 +68,13 @@ def driver(
         index = np.unique(groups[finite], return_inverse=True)[1]
         sizes = np.bincount(index).astype(np.float64)
         size = float((sizes**2).sum() / sizes.sum())
-        effective = n / max(
-            1.0,
-            1.0
-            + (size - 1.0)
-            * _estimate_intraclass_correlation(x, index, sizes)
-            * _estimate_intraclass_correlation(y, index, sizes),
-        )
+        r_x, r_y = (_estimate_intraclass_correlation(values, index, sizes) for values in (x, y))
+        effective = n / max(1.0, 1.0 + (size - 1.0) * r_x * r_y)
     correlation = float(np.corrcoef(x, y)[0, 1])
-    half = float(stats.norm.ppf(0.5 * (1.0 + confidence)))
-    half *= math.sqrt((1.0 + 0.5 * correlation**2) / max(effective - 3.0, 1.0))
-    middle = math.atanh(float(np.clip(correlation, -1.0 + 1e-12, 1.0 - 1e-12)))
-    lower, upper = math.tanh(middle - half), math.tanh(middle + half)
+    half_width = float(stats.norm.ppf(0.5 * (1.0 + confidence)))
+    half_width *= math.sqrt((1.0 + 0.5 * correlation**2) / max(effective - 3.0, 1.0))
+    centre = math.atanh(float(np.clip(correlation, -1.0 + 1e-12, 1.0 - 1e-12)))
+    lower, upper = math.tanh(centre - half_width), math.tanh(centre + half_width)
     return Driver(n, effective, correlation, lower, upper, *_estimate_explained_fraction(x, y, effective, confidence))
 
 
@@ -90,27 +83,27 @@ def _estimate_explained_fraction(
 ) -> tuple[float, float, float, float]:
     """Fraction of variance between bins, its interval, and the p-value of the F-test."""
     n = x.size
-    wanted = int(np.clip(n // _CASES_PER_BIN, 2, _MAX_BINS))
-    edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, wanted + 1)))[1:-1]
-    # values below the bins' edges, so that a condition of two kinds has a bin for each
+    max_bins = int(np.clip(n // _CASES_PER_BIN, 2, _MAX_BINS))
+    edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, max_bins + 1)))[1:-1]
+    # intervals closed on the left, so that each value of a condition with two values has its own bin
     index = np.unique(np.searchsorted(edges, x, side="right"), return_inverse=True)[1]
     if index.max() == 0:
-        index = np.unique(x, return_inverse=True)[1] if np.unique(x).size <= wanted else (x > x.min()).astype(int)
+        index = np.unique(x, return_inverse=True)[1] if np.unique(x).size <= max_bins else (x > x.min()).astype(int)
     bins = int(index.max()) + 1
     means = np.bincount(index, weights=y) / np.bincount(index)
     total = float(((y - y.mean()) ** 2).sum())
     between = float((np.bincount(index) * (means - y.mean()) ** 2).sum())
     if between >= (1.0 - 1e-9) * total:
         return 1.0, 1.0, 1.0, 0.0
-    freedom = max(effective - bins, 1.0)
+    degrees = max(effective - bins, 1.0)
     within = total - between
-    ratio = between / (bins - 1.0) / (within / freedom)
-    fraction = max(0.0, (between - (bins - 1.0) * within / freedom) / total)
+    ratio = between / (bins - 1.0) / (within / degrees)
+    fraction = max(0.0, (between - (bins - 1.0) * within / degrees) / total)
 
     def excess(value: float, level: float) -> float:
-        """Distribution function of the F ratio at a noncentrality, above a level."""
-        law = stats.ncf.cdf(ratio, bins - 1.0, freedom, value) if value else stats.f.cdf(ratio, bins - 1.0, freedom)
-        return float(law) - level
+        """Distribution function of the F ratio at a noncentrality, minus a level."""
+        cdf = stats.ncf.cdf(ratio, bins - 1.0, degrees, value) if value else stats.f.cdf(ratio, bins - 1.0, degrees)
+        return float(cdf) - level
 
     bounds: list[float] = []
     tail = 0.5 * (1.0 - confidence)
@@ -120,17 +113,16 @@ def _estimate_explained_fraction(
             high *= 2.0
         noncentrality = 0.0
         if excess(0.0, level) > 0.0:
-            noncentrality = (
-                float(optimize.brentq(excess, 0.0, high, args=(level,), xtol=1e-4 * high, rtol=1e-4)) / effective
-            )
+            root = float(optimize.brentq(excess, 0.0, high, args=(level,), xtol=1e-4 * high, rtol=1e-4))
+            noncentrality = root / effective
         bounds.append(noncentrality / (1.0 + noncentrality))
-    return fraction, bounds[0], bounds[1], float(stats.f.sf(ratio, bins - 1.0, freedom))
+    return fraction, bounds[0], bounds[1], float(stats.f.sf(ratio, bins - 1.0, degrees))
 
 
 def _estimate_intraclass_correlation(
     values: Float[np.ndarray, " n"], index: Int[np.ndarray, " n"], sizes: Float[np.ndarray, " groups"]
 ) -> float:
-    """Intraclass correlation by analysis of variance, 0 to 1; 0 where no group has two."""
+    """Intraclass correlation by analysis of variance, 0 to 1; 0 if no group has two values."""
     n, groups = values.size, sizes.size
     if groups < 2 or groups == n:
         return 0.0

@@ -17,33 +17,31 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
 from scipy import special, stats
 
-_LARGEST_SAMPLE_SIZE = 2**40
+_MAX_SAMPLE_SIZE = 2**40
 #: A lower and an upper bound.
 Interval = tuple[float, float]
 
 
 def check_confidence(confidence: float) -> None:
-    """Raise ValueError where a confidence does not lie between 0 and 1."""
+    """Raise ValueError if a confidence does not lie between 0 and 1."""
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"the confidence is {confidence}; it must lie between 0 and 1, both excluded")
 
 
 def _check_counts(successes: float | int, n: float | int) -> None:
     if not 0 <= successes <= n:
-        raise ValueError(f"{successes} successes of {n} cases; there can be none to all")
+        raise ValueError(f"{successes} successes of {n} cases; allowed: 0 to {n}")
 
 
 def proportion_lower(successes: float | int, n: float | int, confidence: float) -> float:
     """One-sided lower Clopper-Pearson bound of a success rate, by the beta quantile; 0 for no cases.
 
-    The numbers need not be whole (an effective sample size is not). Raises ValueError where they or the confidence are
+    The numbers can be fractional (effective sample sizes). Raises ValueError if they or the confidence are
     out of range.
     """
     check_confidence(confidence)
     _check_counts(successes, n)
-    if successes <= 0:
-        return 0.0
-    return float(stats.beta.ppf(1.0 - confidence, successes, n - successes + 1.0))
+    return 0.0 if successes <= 0 else float(stats.beta.ppf(1.0 - confidence, successes, n - successes + 1.0))
 
 
 def proportion_upper(successes: float | int, n: float | int, confidence: float) -> float:
@@ -61,39 +59,39 @@ def proportion_interval(successes: float | int, n: float | int, confidence: floa
 
 
 def minimum_sample_size(reliability: float, confidence: float, failures: int = 0) -> int:
-    """Smallest number of cases that shows a reliability at a confidence with a given number of failures.
+    """Minimum number of cases that demonstrates a reliability at a confidence with a given number of failures.
 
     The one-sided lower Clopper-Pearson bound reaches the reliability: without failures at the textbook
-    ln(1 - confidence) / ln(reliability), rounded up. Raises ValueError where reliability or confidence do not lie
-    strictly between 0 and 1, or the failures are negative.
+    ln(1 - confidence) / ln(reliability), rounded up. Raises ValueError if reliability or confidence do not lie
+    strictly between 0 and 1, or if the failures are negative.
     """
     check_confidence(confidence)
     if not 0.0 < reliability < 1.0:
         raise ValueError(f"the reliability is {reliability}; it must lie between 0 and 1, both excluded")
     if failures < 0:
-        raise ValueError(f"{failures} failures; there cannot be fewer than none")
+        raise ValueError(f"{failures} failures; the number must not be negative")
 
-    def is_shown(cases: int) -> bool:
+    def is_sufficient(cases: int) -> bool:
         return proportion_lower(cases - failures, cases, confidence) >= reliability
 
     upper = failures + 1
-    while not is_shown(upper):
+    while not is_sufficient(upper):
         upper *= 2
-        if upper > _LARGEST_SAMPLE_SIZE:
-            raise ValueError(f"no sample of practical size shows a reliability of {reliability}")
+        if upper > _MAX_SAMPLE_SIZE:
+            raise ValueError(f"no sample of practical size demonstrates a reliability of {reliability}")
     cases = range(failures + 1, upper)
-    return cases.start + bisect.bisect_left(cases, True, key=is_shown)
+    return cases.start + bisect.bisect_left(cases, True, key=is_sufficient)
 
 
 def further_cases_needed(n: int, failures: int, reliability: float, confidence: float) -> int:
-    """Number of additional cases without failure that show the reliability at the confidence; 0 when it is shown."""
+    """Number of additional cases without failure that demonstrate the reliability at the confidence; 0 if none."""
     return max(0, minimum_sample_size(reliability, confidence, failures) - n)
 
 
 def consumer_risk(successes: float | int, n: float | int, rate: float) -> float:
-    """Probability of evidence at least as good if the true rate only just equals `rate`; 1 for no successes.
+    """Probability of evidence at least as good if the true rate equals `rate`; 1 for no successes.
 
-    It is at most 1 - confidence exactly where the one-sided lower Clopper-Pearson bound at that confidence reaches the
+    It is at most 1 - confidence exactly if the one-sided lower Clopper-Pearson bound at that confidence reaches the
     rate (Hanson & Beard, NASA/TP-2010-216447).
     """
     _check_counts(successes, n)
@@ -117,11 +115,10 @@ class ClusterMethod(StrEnum):
 class ClusteredEvidence:
     """Evidence for a success rate from cases that share terrains.
 
-    terrains, failed_terrains: distinct terrains, and those on which at least one case failed.
-    method: method of the bounds.
-    design_effect: variance of the success rate over that of as many independent cases; NaN where it cannot be
-    estimated. effective_n, effective_successes: equivalent independent cases, and successes that give the lower bound.
-    lower, upper: one-sided bounds of the success rate of a case, each at the requirement's confidence.
+    terrains, failed_terrains: number of distinct terrains, and of terrains with at least one failed case. method:
+    method of the bounds. design_effect: variance of the success rate divided by that of as many independent cases; NaN
+    if it cannot be estimated. effective_n, effective_successes: equivalent independent cases, and successes for the
+    lower bound. lower, upper: one-sided bounds of the success rate of a case, each at the requirement's confidence.
     """
 
     terrains: int
@@ -137,9 +134,9 @@ class ClusteredEvidence:
 def clustered_evidence(
     success: Bool[np.ndarray, " n"], terrain: Int[np.ndarray, " n"], confidence: float
 ) -> ClusteredEvidence:
-    """Bounds of a success rate, each at `confidence`, for at least one case; `terrain` numbers the terrain of each.
+    """Bounds of a success rate, each at `confidence`, for at least one case; `terrain`: terrain number of each.
 
-    Few terrains with failures or successes are counted whole. Otherwise the bounds are those of Clopper and Pearson
+    For few terrains with failures or successes, terrains are counted. Otherwise: bounds of Clopper and Pearson
     with the effective sample size of Korn & Graubard 1998, never larger than n.
     """
     index = number_terrains(terrain)
@@ -149,24 +146,25 @@ def clustered_evidence(
     n, terrains = float(sizes.sum()), sizes.size
     if terrains >= _MIN_TERRAINS and min(failed, succeeded) >= _MIN_MIXED_TERRAINS:
         method, design_effect = ClusterMethod.KORN_GRAUBARD, _estimate_design_effect(successes, sizes)
-        # The second factor pays for estimating the variance from so many terrains only.
-        freedom = (stats.t.ppf(confidence, n - 1) / stats.t.ppf(confidence, terrains - 1)) ** 2
-        effective_n = min(n, n / max(design_effect, 1e-9) * float(freedom))
+        # The second factor accounts for the estimation of the variance from few terrains.
+        correction = (stats.t.ppf(confidence, n - 1) / stats.t.ppf(confidence, terrains - 1)) ** 2
+        effective_n = min(n, n / max(design_effect, 1e-9) * float(correction))
         min_successes = max_successes = float(successes.sum() / n * effective_n)
     else:
         # With equally many cases on each, a terrain has a failure at least as often as a case fails, and a success at
-        # least as often as a case succeeds: both bounds are safe. Where bad terrains have fewer cases (they answer less
+        # least as often as a case succeeds: both bounds are safe. If bad terrains have fewer cases (they answer less
         # often) or more, the rate of the cases is on the safe side of the terrains' rate for one of the two bounds.
         method, design_effect, effective_n = ClusterMethod.TERRAIN_COUNT, float("nan"), float(terrains)
-        of_cases = terrains * float(successes.sum() / n)
-        min_successes, max_successes = min(float(terrains - failed), of_cases), max(float(succeeded), of_cases)
+        scaled_successes = terrains * float(successes.sum() / n)
+        min_successes = min(float(terrains - failed), scaled_successes)
+        max_successes = max(float(succeeded), scaled_successes)
     lower = proportion_lower(min_successes, effective_n, confidence)
     upper = proportion_upper(max_successes, effective_n, confidence)
     return ClusteredEvidence(terrains, failed, method, design_effect, effective_n, min_successes, lower, upper)
 
 
 def _estimate_design_effect(successes: Float[np.ndarray, " terrains"], sizes: Float[np.ndarray, " terrains"]) -> float:
-    """Variance of the rate over terrains (Taylor linearisation) over the binomial one."""
+    """Variance of the rate over terrains (Taylor linearisation), divided by the binomial variance."""
     terrains, n = sizes.size, sizes.sum()
     rate = successes.sum() / n
     residuals = successes - rate * sizes
@@ -175,16 +173,16 @@ def _estimate_design_effect(successes: Float[np.ndarray, " terrains"], sizes: Fl
 
 
 def number_terrains(terrain: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Consecutive terrain numbers from 0, in the order of the given ones."""
+    """Number the terrains consecutively from 0, in the order of their given numbers."""
     first, last = int(terrain.min()), int(terrain.max())
     if last - first > 4 * terrain.size:
         return np.unique(terrain, return_inverse=True)[1]
-    # without sorting, which takes most of a report of a million cases
+    # without sorting, which is slow for a million cases
     shifted = terrain - first
     return np.asarray((np.cumsum(np.bincount(shifted) > 0) - 1)[shifted])
 
 
-#: Minimum risk: a confidence nearer to 1 would round to 1.
+#: Minimum risk: a confidence closer to 1 would round to 1.
 _MIN_RISK = 1e-12
 #: Minimum number of cases of the first look, and maximum number of looks.
 _MIN_FIRST_CASES, _MAX_LOOKS = 16, 6
@@ -192,48 +190,48 @@ _MIN_FIRST_CASES, _MAX_LOOKS = 16, 6
 
 @dataclass(frozen=True)
 class Look:
-    """A look at the verdicts: number of cases, and fraction of the risk that is spent."""
+    """A planned evaluation of the verdicts: number of cases, and fraction of the risk that it may spend."""
 
     cases: int
-    share: float
+    risk_fraction: float
 
 
 def planned_looks(cases: int) -> tuple[Look, ...]:
-    """Looks of a campaign of at most `cases` cases: at the last case, at half of them, a quarter, and so on."""
+    """Plan the looks of a campaign of at most `cases` cases: at all cases, at half of them, a quarter, and so on."""
     if cases < 1:
         raise ValueError(f"{cases} cases; a campaign has at least one")
     sizes = [cases]
     while len(sizes) < _MAX_LOOKS and sizes[0] // 2 >= _MIN_FIRST_CASES:
         sizes.insert(0, sizes[0] // 2)
-    return tuple(Look(size, (size - before) / cases) for before, size in pairwise([0, *sizes]))
+    return tuple(Look(size, (size - previous) / cases) for previous, size in pairwise([0, *sizes]))
 
 
 def spent_fraction(looks: tuple[Look, ...], cases: int) -> float:
     """Fraction of the risk for a verdict from a number of cases: that of the first look with at least as many.
 
-    For more cases than at the last look it is that look's: cases added to a stopped campaign gain nothing.
+    For more cases than at the last look it is that of the last look.
     """
-    return next((look.share for look in looks if cases <= look.cases), looks[-1].share)
+    return next((look.risk_fraction for look in looks if cases <= look.cases), looks[-1].risk_fraction)
 
 
-def confidence_at(confidence: float, share: float) -> float:
+def confidence_at(confidence: float, risk_fraction: float) -> float:
     """Confidence of the bounds at one look."""
-    return 1.0 - (1.0 - confidence) * share
+    return 1.0 - (1.0 - confidence) * risk_fraction
 
 
 @dataclass(frozen=True)
 class LaterLook:
-    """Test at a look at a campaign that was evaluated before: one verdict, PASS or FAIL, of a requirement.
+    """Test at a look at a campaign that was evaluated earlier: one verdict, PASS or FAIL, of a requirement.
 
-    Events are failures for PASS, successes for FAIL: few of them show it. Under `rate`, the rate at the requirement's
+    Events are failures for PASS, successes for FAIL: few events support the verdict. Under `rate`, the rate at the
     limit, the likelihood ratio (`_log_likelihood_ratio`) is a martingale, and under any higher rate a supermartingale.
-    By Ville's inequality it ever reaches c with probability at most its value at the first look over c, for any
+    By Ville's inequality it ever reaches c with probability at most its value at the first look divided by c, for any
     stopping rule. The threshold c is chosen so that the probabilities of a verdict at the first look, by the ordinary
     bound, and at any later look add up to `risk`.
 
     rate: probability of an event in a case at the limit: 1 - probability for PASS, probability for FAIL.
     risk: probability of a false verdict of all looks together: 1 - confidence.
-    first: cases of the first look, or whole terrains where these are counted.
+    first: number of cases of the first look, or of terrains if these are counted.
     """
 
     rate: float
@@ -242,39 +240,39 @@ class LaterLook:
 
     @cached_property
     def log_threshold(self) -> float:
-        """Logarithm of the likelihood ratio that shows the verdict at a later look."""
+        """Logarithm of the likelihood ratio that supports the verdict at a later look."""
         events = np.arange(self.first + 1, dtype=np.float64)
-        decided = events[stats.binom.cdf(events, self.first, self.rate) <= self.risk]
-        chance = stats.binom.logpmf(decided, self.first, self.rate)
-        spent = float(np.exp(chance).sum())
-        # rest of the martingale's mean of 1 where the first look does not decide
-        remaining = 1.0 - float(np.exp(chance + _log_likelihood_ratio(decided, self.first, self.rate)).sum())
-        return math.log(max(_MIN_RISK, remaining) / max(_MIN_RISK, self.risk - spent))
+        decided_events = events[stats.binom.cdf(events, self.first, self.rate) <= self.risk]
+        log_probability = stats.binom.logpmf(decided_events, self.first, self.rate)
+        spent_risk = float(np.exp(log_probability).sum())
+        # remainder of the martingale's mean of 1, if the first look does not decide
+        log_ratio = _log_likelihood_ratio(decided_events, self.first, self.rate)
+        remaining = 1.0 - float(np.exp(log_probability + log_ratio).sum())
+        return math.log(max(_MIN_RISK, remaining) / max(_MIN_RISK, self.risk - spent_risk))
 
     def risk_of_bound(self, n: float | int) -> float:
-        """Risk at which the one-sided Clopper-Pearson bound of n cases shows the verdict at this look."""
+        """Risk at which the one-sided Clopper-Pearson bound of n cases supports the verdict at this look."""
         log_ratio = float(_log_likelihood_ratio(0.0, n, self.rate))
         if log_ratio < self.log_threshold:
             level = n * math.log1p(-self.rate) + log_ratio - self.log_threshold
             return max(_MIN_RISK, min(self.risk, math.exp(level)))
         few, many = 0.0, float(n)
         while many - few > 1e-9 * max(1.0, n):
-            middle = 0.5 * (few + many)
-            few, many = (
-                (middle, many) if _log_likelihood_ratio(middle, n, self.rate) >= self.log_threshold else (few, middle)
-            )
+            events = 0.5 * (few + many)
+            is_enough = _log_likelihood_ratio(events, n, self.rate) >= self.log_threshold
+            few, many = (events, many) if is_enough else (few, events)
         return max(_MIN_RISK, min(self.risk, float(stats.beta.cdf(1.0 - self.rate, n - few, few + 1.0))))
 
     def cases_needed(self, n: int, events: int) -> int:
-        """Total number of cases, at least n, that shows the verdict if no further event happens."""
+        """Total number of cases, at least n, that supports the verdict if no more events occur."""
 
-        def is_shown(cases: int) -> bool:
+        def is_sufficient(cases: int) -> bool:
             return bool(_log_likelihood_ratio(events, cases, self.rate) >= self.log_threshold)
 
         upper = max(n, 1)
-        while not is_shown(upper):
+        while not is_sufficient(upper):
             upper *= 2
-        return n + bisect.bisect_left(range(n, upper), True, key=is_shown)
+        return n + bisect.bisect_left(range(n, upper), True, key=is_sufficient)
 
 
 def _log_likelihood_ratio(
@@ -282,8 +280,8 @@ def _log_likelihood_ratio(
 ) -> Float64[np.ndarray, "*n"]:
     """Logarithm of the likelihood ratio of a lower rate to `rate`, for a number of events in n cases.
 
-    The lower rate has Jeffreys' prior, Beta(1/2, 1/2), truncated at `rate`. The ratio falls with the events, and rises
-    with every case without one.
+    The lower rate has Jeffreys' prior, Beta(1/2, 1/2), truncated at `rate`. The ratio decreases with the events, and
+    increases with every case without one.
     """
     events = np.asarray(events, dtype=np.float64)
     likelihood = special.betaln(events + 0.5, n - events + 0.5) - special.betaln(0.5, 0.5)

@@ -1,21 +1,21 @@
-"""Statistics of samples: quantiles, mean and spread, each with bounds; prediction ellipses of errors in two dimensions.
+"""Statistics of samples: quantiles, mean, standard deviation, each with bounds; prediction ellipses of errors in 2-D.
 
 Quantiles are bounded by order statistics, for any distribution (Wilks, "Determination of sample sizes for setting
-tolerance limits", Ann. Math. Statist. 12, 1941; as Hanson & Beard use them for a stated consumer risk,
-NASA/TP-2010-216447). Means and spreads are bounded by SciPy's BCa bootstrap (Efron, "Better bootstrap confidence
-intervals", J. Amer. Statist. Assoc. 82, 1987), at the level of Student's t instead of the normal distribution
-(Hesterberg, "What teachers should know about the bootstrap", Amer. Statist. 69, 2015), since BCa alone covers too
-little in small samples. A spread's interval contains Bonett's ("Approximate confidence interval for standard deviation
-of nonnormal distributions", Comput. Statist. Data Anal. 50, 2006).
+tolerance limits", Ann. Math. Statist. 12, 1941; used by Hanson & Beard for a specified consumer risk,
+NASA/TP-2010-216447). Means and standard deviations are bounded by SciPy's BCa bootstrap (Efron, "Better bootstrap
+confidence intervals", J. Amer. Statist. Assoc. 82, 1987), at the level of Student's t instead of the normal
+distribution (Hesterberg, "What teachers should know about the bootstrap", Amer. Statist. 69, 2015), since the coverage
+of BCa is too low in small samples. The interval of a standard deviation contains Bonett's ("Approximate confidence
+interval for standard deviation of nonnormal distributions", Comput. Statist. Data Anal. 50, 2006).
 
 Values that share terrains (`groups`) are correlated; the terrain is the sampling unit. Mean and standard deviation: BCa
-bootstrap of whole terrains (Davison & Hinkley, "Bootstrap methods and their application", 1997, section 3.8), widened
-for few of them as for single values; it contains Student's interval with the variance over terrains (Taylor
+bootstrap of entire terrains (Davison & Hinkley, "Bootstrap methods and their application", 1997, section 3.8), widened
+for few terrains as for few values; it contains Student's interval with the variance over terrains (Taylor
 linearisation; Cochran, "Sampling techniques", 1977, section 6). Quantiles: order statistics, with the counts of
 `marsyard.reports.statistics.proportions`: the effective number of values (Woodruff, J. Amer. Statist. Assoc. 47, 1952,
-with Korn & Graubard's number), or whole terrains where too few of them lie on either side.
+with Korn & Graubard's number), or the number of terrains if too few of them lie on one side.
 
-`python -m benchmarks.validation --only intervals --only shared` measures the coverage of all of these.
+`python -m benchmarks.validation --only intervals --only shared` measures the coverage of all these intervals.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ from marsyard.reports.statistics.proportions import (
     proportion_lower,
 )
 
-#: Number of values (or terrains) above which the bootstrap's interval equals the large-sample one as printed.
+#: Maximum number of values (or terrains) of a bootstrap; above it, the printed large-sample interval is equal.
 _MAX_BOOTSTRAP = 2000
-_RESAMPLES = 2000
-#: Fixed seed: the same rows give the same page.
+_N_RESAMPLES = 2000
+#: Fixed seed of the bootstrap, for reproducible reports.
 _SEED = 19340401
-#: Minimum number of terrains, and of independent values, to estimate their spread.
-FEWEST_TERRAINS, _MIN_FOR_SPREAD = 5, 8
-#: Minimum number of points of an ellipse: its factor needs two degrees of freedom beyond the plane's.
+#: Minimum number of terrains, and of independent values, to estimate a standard deviation.
+MIN_TERRAINS, _MIN_FOR_SPREAD = 5, 8
+#: Minimum number of points of an ellipse.
 _MIN_FOR_ELLIPSE = 5
-#: Terrain number of each value; None where all are independent.
+#: Terrain number of each value; None if all are independent.
 Groups = Int[np.ndarray, " n"] | None
 
 
@@ -60,7 +60,7 @@ def is_shared(groups: Groups) -> bool:
 
 
 def _bootstrap(data: Sequence[Float[np.ndarray, " n"]], statistic: Callable[..., Any], confidence: float) -> Interval:
-    """Two-sided BCa interval of a statistic of one or more columns, resampled together; NaN where there is none."""
+    """Two-sided BCa interval of a statistic of one or more columns, resampled together; NaN if it does not exist."""
     n = data[0].size
     # the level at which the normal quantile equals Student's times sqrt(n / (n - 1)): Hesterberg 2015, section 5
     quantile = _student_quantile(confidence, n) * math.sqrt(n / (n - 1.0))
@@ -73,7 +73,7 @@ def _bootstrap(data: Sequence[Float[np.ndarray, " n"]], statistic: Callable[...,
             paired=True,
             # below 1, as SciPy requires
             confidence_level=min(2.0 * float(stats.norm.cdf(quantile)) - 1.0, 1.0 - 1e-6),
-            n_resamples=_RESAMPLES,
+            n_resamples=_N_RESAMPLES,
             batch=200,
             vectorized=True,
             method="BCa",
@@ -87,19 +87,19 @@ def _student_quantile(confidence: float, n: int) -> float:
     return float(stats.t.ppf(0.5 * (1.0 + confidence), n - 1))
 
 
-def _deviation_of_mean(residuals: Float[np.ndarray, " terrains"], n: int) -> float:
+def _standard_error(residuals: Float[np.ndarray, " terrains"], n: int) -> float:
     terrains = residuals.size
     return math.sqrt(terrains / (terrains - 1.0) * float((residuals**2).sum())) / n
 
 
-def _unite(first: Interval, second: Interval) -> Interval:
+def _union(first: Interval, second: Interval) -> Interval:
     return float(np.fmin(first[0], second[0])), float(np.fmax(first[1], second[1]))
 
 
 def mean_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Groups = None) -> Interval:
     """Two-sided interval of the mean: BCa bootstrap, or the central limit theorem in large samples.
 
-    NaN for fewer than two values, or five terrains; the value itself where all are equal.
+    NaN for fewer than two values, or five terrains; the value itself if all are equal.
     """
     check_confidence(confidence)
     values = np.asarray(sample, dtype=np.float64)
@@ -111,28 +111,27 @@ def mean_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Gr
     if groups is None or not is_shared(groups):
         if values.size <= _MAX_BOOTSTRAP:
             return _bootstrap((values,), np.mean, confidence)
-        quantile, spread = float(stats.norm.ppf(0.5 * (1.0 + confidence))), float(values.std(ddof=1))
-        half = quantile * spread / math.sqrt(values.size)
-        return mean - half, mean + half
+        quantile, deviation = float(stats.norm.ppf(0.5 * (1.0 + confidence))), float(values.std(ddof=1))
+        half_width = quantile * deviation / math.sqrt(values.size)
+        return mean - half_width, mean + half_width
     index = number_terrains(groups)
     sizes, sums = np.bincount(index).astype(np.float64), np.bincount(index, weights=values)
-    if sizes.size < FEWEST_TERRAINS:
+    if sizes.size < MIN_TERRAINS:
         return math.nan, math.nan
-    half = _student_quantile(confidence, sizes.size) * _deviation_of_mean(sums - mean * sizes, values.size)
+    half_width = _student_quantile(confidence, sizes.size) * _standard_error(sums - mean * sizes, values.size)
     if sizes.size > _MAX_BOOTSTRAP:
-        return mean - half, mean + half
+        return mean - half_width, mean + half_width
 
     def ratio(sums: Float[np.ndarray, "*n"], sizes: Float[np.ndarray, "*n"], axis: int = -1) -> np.ndarray:
         return np.asarray(sums.sum(axis=axis) / sizes.sum(axis=axis))
 
-    return _unite((mean - half, mean + half), _bootstrap((sums, sizes), ratio, confidence))
+    return _union((mean - half_width, mean + half_width), _bootstrap((sums, sizes), ratio, confidence))
 
 
 def spread_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: Groups = None) -> Interval:
-    """Two-sided interval of the standard deviation: union of BCa bootstrap and Bonett's; in large samples Bonett's
-    alone.
+    """Two-sided interval of the standard deviation: union of BCa bootstrap and Bonett's; in large samples Bonett's.
 
-    NaN for fewer than eight values, or five terrains; 0 where all are equal.
+    NaN for fewer than eight values, or five terrains; 0 if all are equal.
     """
     check_confidence(confidence)
     values = np.asarray(sample, dtype=np.float64)
@@ -141,41 +140,41 @@ def spread_interval(sample: Float[np.ndarray, " n"], confidence: float, groups: 
     if np.ptp(values) == 0.0:
         return 0.0, 0.0
     if groups is not None and is_shared(groups):
-        return _shared_spread(values, groups, confidence)
+        return _clustered_spread(values, groups, confidence)
     interval = _bonett_interval(values, confidence)
     if values.size > _MAX_BOOTSTRAP:
         return interval
-    return _unite(interval, _bootstrap((values,), partial(np.std, ddof=1), confidence))
+    return _union(interval, _bootstrap((values,), partial(np.std, ddof=1), confidence))
 
 
-def _shared_spread(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], confidence: float) -> Interval:
+def _clustered_spread(values: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"], confidence: float) -> Interval:
     """Two-sided interval of the standard deviation of values on shared terrains; NaN for fewer than five terrains."""
     index = number_terrains(groups)
     sizes = np.bincount(index).astype(np.float64)
     terrains = sizes.size
-    if terrains < FEWEST_TERRAINS:
+    if terrains < MIN_TERRAINS:
         return math.nan, math.nan
     centred = values - values.mean()
     sums, squares = (np.bincount(index, weights=centred**power) for power in (1, 2))
     variance = float((centred**2).mean())
-    # of the logarithm, which is less skewed, corrected for few terrains as Bonett's interval is for few values
+    # interval of the logarithm, which is less skewed; corrected for few terrains like Bonett's interval for few values
     quantile = _student_quantile(confidence, terrains)
     correction = terrains / max(terrains - quantile, 1.0)
-    half = quantile * correction * _deviation_of_mean(squares - variance * sizes, values.size) / variance
-    middle = math.log(correction * variance)
-    plain = math.exp(0.5 * (middle - half)), math.exp(0.5 * (middle + half))
+    half_width = quantile * correction * _standard_error(squares - variance * sizes, values.size) / variance
+    centre = math.log(correction * variance)
+    interval = math.exp(0.5 * (centre - half_width)), math.exp(0.5 * (centre + half_width))
     if terrains > _MAX_BOOTSTRAP:
-        return plain
+        return interval
 
-    def spread(*columns: Float[np.ndarray, "*n"], axis: int = -1) -> np.ndarray:
+    def standard_deviation(*columns: Float[np.ndarray, "*n"], axis: int = -1) -> np.ndarray:
         squares, sums, n = (column.sum(axis=axis) for column in columns)
         return np.asarray(np.sqrt(np.maximum(squares - sums**2 / n, 0.0) / (n - 1.0)))
 
-    return _unite(plain, _bootstrap((squares, sums, sizes), spread, confidence))
+    return _union(interval, _bootstrap((squares, sums, sizes), standard_deviation, confidence))
 
 
 def _bonett_interval(values: Float[np.ndarray, " n"], confidence: float) -> Interval:
-    """Bonett 2006, equation 8, with Student's t for the normal quantile."""
+    """Bonett 2006, equation 8, with Student's t instead of the normal quantile."""
     n = values.size
     quantile = _student_quantile(confidence, n)
     trimmed = float(stats.trim_mean(values, min(0.49, 0.5 / math.sqrt(n - 4.0))))
@@ -183,8 +182,8 @@ def _bonett_interval(values: Float[np.ndarray, " n"], confidence: float) -> Inte
     kurtosis = n * float(((values - trimmed) ** 4).sum()) / squares**2
     correction = n / (n - quantile)
     error = correction * math.sqrt(max((kurtosis - (n - 3.0) / n) / (n - 1.0), 0.0))
-    middle = math.log(correction * squares / (n - 1.0))
-    return math.exp(0.5 * (middle - quantile * error)), math.exp(0.5 * (middle + quantile * error))
+    centre = math.log(correction * squares / (n - 1.0))
+    return math.exp(0.5 * (centre - quantile * error)), math.exp(0.5 * (centre + quantile * error))
 
 
 def quantile_bounds(
@@ -192,8 +191,7 @@ def quantile_bounds(
 ) -> Interval:
     """One-sided lower and upper order-statistic bounds of a quantile, each at the confidence.
 
-    -inf or inf where the sample is too small (upper bound of the 99 % quantile at 95 % confidence: fewer than 299
-    values).
+    -inf or inf if the sample is too small (upper bound of the 99 % quantile at 95 % confidence: fewer than 299 values).
     """
     check_confidence(confidence)
     values = np.asarray(sample, dtype=np.float64)
@@ -204,8 +202,7 @@ def quantile_bounds(
 
 
 def _bound_quantile(values: Float[np.ndarray, " n"], groups: Groups, quantile: float, confidence: float) -> float:
-    """Smallest value of the sample below which at least a fraction `quantile` of the population lies, at the
-    confidence.
+    """Find the smallest sample value with at least a fraction `quantile` of the population below it, at the confidence.
 
     Wilks 1941: the r-th smallest of n values lies at or above the quantile q with probability P(Bin(n, q) <= r - 1);
     the bound is the smallest such value with that probability at the confidence.
@@ -217,20 +214,18 @@ def _bound_quantile(values: Float[np.ndarray, " n"], groups: Groups, quantile: f
         rank = int(stats.binom.ppf(confidence, n, quantile))
         return float(ordered[rank]) if rank < n else math.inf
     below = values <= ordered[min(n - 1, max(0, math.ceil(quantile * n) - 1))]
-    shown = clustered_evidence(below, groups, confidence)
-    weight = shown.effective_n / n
-    if shown.method is ClusterMethod.TERRAIN_COUNT:
+    evidence = clustered_evidence(below, groups, confidence)
+    weight = evidence.effective_n / n
+    if evidence.method is ClusterMethod.TERRAIN_COUNT:
         # a bound for the maximum of a terrain also holds for its values
         index = number_terrains(groups)
         ordered = np.full(int(index.max()) + 1, -math.inf)
         np.maximum.at(ordered, index, values)
         ordered, weight = np.sort(ordered), 1.0
-    # first rank that shows the quantile, each value counting as `weight` independent ones
+    # first rank above the quantile; each value counts as `weight` independent values
     ranks = range(1, ordered.size + 1)
     total = ordered.size * weight
-    rank = bisect.bisect_left(
-        ranks, True, key=lambda rank: proportion_lower(rank * weight, total, confidence) >= quantile
-    )
+    rank = bisect.bisect_left(ranks, True, key=lambda k: proportion_lower(k * weight, total, confidence) >= quantile)
     return float(ordered[rank]) if rank < ordered.size else math.inf
 
 
@@ -246,15 +241,13 @@ class Quantile:
 
 @dataclass(frozen=True)
 class ErrorSummary:
-    """Summary of a sample of errors; NaN where it has too few values.
+    """Summary of a sample of errors; NaN for too few values.
 
-    n, missing: finite values, and others (no answer was reported).
-    mean, mean_lower, mean_upper: mean and its two-sided interval at `confidence`.
-    sd, sd_lower, sd_upper: standard deviation (n - 1) and its two-sided interval at `confidence`.
-    rms, median: root mean square about zero, median.
-    robust_sd: median absolute deviation about the median times 1.4826, the standard deviation of a normal core.
-    largest: largest magnitude.
-    quantiles: with order-statistic bounds at `confidence`.
+    n, missing: number of finite values, and of missing values (no answer was reported). mean, mean_lower, mean_upper:
+    mean and its two-sided interval at `confidence`. sd, sd_lower, sd_upper: standard deviation (n - 1) and its
+    two-sided interval at `confidence`. rms, median: root mean square about zero, median. robust_sd: median absolute
+    deviation about the median times 1.4826, the standard deviation of a normal core. largest: largest magnitude.
+    quantiles: quantiles with order-statistic bounds at `confidence`.
     """
 
     n: int
@@ -279,22 +272,23 @@ def summarize(
     confidence: float = 0.95,
     groups: Groups = None,
 ) -> ErrorSummary:
-    """Summarize a sample of errors; values that are not finite are counted as missing and left out.
+    """Summarize a sample of errors; values that are not finite are counted as missing and ignored.
 
     For radial errors the quantiles 0.5 and 0.95 are the circular error probable and the 95 % radius about the truth.
     """
     values = np.asarray(sample, dtype=np.float64)
-    finite, shared = values[np.isfinite(values)], None if groups is None else groups[np.isfinite(values)]
+    finite, finite_groups = values[np.isfinite(values)], None if groups is None else groups[np.isfinite(values)]
     n, missing = finite.size, values.size - finite.size
     median = float(np.median(finite)) if n else math.nan
-    mean_lower, mean_upper = mean_interval(finite, confidence, shared)
-    sd_lower, sd_upper = spread_interval(finite, confidence, shared)
-    intervals = []
+    mean_lower, mean_upper = mean_interval(finite, confidence, finite_groups)
+    sd_lower, sd_upper = spread_interval(finite, confidence, finite_groups)
+    quantile_results = []
     for probability in quantiles:
-        # a quantile beyond all but the last value is an extrapolation, not an estimate
+        # a quantile beyond the last but one value is an extrapolation, not an estimate
         is_estimate = n * min(probability, 1.0 - probability) >= 1.0 - 1e-9
         estimate = float(np.quantile(finite, probability)) if is_estimate else math.nan
-        intervals.append(Quantile(probability, estimate, *quantile_bounds(finite, probability, confidence, shared)))
+        bounds = quantile_bounds(finite, probability, confidence, finite_groups)
+        quantile_results.append(Quantile(probability, estimate, *bounds))
     return ErrorSummary(
         n=n,
         missing=missing,
@@ -308,20 +302,18 @@ def summarize(
         median=median,
         robust_sd=1.4826 * float(np.median(np.abs(finite - median))) if n else math.nan,
         largest=float(np.abs(finite).max()) if n else math.nan,
-        quantiles=tuple(intervals),
+        quantiles=tuple(quantile_results),
         confidence=confidence,
     )
 
 
 @dataclass(frozen=True)
 class ErrorEllipse:
-    """Ellipse that contains the next error with a stated probability, for normal errors.
+    """Ellipse that contains the next error with a given probability, for normal errors.
 
-    centre: mean error.
-    semi_major, semi_minor: half axes, in the errors' unit.
-    angle_deg: of the major axis from the first component towards the second, from -90 (excluded) to 90 degrees.
-    probability: probability that the next error lies inside.
-    inside: fraction of these errors that lie inside; differs from the probability where errors are not normal.
+    centre: mean error. semi_major, semi_minor: semi-axes, in the errors' unit. angle_deg: angle of the major axis from
+    the first component towards the second, from -90 (excluded) to 90 degrees. probability: probability that the next
+    error lies inside. inside: fraction of the sample inside; differs from the probability if the errors are not normal.
     """
 
     centre: tuple[float, float]
@@ -332,8 +324,8 @@ class ErrorEllipse:
     inside: float
 
     @property
-    def reach(self) -> float:
-        """Half the side of the smallest square about zero error that contains the ellipse."""
+    def half_extent(self) -> float:
+        """Half the side of the smallest square centred on zero error that contains the ellipse."""
         angle = math.radians(self.angle_deg)
         x = math.hypot(self.semi_major * math.cos(angle), self.semi_minor * math.sin(angle))
         y = math.hypot(self.semi_major * math.sin(angle), self.semi_minor * math.cos(angle))
@@ -341,7 +333,7 @@ class ErrorEllipse:
 
 
 def error_ellipse(errors: Float[np.ndarray, "n 2"], probability: float) -> ErrorEllipse | None:
-    """Prediction ellipse of two-dimensional errors; None for fewer than five or where all lie on a point.
+    """Prediction ellipse of two-dimensional errors; None for fewer than five errors or if all are equal.
 
     For a new error e of the same normal distribution, (e - m)' S^-1 (e - m) with the sample's mean and covariance is
     distributed as 2 (n - 1) (n + 1) / (n (n - 2)) times F with 2 and n - 2 degrees of freedom (Hotelling; Chew,
@@ -375,9 +367,9 @@ def error_ellipse(errors: Float[np.ndarray, "n 2"], probability: float) -> Error
 def circular_error(
     errors: Float[np.ndarray, "n 2"], probability: float, confidence: float, groups: Groups = None
 ) -> Quantile:
-    """Radius about the truth that holds a fraction of the errors (0.5: the circular error probable), with bounds.
+    """Radius about the truth that contains a fraction of the errors (0.5: circular error probable), with bounds.
 
-    The bounds are order statistics, one-sided each at the confidence: nothing is assumed of the distribution.
+    The bounds are one-sided order statistics, each at the confidence, for any distribution.
     """
     finite = np.isfinite(errors).all(axis=1)
     radii = np.hypot(*errors[finite].T)

@@ -1,4 +1,4 @@
-"""How visual target tracking is presented: its sections, and a case as its stops, its way and its updates."""
+"""Presentation of visual target tracking: report sections, and views of cases with stops, path and updates."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from collections.abc import Mapping
 from typing import Any
 
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
-from marsyard.reports.section import plate
+from marsyard.reports.section import svg_figure
 from marsyard.reports.vtt import sections
 from marsyard.reports.vtt.case_figures import (
     draw_path,
     draw_stops,
     is_vtt_case,
-    list_stops,
-    rover_path,
+    read_rover_path,
+    read_stops,
     write_vtt_figures,
 )
 from marsyard.reports.vtt.goal import GOAL
 from marsyard.reports.wording import NOTHING, label, note_text, number
 
-#: Maximum number of stops whose pictures the page shows.
+#: Maximum number of stops with pictures on the page.
 _MAX_STOPS = 8
-#: Numbers of an update in the order of the table.
+#: Quantities of an update in the order of the table.
 _QUANTITIES = (
     "range_m", "azimuth_deg", "elevation_deg", "magnification", "roll_change_deg", "azimuth_change_deg", "match_score",
     "stereo_score", "correction_px", "error_px", "position_error_m",
@@ -29,19 +29,20 @@ _QUANTITIES = (
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
-    """A tracking case."""
-    stops = list_stops(products)
+    """Create the view of a tracking case."""
+    stops = read_stops(products)
     caption = f"{_MAX_STOPS} stops of {len(stops)}." if len(stops) > _MAX_STOPS else "All stops."
-    plates = [plate(draw_stops(products, _MAX_STOPS), f"{key}stops", caption, wide=True)]
-    if rover_path(products) is not None:
-        text = "The path from above, and the target as estimated."
-        plates.append(plate(draw_path(products), f"{key}way", text, wide=True))
-    names = [name for name in _QUANTITIES if any(name in stop.figures for stop in stops)]
+    svg_figures = [svg_figure(draw_stops(products, _MAX_STOPS), f"{key}stops", caption, wide=True)]
+    if read_rover_path(products) is not None:
+        text = "Top view of the rover path, and estimated target positions."
+        svg_figures.append(svg_figure(draw_path(products), f"{key}way", text, wide=True))
+    names = [name for name in _QUANTITIES if any(name in stop.quantities for stop in stops)]
     rows = []
     for stop in stops:
-        texts = [str(stop.number), stop.state or NOTHING, *(number(stop.figure(name)) for name in names)]
-        rows.append(TableRow(texts, stop.is_found))
-    return CaseView([("Stops", str(len(stops)))], plates, ["Stop", "State", *(label(name) for name in names)], rows)
+        texts = [str(stop.number), stop.state or NOTHING, *(number(stop.quantity(name)) for name in names)]
+        rows.append(TableRow(texts, stop.is_matched))
+    head = ["Stop", "State", *map(label, names)]
+    return CaseView([("Stops", str(len(stops)))], svg_figures, head, rows)
 
 
 VTT = Presentation(

@@ -1,8 +1,8 @@
 """Conformance suites: checks of an algorithm or a user-defined part against its protocol.
 
-`inputs` synthesizes measurements without terrain or renderer; `checks` has the checks common to all suites;
-`estimators`, `trackers` and `parts` add those of their protocols. This module selects the suite, and runs its checks
-one by one.
+`inputs` synthesizes measurements without terrain or renderer; `checks` contains the checks common to all suites;
+`estimators`, `trackers` and `parts` add the checks of their protocols. This module selects the suite, and runs its
+checks one by one.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from marsyard.scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Ta
 from marsyard.scenarios.parts.named import KINDS
 from marsyard.scenarios.user_files import import_object
 
-#: Tasks and kinds with a suite, words of the command line.
+#: Tasks and kinds of parts with a suite; names on the command line.
 SUBJECT_KINDS = (*TASKS, *KINDS)
 
 
 @dataclass(frozen=True)
 class Subject:
-    """An algorithm or a user-defined part under examination.
+    """An algorithm or a user-defined part under test.
 
     - spec: its name; see `marsyard.scenarios.estimators`, `marsyard.scenarios.parts`
     - task: name of its task or kind
@@ -38,28 +38,28 @@ class Subject:
     limit_s: float
 
     def suite(self) -> Suite:
-        """Its conformance suite."""
+        """Return its conformance suite."""
         if self.task in KINDS:
             kind = KINDS[self.task]
             return parts.PartSuite(partial(parts.load_part, kind, self.spec), self.spec, False, self.limit_s, kind)
         task: Task[Any, Any] = TASKS[self.task]
-        make = partial(task.make, self.spec, task.options(), ExecutableLimits(time_s=self.limit_s))
-        program = self.spec.startswith(tuple(PREFIXES))
+        create = partial(task.make, self.spec, task.options(), ExecutableLimits(time_s=self.limit_s))
+        is_program = self.spec.startswith(tuple(PREFIXES))
         if task is TRACKING:
-            return trackers.TrackerSuite(make, self.spec, program, self.limit_s)
+            return trackers.TrackerSuite(create, self.spec, is_program, self.limit_s)
         protocol = estimators.VELOCITY if task is VELOCITY else estimators.LANDING
         if task.takes_stream(self.spec):
             protocol = estimators.STREAM
-        return estimators.EstimatorSuite(make, self.spec, program, self.limit_s, protocol)
+        return estimators.EstimatorSuite(create, self.spec, is_program, self.limit_s, protocol)
 
     def prepare(self) -> None:
-        """Load and compile the suite's own code, and the algorithm's code."""
+        """Load and compile the suite and the algorithm."""
         check_subject(self.spec, self.task)
         self.suite().cases()
 
 
 def check_subject(spec: str, task: str) -> None:
-    """Raises ValueError with the allowed names if there is nothing of this name for a task or kind."""
+    """Raise ValueError with the allowed names if a task or kind has no algorithm or part of this name."""
     if task in KINDS:
         parts.load_part(KINDS[task], spec)
     else:
@@ -68,7 +68,7 @@ def check_subject(spec: str, task: str) -> None:
 
 def check_names(subject: Subject) -> list[tuple[str, str]]:
     """Names and requirements of a subject's checks."""
-    return [(check.name, check.asked) for check in subject.suite().checks()]
+    return [(check.name, check.requirement) for check in subject.suite().checks()]
 
 
 def run_check(subject: Subject, number: int) -> Finding:
@@ -95,9 +95,9 @@ def determine_task(spec: str) -> str:
     try:
         algorithm = import_object(path)
     except (ImportError, AttributeError) as error:
-        raise ValueError(f"no algorithm at '{spec}': {error}") from error
+        raise ValueError(f"cannot import algorithm '{spec}': {error}") from error
     if hasattr(algorithm, "designate"):
         return TRACKING.name
     annotations = inspect.get_annotations(getattr(algorithm, "estimate", None) or algorithm)
-    landing = any("Landing" in str(one) or "Site" in str(one) for one in annotations.values())
+    landing = any("Landing" in str(item) or "Site" in str(item) for item in annotations.values())
     return LANDING.name if landing else VELOCITY.name

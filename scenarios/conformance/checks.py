@@ -27,13 +27,13 @@ _SCENARIOS = Path(__file__).resolve().parents[1]
 class Finding:
     """Result of one check.
 
-    - asked: the requirement of the protocol
+    - requirement: text of the protocol's requirement
     - problem, next_step: the violation and its remedy; empty if passed
     - note: the answer, or its computation time
     """
 
     check: str
-    asked: str
+    requirement: str
     problem: str = ""
     next_step: str = ""
     note: str = ""
@@ -53,55 +53,55 @@ class Check:
     """A check: `run` returns a note, or raises BreachError or an error of the algorithm; `advice` is the remedy."""
 
     name: str
-    asked: str
+    requirement: str
     advice: str
     run: Callable[[], str]
 
     def finding(self) -> Finding:
         """Run the check; an exception is a problem."""
         try:
-            return Finding(self.name, self.asked, note=self.run())
+            return Finding(self.name, self.requirement, note=self.run())
         except BreachError as error:
             problem = str(error)
         except AlgorithmError as error:
-            last = error.stderr.strip().splitlines()[-1:]
-            stderr = f"; its standard error ends with: {last[0]}" if last else ""
+            last_line = error.stderr.strip().splitlines()[-1:]
+            stderr = f"; its standard error ends with: {last_line[0]}" if last_line else ""
             problem = f"{error.fault.name}: {error}{stderr}"
         except Exception as error:
-            # the last line of the user's code in the traceback
+            # report the last line of the user's code in the traceback
             frames = traceback.extract_tb(error.__traceback__)
-            own = [frame for frame in frames if not Path(frame.filename).resolve().is_relative_to(_SCENARIOS)]
-            where = f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
-            problem = f"it raised {type(error).__name__}: {error}{where}"
-        return Finding(self.name, self.asked, problem, self.advice)
+            user = [frame for frame in frames if not Path(frame.filename).resolve().is_relative_to(_SCENARIOS)]
+            location = f" ({Path(user[-1].filename).name}, line {user[-1].lineno})" if user else ""
+            problem = f"it raised {type(error).__name__}: {error}{location}"
+        return Finding(self.name, self.requirement, problem, self.advice)
 
 
 @dataclass(frozen=True)
 class Suite(ABC):
-    """Conformance suite of one algorithm or part, which is constructed again for each check.
+    """Conformance suite of one algorithm or part; a new object is constructed for each check.
 
-    The process of a check detects state left behind in it (`marsyard.campaigns.running.replay`).
+    `marsyard.campaigns.running.replay` detects state that a check leaves in its process.
 
     - make: constructs the algorithm or part
-    - program: it is a program with files as input, which cannot change the suite's objects
+    - is_program: whether it is an external program, which reads files and cannot change the suite's objects
     """
 
     make: Callable[[], Any]
     spec: str
-    program: bool
+    is_program: bool
     limit_s: float
 
     #: Advice of the check `deterministic`, and verb of the check `time`.
     deterministic_advice = (
-        "draw from numpy.random.default_rng(a fixed seed), made in estimate; keep no state between cases"
+        "use numpy.random.default_rng(a fixed seed), created in estimate; keep no state between cases"
     )
     answers = "answers"
     #: Problem of an answer that differs after other cases.
     dependence = "its answer depends on earlier cases"
-    #: Whether imports of the truth are forbidden.
-    closed_to_truth = True
+    #: Whether imports of modules with ground truth are forbidden.
+    forbids_truth = True
     #: Whether the arrays of inputs are writable in all checks.
-    writable = False
+    writable_inputs = False
 
     @abstractmethod
     def checks(self) -> Iterator[Check]:
@@ -125,83 +125,84 @@ class Suite(ABC):
 
     def _answer(self, case: Any, seed: int = 1) -> Any:
         """Checked answer of a new algorithm or part to a copy of a case's input."""
-        return self._check_answer(self._call(self.make(), copy_inputs(case, writable=self.writable), seed), case)
+        return self._check_answer(self._call(self.make(), copy_inputs(case, writable=self.writable_inputs), seed), case)
 
     def common_checks(self) -> Iterator[Check]:
         """Checks of unchanged inputs, repeatability, time, and imports."""
-        if not self.program:
+        if not self.is_program:
             copies = "work on copies: counts.astype(...), array.copy()"
-            yield Check("inputs", "leaves its inputs as they are", copies, self._leaves_inputs)
-        rule = "gives the same answers to the same case, after any other cases"
+            yield Check("inputs", "does not change its inputs", copies, self._leaves_inputs)
+        rule = "returns the same answers to the same case, after any other cases"
         yield Check("deterministic", rule, self.deterministic_advice, self._repeats_answers)
-        faster = "be faster, or allow more with --time-limit"
-        yield Check("time", f"{self.answers} within {self.limit_s:g} s", faster, self._answers_in_time)
-        if self.closed_to_truth and not self.program:
-            advice = f"use the inputs alone; of marsyard import only {', '.join(OPEN_MODULES)}"
+        advice = "reduce the computation time, or raise the limit with --time-limit"
+        yield Check("time", f"{self.answers} within {self.limit_s:g} s", advice, self._answers_in_time)
+        if self.forbids_truth and not self.is_program:
+            advice = f"use only the inputs; from marsyard import only {', '.join(OPEN_MODULES)}"
             yield Check("truth", "imports no module with access to the truth", advice, self._imports_no_truth)
 
     def _leaves_inputs(self) -> str:
         for case in self.cases():
             copy = copy_inputs(case, writable=True)
-            before = hash_inputs(copy)
+            original_hash = hash_inputs(copy)
             self._call(self.make(), copy, 1)
-            if hash_inputs(copy) != before:
+            if hash_inputs(copy) != original_hash:
                 raise BreachError(f"it changed its input, a {type(case).__name__}")
         return ""
 
     def _repeats_answers(self) -> str:
-        used = self.make()
+        reused = self.make()
         for case in self.cases():
-            prints = []
-            for seed in (1, 2):  # the process's global generators, for code that uses them by mistake
+            fingerprints = []
+            for seed in (1, 2):  # of the global generators, for code that uses them by mistake
                 random.seed(seed)
                 np.random.seed(seed)  # noqa: NPY002
-                prints.append(fingerprint(self._answer(case)))
-            if prints[0] != prints[1]:
-                raise BreachError("asked twice, it answers differently to the same case")
-            for other in self._other_cases():
-                self._call(used, copy_inputs(other, writable=self.writable), 2)
-            again = self._call(used, copy_inputs(case, writable=self.writable), 1)
-            if fingerprint(self._check_answer(again, case)) != prints[0]:
+                fingerprints.append(fingerprint(self._answer(case)))
+            if fingerprints[0] != fingerprints[1]:
+                raise BreachError("its answers to the same case differ between two calls")
+            for other_case in self._other_cases():
+                self._call(reused, copy_inputs(other_case, writable=self.writable_inputs), 2)
+            answer = self._call(reused, copy_inputs(case, writable=self.writable_inputs), 1)
+            if fingerprint(self._check_answer(answer, case)) != fingerprints[0]:
                 raise BreachError(self.dependence)
         return ""
 
     def _answers_in_time(self) -> str:
-        taken = self._answer_time_s()
-        if taken > self.limit_s:
-            raise BreachError(f"it took {taken:.3g} s")
-        return f"{taken:.3g} s"
+        elapsed_s = self._answer_time_s()
+        if elapsed_s > self.limit_s:
+            raise BreachError(f"it took {elapsed_s:.3g} s")
+        return f"{elapsed_s:.3g} s"
 
     def _answer_time_s(self) -> float:
-        """Time of an answer after a first one, which compiles kernels."""
+        """Time of an answer after a first answer, which compiles kernels."""
         case = self.cases()[0]
         self._answer(case)
         return measure_time_s(lambda: self._answer(case))
 
     def _imports_no_truth(self) -> str:
-        closed, allowed = [], tuple(f"{one}." for one in OPEN_MODULES)
+        forbidden, allowed = [], tuple(f"{module}." for module in OPEN_MODULES)
         for name, path in algorithm_sources(self.spec):
             try:
                 nodes = list(ast.walk(ast.parse(path.read_bytes())))
             except (SyntaxError, ValueError):
                 continue
-            imports = [(node.lineno, one.name) for node in nodes if isinstance(node, ast.Import) for one in node.names]
+            statements = [node for node in nodes if isinstance(node, ast.Import)]
+            imports = [(node.lineno, part.name) for node in statements for part in node.names]
             for node in nodes:
                 if isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:
-                    imports += [(node.lineno, f"{node.module}.{alias.name}") for alias in node.names]
+                    imports += [(node.lineno, f"{node.module}.{part.name}") for part in node.names]
             for line, module in imports:
                 if module.partition(".")[0] == "marsyard" and not f"{module}.".startswith(allowed):
-                    closed.append(f"{name}, line {line}: {module}")
-        if closed:
-            raise BreachError(f"it imports modules with access to the truth: {'; '.join(closed[:5])}")
+                    forbidden.append(f"{name}, line {line}: {module}")
+        if forbidden:
+            raise BreachError(f"it imports modules with access to the truth: {'; '.join(forbidden[:5])}")
         return ""
 
 
 def measure_time_s(call: Callable[[], object]) -> float:
     """Wall-clock time of a call."""
-    began = time.perf_counter()
+    start_s = time.perf_counter()
     call()
-    return time.perf_counter() - began
+    return time.perf_counter() - start_s
 
 
 def fingerprint(answer: Any) -> str:

@@ -1,4 +1,4 @@
-"""Conformance checks of estimators: velocity, also from a stream of pictures, and landing sites."""
+"""Conformance checks of estimators: velocity, also from a stream of images, and landing sites."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, fingerprint
 from marsyard.sim.measurements import DescentMeasurements
 
-#: Pictures of an ordinary stream; of shortened streams, too short and long enough for an answer; of a long stream.
+#: Images of an ordinary stream; of streams too short and long enough for an answer; of a long stream.
 _PICTURES, _TOO_FEW, _ENOUGH, _MANY = 5, (0, 1), (2, 3), 10
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """A task's measurements, and the check, validity and text of its answers; `failures` are outcomes without a result.
+    """Measurements of a task, and the check, validity and description of its answers.
 
-    `check` checks an answer against the interface and raises AlgorithmError.
+    `check` checks an answer against the interface (AlgorithmError); `failures` lists the outcomes without a result.
     """
 
     measurements: Callable[[], Any]
@@ -35,11 +35,11 @@ class Protocol:
 
 
 def describe_velocity(estimate: VelocityEstimate) -> str:
-    """Outcome of an estimate, and its distance from the truth of the suite's descents."""
+    """Outcome of an estimate, and its error relative to the truth of the suite's descents."""
     if estimate.velocity_m_s is None:
         return estimate.outcome.name
     error = float(np.hypot(*(estimate.velocity_m_s - inputs.DESCENT_VELOCITY_M_S[:2])))
-    return f"{estimate.outcome.name}, {error:.2f} m/s from the truth"
+    return f"{estimate.outcome.name}, {error:.2f} m/s error"
 
 
 VELOCITY = Protocol(
@@ -47,7 +47,7 @@ VELOCITY = Protocol(
     check=check_velocity,
     is_valid=lambda estimate: estimate.outcome is VelocityOutcome.VALID,
     describe=describe_velocity,
-    failures=", ".join(one.name for one in VelocityOutcome if one is not VelocityOutcome.VALID),
+    failures=", ".join(outcome.name for outcome in VelocityOutcome if outcome is not VelocityOutcome.VALID),
 )
 STREAM = replace(VELOCITY, measurements=partial(inputs.descent, _PICTURES))
 LANDING = Protocol(
@@ -55,7 +55,7 @@ LANDING = Protocol(
     check=check_site,
     is_valid=lambda estimate: estimate.outcome.converged,
     describe=lambda estimate: str(estimate.outcome.name),
-    failures=", ".join(one.name for one in SiteOutcome if not one.converged),
+    failures=", ".join(outcome.name for outcome in SiteOutcome if not outcome.converged),
 )
 
 
@@ -67,26 +67,26 @@ class EstimatorSuite(Suite):
 
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
-        p = self.protocol
-        form = "see algorithms/interface.py for the answer's form"
-        rule = "gives a well-formed answer to textured pictures"
-        yield Check("answer", rule, form, lambda: p.describe(self._answer(p.measurements())))
-        advice = f"return one of the failures: {p.failures}"
+        protocol = self.protocol
+        advice = "see algorithms/interface.py for the format of the answer"
+        rule = "returns a well-formed answer to textured images"
+        yield Check("answer", rule, advice, lambda: protocol.describe(self._answer(protocol.measurements())))
+        advice = f"return one of the failures: {protocol.failures}"
         for name, blank in inputs.BLANKS.items():
-            rule = f"ends with a failure if pictures are {name}"
+            rule = f"returns a failure if images are {name}"
             yield Check(name, rule, advice, partial(self._fails_on, name, blank))
-        rule = "gives a well-formed answer to pictures of noise"
-        yield Check("noise", rule, advice, lambda: self._outcome(inputs.noisy(p.measurements())))
-        if p is LANDING:
-            rule = "gives a well-formed answer without a range"
+        rule = "returns a well-formed answer to images of noise"
+        yield Check("noise", rule, advice, lambda: self._outcome(inputs.noisy(protocol.measurements())))
+        if protocol is LANDING:
+            rule = "returns a well-formed answer without a range"
             no_range = replace(inputs.landing(), slant_range_m=float("nan"))
             yield Check("no-range", rule, advice, lambda: self._outcome(no_range))
         yield from self.common_checks()
-        if p is STREAM:
+        if protocol is STREAM:
             advice = f"return one of the failures from finish: {VELOCITY.failures}"
-            yield Check("few", "ends with a failure if there is no picture, or one", advice, self._fails_on_few)
-            rule = f"gives a well-formed answer to {', '.join(map(str, _ENOUGH))} and {_MANY} pictures"
-            advice = "expect any number: see VelocityStream in algorithms/interface.py"
+            yield Check("few", "returns a failure for zero images and for one image", advice, self._fails_on_few)
+            rule = f"returns a well-formed answer to {', '.join(map(str, _ENOUGH))} and {_MANY} images"
+            advice = "accept any number: see VelocityStream in algorithms/interface.py"
             streams = (*map(_first_pictures, _ENOUGH), inputs.descent(_MANY))
             yield Check("number", rule, advice, lambda: "; ".join(describe_velocity(self._answer(x)) for x in streams))
             rule, advice = "resets its state after an interrupted descent", "reset the whole state in start"
@@ -111,7 +111,7 @@ class EstimatorSuite(Suite):
     def _fails_on(self, name: str, blank: inputs.Blank) -> str:
         answer = self._answer(inputs.blank_pictures(self.protocol.measurements(), blank))
         if self.protocol.is_valid(answer):
-            raise BreachError(f"it answers {answer.outcome.name} to pictures that are {name}: there is nothing to see")
+            raise BreachError(f"it answers {answer.outcome.name} to images that are {name}: they contain no texture")
         return str(answer.outcome.name)
 
     def _fails_on_few(self) -> str:
@@ -119,19 +119,19 @@ class EstimatorSuite(Suite):
         for number in _TOO_FEW:
             answer = self._answer(_first_pictures(number))
             if VELOCITY.is_valid(answer):
-                raise BreachError(f"it answers {answer.outcome.name} to {number or 'no'} picture: nothing has moved")
+                raise BreachError(f"it answers {answer.outcome.name} to {number or 'no'} image: no motion is visible")
             outcomes.append(answer.outcome.name)
         return ", ".join(outcomes)
 
     def _starts_again(self) -> str:
         measurements = self.protocol.measurements()
         expected = fingerprint(self._answer(measurements))
-        used = self.make()
-        used.stream.start()
+        reused = self.make()
+        reused.stream.start()
         for frame in copy_inputs(inputs.noisy(measurements)).frames()[:2]:
-            used.stream.picture(frame)
-        if fingerprint(used.estimate(copy_inputs(measurements))) != expected:
-            raise BreachError("started again after two pictures, it answers differently")
+            reused.stream.picture(frame)
+        if fingerprint(reused.estimate(copy_inputs(measurements))) != expected:
+            raise BreachError("after a restart in the middle of a descent, its answer differs")
         return ""
 
 

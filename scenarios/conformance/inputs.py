@@ -1,4 +1,4 @@
-"""Synthetic measurements for conformance checks: a textured plane, seen exactly through any camera, and blank pictures.
+"""Synthetic measurements for conformance checks: a textured plane, imaged exactly by any camera, and blank images.
 
 Each pixel's ray is intersected with the plane, without a renderer.
 """
@@ -32,20 +32,20 @@ from marsyard.sim.sensor.presets import Preset
 
 Measurements = TypeVar("Measurements", DescentMeasurements, LandingMeasurements)
 
-#: Mean radiance factor of the plane, and radiance factor beyond it.
-MEAN, BEYOND = 0.2, 0.1
+#: Mean radiance factor of the plane, and radiance factor outside the plane.
+MEAN, BACKGROUND = 0.2, 0.1
 _SIZE, _CONTRAST = 1024, 0.2
 #: Mean velocity of the descent, east, north, up, m/s.
 DESCENT_VELOCITY_M_S = np.array([12.0, -7.0, -75.0])
-#: Maximum time between pictures, and from the first to the last, s.
+#: Maximum time between images, and from the first to the last image, s.
 _INTERVAL_S, _DURATION_S = 3.75, 7.5
-#: Attitudes of the pictures, periodic: about z, y and x, degrees.
+#: Attitudes of the images, periodic: about z, y and x, degrees.
 _ATTITUDES_DEG = ((40, 4, -3), (44, 2, 3), (41, -3, 5))
-_FIRST_M = np.array([0.0, 0.0, 1900.0])
-#: Positions of the landing's two pictures, metres.
+_START_POSITION_M = np.array([0.0, 0.0, 1900.0])
+#: Positions of the two landing images, metres.
 _HOVER_M = np.array([[0.0, 0.0, 30.0], [1.2, 0.2, 29.8]])
 
-#: Counts of a blank picture as a function of the detector's calibration.
+#: Counts of a blank image as a function of the detector's calibration.
 Blank = Callable[[DetectorCalibration], int]
 BLANKS: dict[str, Blank] = {
     "featureless": lambda calibration: round(0.4 * calibration.full_scale_dn),
@@ -56,54 +56,54 @@ BLANKS: dict[str, Blank] = {
 
 @dataclass(frozen=True)
 class TexturedPlane:
-    """A plane through `origin` in the world, with a periodic texture of samples `step_m` apart.
+    """A plane through `origin` in the world, with a periodic texture of spacing `step_m`.
 
-    The orthogonal unit vectors `along` follow the texture's columns and rows.
+    The orthogonal unit vectors `axes` point along the texture's columns and rows.
     """
 
     origin: Float64[np.ndarray, "3"]
-    along: Float64[np.ndarray, "2 3"]
+    axes: Float64[np.ndarray, "2 3"]
     step_m: float
 
     def radiance(self, camera: CameraModel) -> Float32[np.ndarray, "rows columns"]:
         """Radiance factor in each pixel of a camera in the world."""
         origins, directions = camera.rays(camera.pixel_grid())
-        normal = np.cross(*self.along)
+        normal = np.cross(*self.axes)
         offset = (self.origin - origins) @ normal
         slope = directions @ normal
         with np.errstate(divide="ignore", invalid="ignore"):
             ranges = offset / slope
         visible = np.isfinite(ranges) & (ranges > 0.0)
         points = origins + np.where(visible, ranges, 1.0)[..., None] * directions - self.origin
-        columns, rows = np.moveaxis(points @ self.along.T, -1, 0) / self.step_m
+        columns, rows = np.moveaxis(points @ self.axes.T, -1, 0) / self.step_m
         values = map_coordinates(texture(), [rows, columns], order=1, mode="grid-wrap")
-        return np.where(visible, MEAN * values, BEYOND).astype(np.float32)
+        return np.where(visible, MEAN * values, BACKGROUND).astype(np.float32)
 
 
 @cache
 def texture() -> Float32[np.ndarray, "rows columns"]:
-    """Periodic noise of mean 1 with amplitudes that decrease with frequency, as on natural surfaces."""
+    """Periodic noise of mean 1; its amplitudes decrease with frequency, as on natural surfaces."""
     rng = np.random.default_rng(20040103)
     frequency = np.hypot(*np.meshgrid(fft.fftfreq(_SIZE), fft.rfftfreq(_SIZE), indexing="ij"))
     frequency[0, 0] = np.inf
-    shape = np.where(frequency < 0.3, frequency**-1.2, 0.0) * (frequency > 4.0 / _SIZE)
-    values = fft.irfft2(shape * fft.rfft2(rng.standard_normal((_SIZE, _SIZE))), (_SIZE, _SIZE))
+    amplitude = np.where(frequency < 0.3, frequency**-1.2, 0.0) * (frequency > 4.0 / _SIZE)
+    values = fft.irfft2(amplitude * fft.rfft2(rng.standard_normal((_SIZE, _SIZE))), (_SIZE, _SIZE))
     return np.asarray(1.0 + _CONTRAST * values / values.std(), dtype=np.float32)
 
 
 @cache
 def descent(pictures: int = 3) -> DescentMeasurements:
-    """Descent pictures of level, textured ground; all instruments but the inertial velocity are exact."""
+    """Descent images of level, textured ground; all instruments except the inertial velocity are exact."""
     interval_s = min(_INTERVAL_S, _DURATION_S / (pictures - 1))
-    positions = _FIRST_M + interval_s * np.arange(pictures)[:, None] * DESCENT_VELOCITY_M_S
+    positions = _START_POSITION_M + interval_s * np.arange(pictures)[:, None] * DESCENT_VELOCITY_M_S
     angles = [_ATTITUDES_DEG[number % len(_ATTITUDES_DEG)] for number in range(pictures)]
-    attitudes = [Rotation.from_euler("ZYX", one, degrees=True) for one in angles]
+    attitudes = [Rotation.from_euler("ZYX", values, degrees=True) for values in angles]
     times = [100.0 + interval_s * number for number in range(pictures)]
     inertial = DESCENT_VELOCITY_M_S + np.array([9.0, -4.0, 0.0])
     return DescentMeasurements(
-        images=tuple(_take_pictures(preset("mer-descent-flown"), positions, attitudes, times, 2.0)),
-        attitudes=tuple(AttitudeMeasurement(one, time) for one, time in zip(attitudes, times, strict=True)),
-        altitudes=tuple(AltitudeMeasurement(float(one[2]), time) for one, time in zip(positions, times, strict=True)),
+        images=tuple(_take_images(preset("mer-descent-flown"), positions, attitudes, times, 2.0)),
+        attitudes=tuple(AttitudeMeasurement(attitude, time) for attitude, time in zip(attitudes, times, strict=True)),
+        altitudes=tuple(AltitudeMeasurement(float(z), time) for z, time in zip(positions[:, 2], times, strict=True)),
         interval_velocities_m_s=np.tile(inertial, (pictures - 1, 1)),
         sun_direction=direction(np.radians(250.0), np.radians(35.0)),
         inertial_velocities_m_s=np.tile(inertial, (pictures, 1)),
@@ -112,10 +112,10 @@ def descent(pictures: int = 3) -> DescentMeasurements:
 
 @cache
 def landing() -> LandingMeasurements:
-    """Two pictures of level, textured ground from a helicopter; all instruments are exact."""
+    """Two images of level, textured ground from a helicopter; all instruments are exact."""
     attitudes = [Rotation.from_euler("ZYX", angles, degrees=True) for angles in ((10, 3, -2), (10.2, 2.8, -1.9))]
     times = [0.0, 2.0]
-    first, second = _take_pictures(preset("xc-55"), _HOVER_M, attitudes, times, 0.03)
+    first, second = _take_images(preset("xc-55"), _HOVER_M, attitudes, times, 0.03)
     poses = [PoseMeasurement(rigid(attitudes[k], _HOVER_M[k]), times[k]) for k in (0, 1)]
     axis = attitudes[0].apply(first.camera.a.copy())
     slant = -_HOVER_M[0, 2] / axis[2]
@@ -128,28 +128,28 @@ def landing() -> LandingMeasurements:
     )
 
 
-def _take_pictures(
-    chosen: Preset, positions: np.ndarray, attitudes: Sequence[Rotation], times: Sequence[float], step_m: float
+def _take_images(
+    detector_preset: Preset, positions: np.ndarray, attitudes: Sequence[Rotation], times: Sequence[float], step_m: float
 ) -> list[DetectorImage]:
-    (camera,) = chosen.cameras()
+    (camera,) = detector_preset.cameras()
     ground = TexturedPlane(np.zeros(3), np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), step_m)
     rng = np.random.default_rng(1)
-    detector = Detector.draw(natural_fall_off(camera), chosen.detector, rng)
-    delivered = camera.bin(columns=1, rows=chosen.detector.rows_summed)
+    detector = Detector.draw(natural_fall_off(camera), detector_preset.detector, rng)
+    binned_camera = camera.bin(columns=1, rows=detector_preset.detector.rows_summed)
     images = []
     for position, attitude, time in zip(positions, attitudes, times, strict=True):
         radiance = ground.radiance(camera.transform(rigid(attitude, position)))
-        images.append(DetectorImage(detector.expose(radiance, rng), time, delivered, detector.calibration))
+        images.append(DetectorImage(detector.expose(radiance, rng), time, binned_camera, detector.calibration))
     return images
 
 
 def blank_pictures(measurements: Measurements, blank: Blank) -> Measurements:
-    """The measurements with blank pictures."""
-    return _replace_counts(measurements, lambda one: np.full(one.counts.shape, blank(one.calibration), np.uint16))
+    """Return the measurements with blank images."""
+    return _replace_counts(measurements, lambda item: np.full(item.counts.shape, blank(item.calibration), np.uint16))
 
 
 def noisy(measurements: Measurements) -> Measurements:
-    """The measurements with pictures of pure noise."""
+    """Return the measurements with images of pure noise."""
     rng = np.random.default_rng(2)
 
     def draw(image: DetectorImage) -> np.ndarray:
@@ -159,5 +159,5 @@ def noisy(measurements: Measurements) -> Measurements:
 
 
 def _replace_counts(measurements: Measurements, counts: Callable[[DetectorImage], np.ndarray]) -> Measurements:
-    images: Any = tuple(replace(one, counts=counts(one)) for one in measurements.images)
+    images: Any = tuple(replace(image, counts=counts(image)) for image in measurements.images)
     return replace(measurements, images=images)

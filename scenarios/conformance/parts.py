@@ -26,7 +26,7 @@ from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
 from marsyard.scenarios.parts import scores
 from marsyard.scenarios.parts.instruments import InstrumentTruth, check_readings
 from marsyard.scenarios.parts.motions import DescentPlace, Poses, check_poses
-from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, KINDS, SCORE, Kind, check_columns, list_installed
+from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, KINDS, SCORE, PartKind, check_columns, list_installed
 from marsyard.sim.dynamics.recorded import RecordedMotion
 from marsyard.sim.frames import rigid
 
@@ -37,10 +37,10 @@ _NORMAL = np.array([-_SLOPE, 0.0, 1.0]) / np.hypot(_SLOPE, 1.0)
 
 
 def part_kind(spec: str) -> str | None:
-    """Kind of a named part by its entry point, members or annotations; None if they do not determine it."""
-    named = next((kind.name for kind in KINDS.values() if spec in list_installed(kind.group)), None)
-    if named is not None or ":" not in spec:
-        return named
+    """Kind of a part by its entry point, members or annotations; None if they do not determine it."""
+    name = next((kind.name for kind in KINDS.values() if spec in list_installed(kind.group)), None)
+    if name is not None or ":" not in spec:
+        return name
     try:
         part = DYNAMICS.load(spec)
     except ValueError:
@@ -55,30 +55,30 @@ def part_kind(spec: str) -> str | None:
 class PartSuite(Suite):
     """Suite of one part of a kind, constructed with the default options of its class."""
 
-    kind: Kind
+    kind: PartKind
 
-    deterministic_advice = "draw only from the generator in the arguments; keep no state between cases"
+    deterministic_advice = "use only the generator in the arguments; keep no state between cases"
     answers = "answers a case"
-    closed_to_truth = False
-    writable = True
+    forbids_truth = False
+    writable_inputs = True
 
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
-        form = "see docs/custom-parts.md for inputs and outputs"
+        advice = "see docs/custom-parts.md for inputs and outputs"
         rule = "returns the output of its kind: right shapes, finite and in order"
-        yield Check("answer", rule, form, lambda: ", ".join(_describe(self._answer(case)) for case in self.cases()))
-        rule = "reports the same columns in every case: identifiers, with numbers or truth values"
-        yield Check("columns", rule, "report every column in every case; NaN for no number", self._columns)
+        yield Check("answer", rule, advice, lambda: ", ".join(_describe(self._answer(case)) for case in self.cases()))
+        rule = "reports the same columns in every case: identifiers, with numbers or booleans"
+        yield Check("columns", rule, "report every column in every case; NaN for a missing number", self._columns)
         yield from self.common_checks()
         if self.kind is not SCORE:
-            rule = "depends on its random stream if it states so, and only then"
-            advice = "set random to true if it draws, and draw only from the generator in the arguments"
+            rule = "depends on its random stream only if its attribute random is true"
+            advice = "set random to true if it uses random numbers, and use only the generator in the arguments"
             yield Check("random", rule, advice, self._depends_on_stream)
 
     def cases(self) -> Sequence[Any]:
         """See `Suite`."""
         if self.kind is not SCORE:
-            return places() if self.kind is DYNAMICS else truths()
+            return motion_cases() if self.kind is DYNAMICS else instrument_cases()
         accepted = scores.accepted_cases(scores.load_score(self.spec))
         return [case for case in scored_cases() if isinstance(case, accepted)]
 
@@ -105,26 +105,25 @@ class PartSuite(Suite):
 
     def _columns(self) -> str:
         answers = [self._answer(case, seed) for case in self.cases() for seed in (1, 2)]
-        names = [tuple(one if isinstance(one, dict) else one.columns) for one in answers]
-        if len(set(names)) > 1:
-            raise BreachError(
-                f"its columns change: {' / '.join(', '.join(one) or 'none' for one in dict.fromkeys(names))}"
-            )
-        return ", ".join(names[0]) or "none"
+        columns = [tuple(answer if isinstance(answer, dict) else answer.columns) for answer in answers]
+        if len(set(columns)) > 1:
+            variants = " / ".join(", ".join(names) or "none" for names in dict.fromkeys(columns))
+            raise BreachError(f"its columns change: {variants}")
+        return ", ".join(columns[0]) or "none"
 
     def _depends_on_stream(self) -> str:
-        stated = bool(self.make().random)
+        is_random = bool(self.make().random)
         case = self.cases()[0]
-        differs = fingerprint(self._answer(case, 1)) != fingerprint(self._answer(case, 2))
-        if stated and not differs:
-            raise BreachError("its random is true, but two streams give the same")
-        if differs and not stated:
-            raise BreachError("its random is false, but two streams give something else")
-        return "random" if stated else "not random"
+        is_different = fingerprint(self._answer(case, 1)) != fingerprint(self._answer(case, 2))
+        if is_random and not is_different:
+            raise BreachError("its attribute random is true, but two streams give the same output")
+        if is_different and not is_random:
+            raise BreachError("its attribute random is false, but two streams give different outputs")
+        return "random" if is_random else "not random"
 
 
-def load_part(kind: Kind, spec: str) -> Any:
-    """A part with default options. Raises ValueError with the allowed names if there is none of this name and kind."""
+def load_part(kind: PartKind, spec: str) -> Any:
+    """A part with default options. Raises ValueError with the allowed names if there is no such part."""
     return scores.load_score(spec) if kind is SCORE else kind.create(spec, {})
 
 
@@ -141,17 +140,17 @@ def _ground_height(x: float, y: float) -> float:
 
 
 def _nearest_ground(
-    apex: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], half_width_rad: float, farthest_m: float
+    apex: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], half_width_rad: float, max_range_m: float
 ) -> float:
     """Distance to the suite's plane within a cone."""
     angle = max(float(np.arccos(np.clip(-axis @ _NORMAL, -1.0, 1.0))) - half_width_rad, 0.0)
     distance = float(apex @ _NORMAL) / np.cos(angle) if angle < 0.5 * np.pi else np.inf
-    return float(distance) if distance <= farthest_m else np.inf
+    return float(distance) if distance <= max_range_m else np.inf
 
 
 @cache
-def places() -> tuple[DescentPlace, ...]:
-    """Inputs of motions: three pictures over Mars, and five at shorter intervals over a smaller planet."""
+def motion_cases() -> tuple[DescentPlace, ...]:
+    """Inputs of motions: three images over Mars, and five at shorter intervals over a smaller planet."""
     return (
         DescentPlace(_ground_height, _GRAVITY_M_S2, (0.0, 3.75, 7.5), -5.0, 8.0, 100.0),
         DescentPlace(_ground_height, 1.62, (0.0, 2.0, 4.0, 6.0, 8.0), -2.0, 8.5, 50.0),
@@ -159,7 +158,7 @@ def places() -> tuple[DescentPlace, ...]:
 
 
 @cache
-def motion() -> RecordedMotion:
+def swinging_fall() -> RecordedMotion:
     """A swinging fall from 1900 m."""
     times = np.arange(-6.0, 22.0, 0.05)
     positions = np.column_stack([12.0 * times, -7.0 * times, 1900.0 - 75.0 * times])
@@ -168,17 +167,17 @@ def motion() -> RecordedMotion:
 
 
 @cache
-def truths() -> tuple[InstrumentTruth, ...]:
+def instrument_cases() -> tuple[InstrumentTruth, ...]:
     """Inputs of instruments: two descents."""
     return tuple(
-        InstrumentTruth(np.array(times), motion(), _ground_height, _nearest_ground)
+        InstrumentTruth(np.array(times), swinging_fall(), _ground_height, _nearest_ground)
         for times in ((0.0, 3.75, 7.5), (1.0, 2.0, 3.0, 4.0))
     )
 
 
 @cache
 def scored_cases() -> tuple[scores.ScoredCase, ...]:
-    """Inputs of scores: all kinds of cases with an answer and with a failure; real ones also without truth."""
+    """Inputs of scores: all kinds of cases with an answer and with a failure; recorded cases also without truth."""
     velocities = (
         VelocityEstimate(VelocityOutcome.VALID, np.array([11.0, -7.5])),
         VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None),
@@ -187,26 +186,26 @@ def scored_cases() -> tuple[scores.ScoredCase, ...]:
         SiteEstimate(SiteOutcome.SAFE_SITE, np.array([1.0, 2.0, 0.05])),
         SiteEstimate(SiteOutcome.NO_SAFE_SITE, None),
     )
-    three = (motion().state(0.0), motion().state(3.75), motion().state(7.5))
-    poses = rigid(three[0].attitude, three[0].position_m), rigid(three[1].attitude, three[1].position_m)
+    states = (swinging_fall().state(0.0), swinging_fall().state(3.75), swinging_fall().state(7.5))
+    poses = rigid(states[0].attitude, states[0].position_m), rigid(states[1].attitude, states[1].position_m)
     cases: list[scores.ScoredCase] = []
     for answer in velocities:
-        asked: dict[str, Any] = {"measurements": inputs.descent(), "answer": answer}
-        known: dict[str, Any] = asked | {"true_velocity_m_s": inputs.DESCENT_VELOCITY_M_S[:2].copy()}
-        flown: dict[str, Any] = known | {"states": three, "motion": motion()}
-        landed: dict[str, Any] = {"at_firing": motion().state(20.0), "touchdown_m_s": np.array([3.0, -1.0])}
-        cases += [scores.ScoredDescent(**flown, **landed), scores.ScoredFlight(**flown)]
-        cases += [scores.ScoredVelocity(**known), scores.ScoredVelocity(**asked, true_velocity_m_s=None)]
+        answered: dict[str, Any] = {"measurements": inputs.descent(), "answer": answer}
+        with_truth: dict[str, Any] = answered | {"true_velocity_m_s": inputs.DESCENT_VELOCITY_M_S[:2].copy()}
+        with_motion: dict[str, Any] = with_truth | {"states": states, "motion": swinging_fall()}
+        touchdown: dict[str, Any] = {"at_firing": swinging_fall().state(20.0), "touchdown_m_s": np.array([3.0, -1.0])}
+        cases += [scores.ScoredDescent(**with_motion, **touchdown), scores.ScoredFlight(**with_motion)]
+        cases += [scores.ScoredVelocity(**with_truth), scores.ScoredVelocity(**answered, true_velocity_m_s=None)]
     for site in sites:
-        asked = {"measurements": inputs.landing(), "answer": site}
-        known = asked | {"true_poses": poses}
-        landing = scores.ScoredLanding(**known, states=three[:2], ground=_ground_truth())
-        cases += [landing, scores.ScoredSite(**known), scores.ScoredSite(**asked, true_poses=None)]
+        answered = {"measurements": inputs.landing(), "answer": site}
+        with_truth = answered | {"true_poses": poses}
+        landing = scores.ScoredLanding(**with_truth, states=states[:2], ground=_ground_truth())
+        cases += [landing, scores.ScoredSite(**with_truth), scores.ScoredSite(**answered, true_poses=None)]
     return (*cases, _scored_run(TrackingState.NORMAL), _scored_run(TrackingState.FAILURE))
 
 
 def _ground_truth() -> GroundTruth:
-    """Level ground of 20 m, safe except for one position."""
+    """Level ground of 20 m with one unsafe position."""
     line = np.linspace(-4.0, 4.0, 9)
     positions_m = np.stack(np.meshgrid(line, line), axis=-1)
     zeros = np.zeros(positions_m.shape[:2])
@@ -218,7 +217,7 @@ def _ground_truth() -> GroundTruth:
 
 
 def _scored_run(state: TrackingState) -> scores.ScoredRun:
-    """A rover's run of two stops, the second with an answer of this state."""
+    """A rover's run with two stops, the second with an answer of this state."""
     poses = (trackers.pose(0.0), trackers.pose(0.4))
     first = TargetUpdate(TrackingState.NORMAL, (), trackers.TARGET_M.copy())
     last = TargetUpdate(state, (), trackers.TARGET_M - 0.4 if state is TrackingState.NORMAL else None)
@@ -227,6 +226,6 @@ def _scored_run(state: TrackingState) -> scores.ScoredRun:
         target_world=trackers.TARGET_M.copy(),
         world_from_rover=poses,
         point_px=np.array([[512.0, 400.0], [515.0, 398.0]]),
-        measurements=tuple(trackers.take_pictures(trackers.aim_ahead(), pose) for pose in poses),
+        measurements=tuple(trackers.take_images(trackers.aim_ahead(), pose) for pose in poses),
         answers=(first, last),
     )

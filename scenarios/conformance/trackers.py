@@ -1,4 +1,4 @@
-"""Conformance checks of target trackers: a drive towards a textured wall, with faults on the way."""
+"""Conformance checks of target trackers: a drive towards a textured wall, with injected faults."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from marsyard.sim.sensor import stereo_mast
 FULL_SCALE_DN = 4095
 _LEVEL_DN = 1500.0
 _WALL_M, _STEP_M = 8.0, 0.4
-#: The designated point in the world, and the stops of the drive, metres ahead.
+#: The designated point in the world; number of stops of the drive.
 TARGET_M = np.array([_WALL_M, 0.3, 1.2])
 _STOPS = 4
-#: Counts of blank pictures.
+#: Counts of blank images.
 BLANKS = {"featureless": 1500, "dark": 0, "saturated": FULL_SCALE_DN}
 
 
@@ -37,13 +37,13 @@ def mast() -> MastCalibration:
     return stereo_mast("research-navcam")
 
 
-def pose(ahead_m: float) -> RigidTransform:
+def pose(distance_m: float) -> RigidTransform:
     """Pose of the rover at a distance along its path."""
-    return rigid(Rotation.identity(), np.array([ahead_m, 0.0, 0.0]))
+    return rigid(Rotation.identity(), np.array([distance_m, 0.0, 0.0]))
 
 
 def designation() -> PixelTarget:
-    """The target, designated in a picture at the start."""
+    """The target, designated in an image at the start."""
     angles = mast_angles(TARGET_M, mast())
     if angles is None:
         raise ValueError("the mast cannot point at the suite's target")
@@ -51,16 +51,16 @@ def designation() -> PixelTarget:
     return PixelTarget(np.asarray(left.project(TARGET_M)[0]), *angles)
 
 
-def take_pictures(aim: MastAim, world_from_rover: RigidTransform, blank: int | None = None) -> RoverMeasurements:
-    """Measurements of a stop at the aim: pictures of the wall, or blank pictures of one count."""
+def take_images(aim: MastAim, world_from_rover: RigidTransform, blank: int | None = None) -> RoverMeasurements:
+    """Measurements of a stop at the aim: images of the wall, or blank images of one count."""
     angles = aim.azimuth_rad, aim.elevation_rad
     head = world_from_rover * mast().geometry.rover_from_head(*angles)
-    left = _take_picture(mast().left.transform(head), aim.left, blank)
-    right = _take_picture(mast().right.transform(head), aim.right, blank)
+    left = _take_image(mast().left.transform(head), aim.left, blank)
+    right = _take_image(mast().right.transform(head), aim.right, blank)
     return RoverMeasurements(left, right, mast(), *angles, world_from_rover)
 
 
-def _take_picture(camera: CameraModel, box: PixelBox, blank: int | None) -> MastImage:
+def _take_image(camera: CameraModel, box: PixelBox, blank: int | None) -> MastImage:
     if blank is not None:
         return MastImage(np.full(box.size[::-1], blank, np.uint16), box.corner)
     wall = TexturedPlane(np.array([_WALL_M, 0.0, 0.0]), np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]), 0.006)
@@ -72,20 +72,20 @@ def _take_picture(camera: CameraModel, box: PixelBox, blank: int | None) -> Mast
 class TrackerSuite(Suite):
     """Suite of one tracker; its case is a drive to the designated target."""
 
-    deterministic_advice = "draw from numpy.random.default_rng(a fixed seed); reset everything in clear and designate"
+    deterministic_advice = "use numpy.random.default_rng(a fixed seed); reset the whole state in clear and designate"
     answers = "updates"
-    dependence = "cleared and given the target again, it answers differently"
+    dependence = "after clear and a second designation of the target, its answer differs"
 
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
-        form = "see algorithms/interface.py for aim, update and state"
-        rule = "gives a well-formed aim and answer at every stop of a drive"
-        yield Check("answer", rule, form, lambda: ", ".join(one.state.name for one in drive(self.make())))
-        yield Check("states", "has no target before one is designated and after it is cleared", form, self._has_states)
+        advice = "see algorithms/interface.py for aim, update and state"
+        rule = "returns a well-formed aim and answer at every stop of a drive"
+        yield Check("answer", rule, advice, lambda: ", ".join(update.state.name for update in drive(self.make())))
+        yield Check("states", "has no target before the designation and after clear", advice, self._has_states)
         advice = "return a TargetUpdate with the state LOST and the reasons in losses"
         for name, blank in BLANKS.items():
-            yield Check(name, f"loses its target if pictures are {name}", advice, partial(self._loses, name, blank))
-        rule = "answers if the pose jumps and pictures show other ground"
+            yield Check(name, f"loses its target if images are {name}", advice, partial(self._loses, name, blank))
+        rule = "answers if the pose jumps and the images show a different scene"
         yield Check("pose", rule, advice, self._answers_after_jump)
         yield from self.common_checks()
 
@@ -104,14 +104,14 @@ class TrackerSuite(Suite):
 
     def _has_states(self) -> str:
         tracker = self.make()
-        _expect_state(tracker, "before a target is designated", TrackingState.NO_TARGET)
+        _expect_state(tracker, "before the designation", TrackingState.NO_TARGET)
         tracker.designate(copy_inputs(designation()), pose(0.0))
-        _expect_state(tracker, "once a target is designated", TrackingState.NORMAL)
+        _expect_state(tracker, "after the designation", TrackingState.NORMAL)
         tracker.clear()
-        _expect_state(tracker, "once it is cleared", TrackingState.NO_TARGET)
-        update = check_update(tracker.update(copy_inputs(take_pictures(aim_ahead(), pose(0.0)))))
+        _expect_state(tracker, "after clear", TrackingState.NO_TARGET)
+        update = check_update(tracker.update(copy_inputs(take_images(aim_ahead(), pose(0.0)))))
         if update.state is not TrackingState.NO_TARGET:
-            raise BreachError(f"asked without a target, it answers {update.state.name}; allowed: NO_TARGET")
+            raise BreachError(f"without a target, it answers {update.state.name}; allowed: NO_TARGET")
         return ""
 
     def _loses(self, name: str, blank: int) -> str:
@@ -119,45 +119,45 @@ class TrackerSuite(Suite):
         drive(tracker)
         update = stop(tracker, pose(_STOPS * _STEP_M), blank)
         if update is None:
-            return "it finds no aim"
+            return "no aim"
         if update.found:
-            raise BreachError(f"it finds its target in pictures that are {name}")
+            raise BreachError(f"it finds its target in images that are {name}")
         if update.state is TrackingState.LOST and not update.losses:
-            raise BreachError("it does not say why the target is lost: losses is empty")
+            raise BreachError("it reports no reason for the lost target: losses is empty")
         return ", ".join([update.state.name, *(loss.name for loss in update.losses)])
 
     def _answers_after_jump(self) -> str:
         tracker = self.make()
         drive(tracker)
-        measurements = replace(take_pictures(aim_ahead(), pose(0.0)), world_from_rover=pose(3.0))
+        measurements = replace(take_images(aim_ahead(), pose(0.0)), world_from_rover=pose(3.0))
         return check_update(tracker.update(copy_inputs(measurements))).state.name
 
     def _leaves_inputs(self) -> str:
         tracker, target = self.make(), copy_inputs(designation(), writable=True)
-        target_before = hash_inputs(target)
+        target_hash = hash_inputs(target)
         tracker.designate(target, pose(0.0))
-        measurements = copy_inputs(take_pictures(_aim_at_target(tracker, pose(0.0)), pose(0.0)), writable=True)
-        before = hash_inputs(measurements)
+        measurements = copy_inputs(take_images(_aim_at_target(tracker, pose(0.0)), pose(0.0)), writable=True)
+        measurements_hash = hash_inputs(measurements)
         tracker.update(measurements)
-        if hash_inputs(target) != target_before or hash_inputs(measurements) != before:
+        if hash_inputs(target) != target_hash or hash_inputs(measurements) != measurements_hash:
             raise BreachError("it changed its input, the designation or the measurements")
         return ""
 
     def _answer_time_s(self) -> float:
-        """Longest time of an update in a drive after a first one, which compiles kernels."""
+        """Maximum time of an update in a drive after a first drive, which compiles kernels."""
         drive(self.make())
         tracker = self.make()
         tracker.designate(copy_inputs(designation()), pose(0.0))
         times = []
         for number in range(_STOPS):
-            here = pose(number * _STEP_M)
-            measurements = copy_inputs(take_pictures(_aim_at_target(tracker, here), here))
+            rover_pose = pose(number * _STEP_M)
+            measurements = copy_inputs(take_images(_aim_at_target(tracker, rover_pose), rover_pose))
             times.append(measure_time_s(partial(tracker.update, measurements)))
         return max(times)
 
 
 def drive(tracker: Any) -> Sequence[TargetUpdate]:
-    """Designate the target and drive towards it; returns the updates at the stops, up to a failure."""
+    """Designate the target and drive towards it; return the updates at the stops, up to a failure."""
     tracker.designate(copy_inputs(designation()), pose(0.0))
     updates: list[TargetUpdate] = []
     for number in range(_STOPS):
@@ -170,26 +170,26 @@ def drive(tracker: Any) -> Sequence[TargetUpdate]:
     return updates
 
 
-def stop(tracker: Any, here: RigidTransform, blank: int | None = None) -> TargetUpdate | None:
-    """Aim, take pictures and update, checked against the interface; None without an aim."""
-    aim = check_aim(tracker.aim(here, copy_inputs(mast())), mast())
+def stop(tracker: Any, rover_pose: RigidTransform, blank: int | None = None) -> TargetUpdate | None:
+    """Aim, take images and update, checked against the interface; None without an aim."""
+    aim = check_aim(tracker.aim(rover_pose, copy_inputs(mast())), mast())
     if aim is None:
         return None
-    update = check_update(tracker.update(copy_inputs(take_pictures(aim, here, blank))))
+    update = check_update(tracker.update(copy_inputs(take_images(aim, rover_pose, blank))))
     if tracker.state is not update.state:
-        raise BreachError(f"its state is {tracker.state}, but its update says {update.state}")
+        raise BreachError(f"its state is {tracker.state}, but its update reports {update.state}")
     return update
 
 
-def _aim_at_target(tracker: Any, here: RigidTransform) -> MastAim:
-    aim = check_aim(tracker.aim(here, copy_inputs(mast())), mast())
+def _aim_at_target(tracker: Any, rover_pose: RigidTransform) -> MastAim:
+    aim = check_aim(tracker.aim(rover_pose, copy_inputs(mast())), mast())
     if aim is None:
-        raise BreachError("it finds no aim at a target 8 m ahead, in full view")
+        raise BreachError("it returns no aim at a fully visible target 8 m ahead")
     return aim
 
 
 def aim_ahead() -> MastAim:
-    """Aim straight ahead with the middle of both frames."""
+    """Aim straight ahead with the centres of both images."""
     columns, rows = mast().left.size
     box = PixelBox((columns // 4, rows // 4), (columns // 2, rows // 2))
     return MastAim(0.0, -0.2, box, box)

@@ -12,8 +12,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.scenarios.descent.parameters import (
     CameraParameters,
     DescentScenarioParameters,
+    add_terrain_fault,
     draw_clouds,
-    faulty_terrain,
 )
 from marsyard.scenarios.exposure import Optics, add_calibration_error, render_state, sunlight_ratio
 from marsyard.scenarios.exposure import camera_optics as shared_optics
@@ -27,7 +27,7 @@ from marsyard.sim.sensor import Detector
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Environment, Surface, TerrainBank
 
-#: Finest spacing of a plain terrain's mesh: that of pictures from 1200 m and above, and as a fraction of lower heights.
+#: Finest mesh spacing of a generic terrain: upper limit, and fraction of the last picture's height above ground.
 MESH_FINEST_M, MESH_FINEST_HEIGHTS = 12.0, 0.01
 
 
@@ -35,9 +35,9 @@ MESH_FINEST_M, MESH_FINEST_HEIGHTS = 12.0, 0.01
 class World:
     """Terrain and light of a descent.
 
-    - ground: the terrain with its site's light, texture and rocks; None for a plain terrain
-    - meshes: own bodies on the ground
-    - brightness: sunlight at the ground over the reference sunlight of the detector's responsivity
+    - ground: the terrain with its site's light, texture and rocks; None for a generic terrain
+    - meshes: custom objects on the ground
+    - brightness: sunlight at the ground divided by the reference sunlight of the detector's responsivity
     """
 
     surface: Surface
@@ -48,13 +48,13 @@ class World:
 
     @property
     def air(self) -> Environment:
-        """Atmosphere of the site; Mars for a plain terrain."""
+        """Atmosphere of the site; the default Martian atmosphere for a generic terrain."""
         return Environment() if self.ground is None else self.ground.site.environment
 
     @classmethod
-    def of(cls, p: DescentScenarioParameters) -> World:
-        """Create a case's world; its terrain is read from the cache or built."""
-        terrain = faulty_terrain(p.faults, p.terrain)
+    def from_parameters(cls, p: DescentScenarioParameters) -> World:
+        """Create the world of a case; read its terrain from the cache or build it."""
+        terrain = add_terrain_fault(p.faults, p.terrain)
         bank = TerrainBank(terrain, p.location.bank_seed)
         surface = bank.terrain(p.location.terrain)
         elevation = float(np.radians(p.sun.elevation_deg))
@@ -67,7 +67,7 @@ class World:
         return cls(surface, ground, sun, p.meshes, sunlight_ratio(air, elevation, p.detector))
 
     def scene(self, east_m: float, north_m: float, lowest_m: float, pixel_rad: float) -> Scene:
-        """Scene of all pictures of a descent, without the lander's shadow and clouds.
+        """Create the scene of all pictures of a descent, without the lander's shadow and clouds.
 
         - east_m, north_m: position below the first picture
         - lowest_m: height above ground of the last picture, which determines the smallest rocks
@@ -80,16 +80,16 @@ class World:
         return add_meshes(scene, self.meshes, (east_m, north_m))
 
 
-#: Height over which the optical depth of haze is stated, m: that of the first picture.
+#: Path length to which the optical depth of haze refers, m: about the height of the first picture.
 HAZE_HEIGHT_M = 2000.0
-#: MER's aeroshell (Desai & Knocke 2004), m.
+#: Diameter of MER's aeroshell (Desai & Knocke 2004), m.
 SHIELD_DIAMETER_M = 2.65
-#: Heat shield relative to the lander: faster fall, sideways drift, tumble rate; all assumed.
-FASTER_M_S, DRIFT_M_S, TUMBLE_RAD_S = 20.0, 2.0, 1.0
+#: Heat shield relative to the lander: downward speed, horizontal speed, tumble rate; all assumed.
+FALL_M_S, DRIFT_M_S, TUMBLE_RAD_S = 20.0, 2.0, 1.0
 #: Largest angle of the heat shield from nadir in the first picture, radians (assumed).
-OFF_NADIR_RAD = 0.2
-#: Assumed albedo of the charred outside and of the inside's insulation.
-OUTSIDE, INSIDE = 0.1, 0.5
+MAX_OFF_NADIR_RAD = 0.2
+#: Assumed albedos of the shield: charred outside, insulated inside.
+OUTSIDE_ALBEDO, INSIDE_ALBEDO = 0.1, 0.5
 
 
 def take_exposures(
@@ -100,13 +100,13 @@ def take_exposures(
     detector: Detector,
     streams: Streams,
 ) -> Iterator[tuple[UInt16[np.ndarray, "rows columns"], Frame]]:
-    """Detector counts and rendered frame of each picture, one by one, without delivery faults."""
+    """Yield detector counts and rendered frame of each picture, without delivery faults."""
     first, last = states[0].position_m, states[-1].position_m
-    below_first, below_last = (float(world.surface.height(point[0], point[1])) for point in (first, last))
-    scene = world.scene(float(first[0]), float(first[1]), float(last[2]) - below_last, optics.rays.pixel_rad)
-    clouds = draw_clouds(p.faults, below_first, streams.generator("clouds"))
+    first_ground_m, last_ground_m = (float(world.surface.height(east, north)) for east, north, _ in (first, last))
+    scene = world.scene(float(first[0]), float(first[1]), float(last[2]) - last_ground_m, optics.rays.pixel_rad)
+    clouds = draw_clouds(p.faults, first_ground_m, streams.generator("clouds"))
     scene = replace(scene, caster_diameter_m=p.lander.caster_diameter_m, clouds=clouds)
-    # the camera is at the body's origin; its alignment error, unknown to the lander, is a rotation alone
+    # the camera is at the body's origin; its alignment error is a pure rotation, unknown to the lander
     tilt = np.radians(p.camera.alignment_error_deg) * streams.generator("camera alignment").standard_normal(3)
     mounting = RigidTransform.from_rotation(Rotation.from_rotvec(tilt))
     shield = None
@@ -125,7 +125,7 @@ def take_exposures(
 
 
 def add_haze(frame: Frame, optical_depth: float, sun: Sun, air: Environment) -> Float32[np.ndarray, "rows columns"]:
-    """Radiance factor of a picture through a homogeneous layer of dusty air between ground and lander.
+    """Compute the radiance factor of a picture through a homogeneous layer of dusty air between ground and lander.
 
     The ground's light is attenuated by ``T = exp(-optical depth x range / HAZE_HEIGHT_M)``; ``1 - T`` of the air's
     source function is added: single scattering of sunlight (Henyey & Greenstein 1941) and of the mean light from sky
@@ -145,9 +145,9 @@ def add_haze(frame: Frame, optical_depth: float, sun: Sun, air: Environment) -> 
 
 @dataclass(frozen=True)
 class HeatShield:
-    """A freely falling, tumbling disc; approximates the shield's cone of 70 deg half angle.
+    """Freely falling, tumbling disc that approximates the shield's cone of 70 deg half angle.
 
-    Centre, velocity, outward normal and angular velocity are those at the first picture, world axes.
+    Centre, velocity, outward normal and angular velocity are those at the first picture, in world axes.
     """
 
     centre_m: Float64[np.ndarray, "3"]
@@ -158,14 +158,14 @@ class HeatShield:
 
     @classmethod
     def draw(cls, first: State, angle_rad: float, rng: np.random.Generator) -> HeatShield:
-        """Draw a shield below the lander at its first picture; `angle_rad` is its angular diameter face on."""
-        circle = 2 * np.pi
-        azimuth, off_nadir, drift_azimuth, axis_azimuth = rng.uniform(size=4) * [circle, OFF_NADIR_RAD, circle, circle]
-        below = np.array([np.sin(azimuth) * np.sin(off_nadir), np.cos(azimuth) * np.sin(off_nadir), -np.cos(off_nadir)])
-        drift = np.array([DRIFT_M_S * np.sin(drift_azimuth), DRIFT_M_S * np.cos(drift_azimuth), -FASTER_M_S])
+        """Draw a shield below the lander at its first picture; `angle_rad` is its angular diameter seen face on."""
+        limits = [2 * np.pi, MAX_OFF_NADIR_RAD, 2 * np.pi, 2 * np.pi]
+        azimuth, off_nadir, drift_azimuth, axis_azimuth = rng.uniform(size=4) * limits
+        ray = np.array([np.sin(azimuth) * np.sin(off_nadir), np.cos(azimuth) * np.sin(off_nadir), -np.cos(off_nadir)])
+        drift = np.array([DRIFT_M_S * np.sin(drift_azimuth), DRIFT_M_S * np.cos(drift_azimuth), -FALL_M_S])
         axis = np.array([np.cos(axis_azimuth), np.sin(axis_azimuth), 0.0])
         return cls(
-            centre_m=first.position_m + SHIELD_DIAMETER_M / (2.0 * np.tan(0.5 * angle_rad)) * below,
+            centre_m=first.position_m + SHIELD_DIAMETER_M / (2.0 * np.tan(0.5 * angle_rad)) * ray,
             velocity_m_s=first.velocity_m_s + drift,
             normal=Rotation.from_rotvec(rng.uniform(-np.pi, np.pi) * axis).apply([0.0, 0.0, -1.0]),
             spin_rad_s=TUMBLE_RAD_S * axis,
@@ -175,52 +175,52 @@ class HeatShield:
     def draw_over(
         self, radiance: Float32[np.ndarray, "rows columns"], frame: Frame, sun: Sun, time_s: float
     ) -> Float32[np.ndarray, "rows columns"]:
-        """A picture's radiance factor with the shield in it, a Lambert surface lit by the sun alone."""
+        """Draw the shield into a picture's radiance factor: a Lambert surface, lit by the sun only."""
         elapsed = time_s - self.start_s
         centre = self.centre_m + elapsed * self.velocity_m_s
         normal = Rotation.from_rotvec(elapsed * self.spin_rad_s).apply(self.normal)
         origin = frame.world_from_body.apply(frame.rays.centre)
         directions = frame.world_from_body.rotation.apply(frame.rays.directions.astype(np.float64))
-        towards = directions @ normal
-        distance = ((centre - origin) @ normal) / np.where(np.abs(towards) > 1e-9, towards, 1e-9)
+        cosines = directions @ normal
+        distance = ((centre - origin) @ normal) / np.where(np.abs(cosines) > 1e-9, cosines, 1e-9)
         from_centre = np.linalg.norm(origin + distance[:, None] * directions - centre, axis=1)
-        hit = (distance > 0.0) & (from_centre < 0.5 * SHIELD_DIAMETER_M)
-        # the visible side faces against the ray
-        lit = np.maximum(-np.sign(towards) * float(normal @ sun.direction), 0.0)
-        reflected = np.where(towards < 0.0, OUTSIDE, INSIDE) * lit
-        covered = np.where(hit, reflected, radiance.reshape(-1))
-        return covered.astype(np.float32).reshape(radiance.shape)
+        is_hit = (distance > 0.0) & (from_centre < 0.5 * SHIELD_DIAMETER_M)
+        # the visible side faces the camera
+        sun_cosine = np.maximum(-np.sign(cosines) * float(normal @ sun.direction), 0.0)
+        reflected = np.where(cosines < 0.0, OUTSIDE_ALBEDO, INSIDE_ALBEDO) * sun_cosine
+        combined = np.where(is_hit, reflected, radiance.reshape(-1))
+        return combined.astype(np.float32).reshape(radiance.shape)
 
 
 def camera_optics(parameters: CameraParameters) -> Optics:
-    """True camera in the body frame: at its origin, looking down, columns to the east at zero attitude."""
+    """Create the true camera in the body frame: at the origin, looking down; columns point east at zero attitude."""
     model = parameters.model
-    return shared_optics(_camera(parameters, 1.0, (0.0, 0.0), 0.0) if model is None else model.camera())
+    return shared_optics(_create_camera(parameters, 1.0, (0.0, 0.0), 0.0) if model is None else model.camera())
 
 
 def calibrated_camera(parameters: CameraParameters, rng: np.random.Generator) -> CameraModel:
-    """The true camera of `camera_optics` with drawn calibration errors."""
+    """Draw calibration errors and add them to the true camera of `camera_optics`."""
     p = parameters
     focal, column, row, distortion = rng.standard_normal(4)
     centre = (p.centre_error_px * float(column), p.centre_error_px * float(row))
     focal_error, corner_px = p.focal_error * focal, p.distortion_error_px * distortion
     if p.model is not None:
         return add_calibration_error(p.model.camera(), focal_error, centre, corner_px)
-    return _camera(p, 1.0 + focal_error, centre, corner_px)
+    return _create_camera(p, 1.0 + focal_error, centre, corner_px)
 
 
-def _camera(p: CameraParameters, focal: float, centre_px: tuple[float, float], corner_px: float) -> Cahvor:
-    """The camera with a factor on its focal length, a shift of its centre, and outward distortion of its corners."""
-    middle = (0.5 * (p.columns - 1), 0.5 * (p.rows - 1))
+def _create_camera(p: CameraParameters, focal_factor: float, shift_px: tuple[float, float], corner_px: float) -> Cahvor:
+    """Create the camera with scaled focal length, shifted image centre, and corners distorted outwards by corner_px."""
+    centre = (0.5 * (p.columns - 1), 0.5 * (p.rows - 1))
     focal_px = p.focal_length_mm / (1e-3 * p.pixel_pitch_um)
     pinhole = Cahv.from_axes(
-        (focal * focal_px, focal * focal_px),
+        (focal_factor * focal_px, focal_factor * focal_px),
         (p.columns, p.rows),
         axis=np.array([0.0, 0.0, -1.0]),
         right=np.array([1.0, 0.0, 0.0]),
-        image_centre=(middle[0] + centre_px[0], middle[1] + centre_px[1]),
+        image_centre=(centre[0] + shift_px[0], centre[1] + shift_px[1]),
     )
-    # CAHVOR moves a point at the angle a from the axis outwards by (R0 + R1 tan(a)^2 + ...) of its distance
-    corner = float(np.hypot(*middle))
-    radial_1 = p.radial_1 + corner_px / corner / (corner / focal_px) ** 2
+    # CAHVOR moves a point at angle a from the axis outwards by the fraction R0 + R1 tan(a)^2 + ... of its distance
+    radius_px = float(np.hypot(*centre))
+    radial_1 = p.radial_1 + corner_px / radius_px / (radius_px / focal_px) ** 2
     return Cahvor.from_cahv(pinhole, r=np.array([p.radial_0, radial_1, p.radial_2]))

@@ -1,4 +1,4 @@
-"""True motion of a descent: simulated dynamics, a user's own motion, or a recorded flight."""
+"""True motion of a descent: simulated dynamics, a custom motion, or a recorded flight."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from marsyard.scenarios.descent.parameters import DescentScenarioParameters, faulty_times
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_time_fault
 from marsyard.scenarios.descent.recorded import AFTER_S, check_looks_down
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.motions import CustomMotion, DescentPlace
@@ -17,23 +17,23 @@ from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 
-#: Gravity over a plain terrain: Mars.
+#: Gravity on Mars, used for a generic terrain.
 MARS_GRAVITY_M_S2 = 3.72
-#: Start of a simulated descent before the first picture, s.
+#: Duration of a simulated descent before the first picture, s.
 LEAD_S = 5.0
 #: Margin of the inertial unit's data before the first picture and after the last instant of interest, s.
 MARGIN_S = 0.1
-#: Samples in the search for the height of the thrusters' firing on a flight given by poses.
-_SAMPLES = 2000
+#: Number of times at which a recorded or custom flight is searched for the thrusters' firing height.
+_SEARCH_TIMES = 2000
 
 
 @dataclass(frozen=True)
 class DescentFlight:
     """Motion of a descent.
 
-    - motion: truth over time; time 0 is the first picture's
-    - lead_s: start of the motion before the first picture
-    - firing_s: time of the thrusters' firing, at `thruster_firing_m` above the ground, or the end of a flight by poses
+    - motion: true motion over time; time 0 is that of the first picture
+    - lead_s: duration of the motion before the first picture
+    - firing_s: time of the thrusters' firing, at `thruster_firing_m` above the ground, or the end of a pose file
     - row: columns of the results
     """
 
@@ -44,22 +44,22 @@ class DescentFlight:
 
 
 def gravity_m_s2(p: DescentScenarioParameters) -> float:
-    """Gravity of the site."""
+    """Return the gravity of the site, or of Mars for a generic terrain."""
     return MARS_GRAVITY_M_S2 if p.preset is None else p.preset.environment.gravity_m_s2
 
 
 def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Streams) -> DescentFlight:
-    """Create the motion of a case: its first picture is at the stated height, or at the recorded position.
+    """Create the motion of a case: its first picture is at the specified height, or at the recorded position.
 
-    Raises ValueError where a recorded or own motion is below the ground at a picture, or an own motion is invalid.
+    Raises ValueError if a recorded or custom motion is below the ground at a picture, or a custom motion is invalid.
     """
     ground = float(surface.height(p.location.east_m, p.location.north_m))
-    below = np.array([p.location.east_m, p.location.north_m, ground])
-    times = faulty_times(p.faults, p.picture_times_s)
+    site_m = np.array([p.location.east_m, p.location.north_m, ground])
+    times = add_time_fault(p.faults, p.picture_times_s)
     if p.flight is None:
         descent = SwingDescent.simulate(
             p.descent,
-            below + np.array([0.0, 0.0, p.descent.altitude_first_m]),
+            site_m + np.array([0.0, 0.0, p.descent.altitude_first_m]),
             streams.generator("gusts"),
             ground_height_m=ground,
             gravity_m_s2=gravity_m_s2(p),
@@ -71,55 +71,55 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
     row: Mapping[str, Scalar]
     if isinstance(p.flight, CustomMotion):
         place = DescentPlace(
-            ground_height=lambda east, north: float(surface.height(below[0] + east, below[1] + north) - below[2]),
+            ground_height=lambda east, north: float(surface.height(site_m[0] + east, site_m[1] + north) - site_m[2]),
             gravity_m_s2=gravity_m_s2(p),
             pictures_s=tuple(times),
             from_s=-p.flight.lead_s,
             until_s=max(times) + AFTER_S,
             firing_height_m=p.descent.thruster_firing_m,
         )
-        motion, row = p.flight.compute(place, below, streams.generator("own motion"))
+        motion, row = p.flight.compute(place, site_m, streams.generator("own motion"))
         check_looks_down(p.flight.motion, motion, times)
     else:
-        motion = p.flight.motion(below, gravity_m_s2(p))
+        motion = p.flight.motion(site_m, gravity_m_s2(p))
         row = {"flight_file": p.flight.file, "flight_first_picture_s": p.flight.start_s}
     positions = motion.motion(np.array(times)).positions_m
     heights = positions[:, 2] - surface.height(positions[:, 0], positions[:, 1])
-    buried = np.flatnonzero(heights <= 0.0)
-    if buried.size:
+    invalid = np.flatnonzero(heights <= 0.0)
+    if invalid.size:
         raise TrajectoryFileError(
-            f"{p.flight.motion if isinstance(p.flight, CustomMotion) else p.flight.file}: at picture {buried[0] + 1} "
-            f"the camera is {-heights[buried[0]]:.1f} m below the ground; allowed: above it"
+            f"{p.flight.motion if isinstance(p.flight, CustomMotion) else p.flight.file}: at picture {invalid[0] + 1} "
+            f"the camera is {-heights[invalid[0]]:.1f} m below the ground; allowed: above it"
         )
-    return DescentFlight(motion, p.flight.lead_s, _firing_s(p, motion, surface), row)
+    return DescentFlight(motion, p.flight.lead_s, _find_firing_time(p, motion, surface), row)
 
 
-def _firing_s(p: DescentScenarioParameters, motion: Trajectory, surface: Surface) -> float:
-    """First time at the thrusters' firing height above the ground below the first picture; else the last time."""
-    times = np.linspace(max(p.picture_times_s), motion.span_s[1] - MARGIN_S, _SAMPLES)
+def _find_firing_time(p: DescentScenarioParameters, motion: Trajectory, surface: Surface) -> float:
+    """Return the first time at the firing height above the ground below the first picture, else the last time."""
+    times = np.linspace(max(p.picture_times_s), motion.span_s[1] - MARGIN_S, _SEARCH_TIMES)
     first = motion.state(0.0).position_m
     heights = motion.motion(times).positions_m[:, 2] - float(surface.height(first[0], first[1]))
-    low = np.flatnonzero(heights <= p.descent.thruster_firing_m)
-    if not low.size or low[0] == 0:
-        return float(times[0 if low.size else -1])
-    crossing = slice(low[0] - 1, low[0] + 1)
+    indices = np.flatnonzero(heights <= p.descent.thruster_firing_m)
+    if not indices.size or indices[0] == 0:
+        return float(times[0 if indices.size else -1])
+    crossing = slice(indices[0] - 1, indices[0] + 1)
     return float(np.interp(-p.descent.thruster_firing_m, -heights[crossing], times[crossing]))
 
 
 def picture_states(p: DescentScenarioParameters, flight: DescentFlight) -> list[State]:
-    """True states at the exposures. Raises ValueError for a picture after the thrusters' firing."""
-    times = faulty_times(p.faults, p.picture_times_s)
+    """Return the true states at the exposures. Raises ValueError for a picture after the thrusters' firing."""
+    times = add_time_fault(p.faults, p.picture_times_s)
     late = [number for number, time in enumerate(times, start=1) if time > flight.firing_s]
     if late:
         raise ValueError(
-            f"picture {late[0]} of {p.pictures} would be taken at {times[late[0] - 1]:.2f} s, after the thrusters' "
-            f"firing at {flight.firing_s:.2f} s; allowed: fewer pictures, or a smaller descent.interval_s"
+            f"picture {late[0]} of {p.pictures} would be taken at {times[late[0] - 1]:.2f} s, after the "
+            f"thrusters' firing at {flight.firing_s:.2f} s; allowed: fewer pictures, or a smaller descent.interval_s"
         )
     return [flight.motion.state(time) for time in times]
 
 
 def mean_velocities(states: Sequence[State]) -> Float64[np.ndarray, "intervals 3"]:
-    """True mean velocities of the camera between the pictures, world axes, m/s."""
+    """Compute the true mean velocities of the camera between the pictures, world axes, m/s."""
     times = np.array([state.time_s for state in states])
     positions = np.stack([state.position_m for state in states])
     return np.asarray(np.diff(positions, axis=0) / np.diff(times)[:, None])
@@ -128,10 +128,10 @@ def mean_velocities(states: Sequence[State]) -> Float64[np.ndarray, "intervals 3
 def true_velocity(
     motion: Trajectory, states: Sequence[State], tags_s: Sequence[float], span_s: tuple[float, float]
 ) -> Float64[np.ndarray, "2"]:
-    """True mean horizontal velocity of the camera over a span of time tags, or that of an instant, m/s.
+    """Compute the camera's true mean horizontal velocity over a span of time tags, or its velocity at one tag, m/s.
 
-    A picture's tag corresponds to its true time, and tags between two pictures are interpolated: a span from picture to
-    picture is one from exposure to exposure, independent of tag errors.
+    A picture's tag is mapped to its true exposure time; other tags are mapped by interpolation. A span from picture to
+    picture is therefore a span from exposure to exposure, independent of tag errors.
     """
 
     def state_at(tag_s: float) -> State:

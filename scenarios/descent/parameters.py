@@ -19,7 +19,7 @@ from marsyard.scenarios.parts.instruments import CustomAltimeter, CustomAttitude
 from marsyard.scenarios.parts.motions import CustomMotion
 from marsyard.scenarios.parts.named import default_or_custom
 from marsyard.scenarios.parts.scores import CustomScores, ScoredDescent
-from marsyard.scenarios.terrain_files import CheckedTerrain, check_site
+from marsyard.scenarios.terrain_files import CheckedTerrain, site_validator
 from marsyard.sim.dynamics import SwingParameters
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
 from marsyard.sim.parameters import NonNegative, Parameters, bounded_field, merge_settings
@@ -38,11 +38,11 @@ from marsyard.sim.sensor import (
 from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 from marsyard.sim.terrain.landforms import Dunes
 
-#: Amplitude and length of a noise burst on the cable: a third of the picture's signal, over two delivered rows.
+#: Amplitude and length of an interference burst: a third of the picture's signal, over two delivered rows.
 BURST_DN, BURST_PX = 300.0, 2048.0
-#: Regular dunes.
+#: Regular dunes of the dune fault.
 REGULAR_DUNES = Dunes(wavelength_m=60.0, height_m=1.0, crest_length=20.0, regularity=12.0)
-#: Index of the picture that single-picture faults affect: it is in both pairs.
+#: Index of the picture that single-picture faults affect; it belongs to both pairs.
 FAULTY_PICTURE = 1
 
 
@@ -54,24 +54,24 @@ class Faults(SizedFaults):
     ] = 0.0
     cloud_cover: Annotated[NonNegative, Field(le=0.9, description="fraction of the ground in cloud shadows")] = 0.0
     haze: Annotated[NonNegative, Field(le=10.0, description="optical depth of dusty air over 2000 m")] = 0.0
-    dunes_m: Annotated[NonNegative, Field(le=30.0, description="height of regular dunes on all of the ground")] = 0.0
-    cable_bursts: Annotated[NonNegative, Field(le=1e4, description="mean number of noise bursts in a picture")] = 0.0
-    late_s: Annotated[NonNegative, Field(le=3.0, description="delay of the second picture after its time tag")] = 0.0
-    repeated_picture: Annotated[int, bounded_field(0, 3, "picture delivered as the previous one, 2 or 3; 0: none")] = 0
+    dunes_m: Annotated[NonNegative, Field(le=30.0, description="height of regular dunes on the whole terrain")] = 0.0
+    cable_bursts: Annotated[NonNegative, Field(le=1e4, description="mean interference bursts per picture")] = 0.0
+    late_s: Annotated[NonNegative, Field(le=3.0, description="delay of the second exposure after its time tag")] = 0.0
+    repeated_picture: Annotated[int, bounded_field(0, 3, "picture replaced by the previous one, 2 or 3; 0: none")] = 0
     black_picture: Annotated[int, bounded_field(0, 3, "picture that is delivered black, 1 to 3; 0: none")] = 0
-    altitude_error: Annotated[NonNegative, Field(le=0.9, description="relative error of all altitudes, too high")] = 0.0
-    altitude_error_once: Annotated[NonNegative, Field(le=0.9, description="the same of the second altitude")] = 0.0
+    altitude_error: Annotated[NonNegative, Field(le=0.9, description="relative excess of all altitudes")] = 0.0
+    altitude_error_once: Annotated[NonNegative, Field(le=0.9, description="added, second altitude only")] = 0.0
     attitude_error_deg: Annotated[NonNegative, Field(le=90.0, description="tilt error of all attitudes")] = 0.0
-    attitude_error_once_deg: Annotated[NonNegative, Field(le=90.0, description="the same of the second attitude")] = 0.0
+    attitude_error_once_deg: Annotated[NonNegative, Field(le=90.0, description="added, second attitude only")] = 0.0
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
-        """Changed detector parameters, noise bursts on the cable included."""
+        """Return the detector parameters that the faults change, including interference bursts on the camera cable."""
         bursts = {"bursts": self.cable_bursts, "length_px": BURST_PX, "amplitude_dn": BURST_DN}
         return {**super().detector_changes(), "bursts": bursts if self.cable_bursts else {}}
 
 
-def faulty_terrain(faults: Faults, terrain: TerrainParameters) -> TerrainParameters:
-    """The terrain, or regular dunes on it with that fault."""
+def add_terrain_fault(faults: Faults, terrain: TerrainParameters) -> TerrainParameters:
+    """Return the terrain; with the dune fault, add regular dunes and remove rocks and craters."""
     if faults.dunes_m == 0.0:
         return terrain
     dunes = REGULAR_DUNES.model_copy(update={"height_m": faults.dunes_m})
@@ -79,51 +79,52 @@ def faulty_terrain(faults: Faults, terrain: TerrainParameters) -> TerrainParamet
 
 
 def draw_clouds(faults: Faults, ground_m: float, rng: np.random.Generator) -> CloudLayer | None:
-    """Draw clouds whose shadows move over ground of this height; None without the fault."""
+    """Draw clouds whose shadows move over ground at this height; None without the cloud fault."""
     if faults.cloud_cover == 0.0:
         return None
     return CloudLayer.draw(CloudParameters(cover=faults.cloud_cover), rng, ground_m=ground_m)
 
 
-def faulty_times(faults: Faults, times_s: Sequence[float]) -> list[float]:
-    """True times of pictures due at these times."""
-    return [time + faults.late_s * (number == FAULTY_PICTURE) for number, time in enumerate(times_s)]
+def add_time_fault(faults: Faults, times_s: Sequence[float]) -> list[float]:
+    """Return the true exposure times of pictures commanded at these times."""
+    return [time + faults.late_s * (index == FAULTY_PICTURE) for index, time in enumerate(times_s)]
 
 
-def faulty_altitudes(faults: Faults, altitudes: Sequence[AltitudeMeasurement]) -> list[AltitudeMeasurement]:
-    """Altitudes with the faults' errors added to the instrument's."""
+def add_altitude_faults(faults: Faults, altitudes: Sequence[AltitudeMeasurement]) -> list[AltitudeMeasurement]:
+    """Add the faults' relative errors to measured altitudes."""
     errors = [faults.altitude_error + faults.altitude_error_once * (n == FAULTY_PICTURE) for n in range(len(altitudes))]
     return [
-        AltitudeMeasurement(one.altitude_m * (1.0 + error), one.time_s)
-        for one, error in zip(altitudes, errors, strict=True)
+        AltitudeMeasurement(altitude.altitude_m * (1.0 + error), altitude.time_s)
+        for altitude, error in zip(altitudes, errors, strict=True)
     ]
 
 
-def faulty_attitudes(
+def add_attitude_faults(
     faults: Faults, attitudes: Sequence[AttitudeMeasurement], rng: np.random.Generator
 ) -> list[AttitudeMeasurement]:
-    """Attitudes tilted about drawn horizontal axes: one of the common error, one of the single picture's error."""
-    axes = [np.array([np.cos(turn), np.sin(turn), 0.0]) for turn in rng.uniform(-np.pi, np.pi, 2)]
+    """Tilt attitudes about two drawn horizontal axes: one for the common error, one for the single picture's error."""
+    axes = [np.array([np.cos(azimuth), np.sin(azimuth), 0.0]) for azimuth in rng.uniform(-np.pi, np.pi, 2)]
     common = Rotation.from_rotvec(np.radians(faults.attitude_error_deg) * axes[0])
-    once = Rotation.from_rotvec(np.radians(faults.attitude_error_once_deg) * axes[1])
+    single = Rotation.from_rotvec(np.radians(faults.attitude_error_once_deg) * axes[1])
     return [
         AttitudeMeasurement(
-            (once if n == FAULTY_PICTURE else Rotation.identity()) * common * one.world_from_body, one.time_s
+            (single if n == FAULTY_PICTURE else Rotation.identity()) * common * attitude.world_from_body,
+            attitude.time_s,
         )
-        for n, one in enumerate(attitudes)
+        for n, attitude in enumerate(attitudes)
     ]
 
 
-#: Pictures of a descent as flown, the input of estimators without a stream.
-PICTURES = 3
+#: Number of pictures of an MER descent, and of the input of estimators that do not process a stream.
+TRIPLE_SIZE = 3
 
 
 class Location(Parameters):
     """Terrain and position of the descent."""
 
-    bank: Annotated[int, bounded_field(1, 100000, "terrains in the bank")] = 4
+    bank: Annotated[int, bounded_field(1, 100000, "number of terrains in the terrain bank")] = 4
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
-    terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
+    terrain: Annotated[int, Field(ge=0, description="index of the terrain in the bank")] = 0
     east_m: Annotated[float, Field(description="position of the first picture on the periodic terrain")] = 0.0
     north_m: Annotated[float, Field(description="position of the first picture on the periodic terrain")] = 0.0
 
@@ -145,21 +146,21 @@ class LanderParameters(Parameters):
     """The lander's shadow in its own pictures: a disc at the camera's position.
 
     The canopy's shadow dominates: 15.09 m nominal, inflated to 0.72 of that (Witkowski & Bruno 2003, MER parachute),
-    it covers the sun wholly. Backshell and lander, 2.65 m in diameter, cover a twentieth of it from 2 km and lie within
-    the canopy's shadow when the sun is high. The canopy's height of some 40 m above the camera, which moves its shadow
-    by 1 deg of the view, is not modelled: the zero-phase spot that DIMES masks is 4 deg in radius.
+    it covers the whole sun. Backshell and lander, 2.65 m in diameter, cover 1/20 of the sun from 2 km; their shadow
+    lies inside the canopy's when the sun is high. The canopy is about 40 m above the camera, which moves its shadow by
+    1 deg of the view. This is not modelled: the zero-phase spot that DIMES masks is 4 deg in radius.
     """
 
-    caster_diameter_m: Annotated[float, bounded_field(0.0, 100.0, "disc that casts the lander's shadow")] = 10.9
+    caster_diameter_m: Annotated[float, bounded_field(0.0, 100.0, "diameter of the shadow disc")] = 10.9
 
 
 class LandingParameters(Parameters):
-    """Landing with the estimate (`marsyard.scenarios.descent.score.touchdown`); values but the burn's are assumed."""
+    """Landing with the estimate (`descent.score.compute_touchdown`); all values except the burn's are assumed."""
 
     computation_s: Annotated[float, bounded_field(0.0, 1000.0, "time to the answer on the flight computer")] = 14.0
-    processor_factor: Annotated[float, Field(gt=0.0, le=1e6, description="flight computer over host (assumed)")] = 600.0
-    min_steered_m_s: Annotated[float, bounded_field(0.0, 100.0, "speed up to which the thrusters do not steer")] = 5.0
-    max_steered_m_s: Annotated[float, bounded_field(0.0, 100.0, "steering limit: 80 m/s burn tilted by 15 deg")] = 20.0
+    processor_factor: Annotated[float, Field(gt=0.0, le=1e6, description="run time, flight / host (assumed)")] = 600.0
+    steering_deadband_m_s: Annotated[float, bounded_field(0.0, 100.0, "no steering up to this horizontal speed")] = 5.0
+    max_steering_m_s: Annotated[float, bounded_field(0.0, 100.0, "steering limit: 80 m/s burn tilted by 15 deg")] = 20.0
     steering_error: Annotated[float, bounded_field(0.0, 1.0, "RMS relative error of the steering per axis")] = 0.1
     burn_error_m_s: Annotated[float, bounded_field(0.0, 50.0, "RMS of the burn's velocity error per axis")] = 1.0
 
@@ -167,21 +168,19 @@ class LandingParameters(Parameters):
 class CameraParameters(Parameters):
     """The descent camera: 14.67 mm, 12 um pixels, 45 deg; distortion of an Opportunity navcam (its PDS label).
 
-    A user's own `model` replaces focal length, pixels and distortion.
+    A custom camera `model` replaces focal length, pixels and distortion.
     """
 
-    model: Annotated[CustomCameraChoice | None, Field(description="own camera: path of its file, or table")] = None
+    model: Annotated[CustomCameraChoice | None, Field(description="custom camera: file path, or table")] = None
     focal_length_mm: Annotated[float, Field(gt=1.0, le=1000.0)] = 14.67
     pixel_pitch_um: Annotated[float, Field(gt=0.5, le=100.0)] = 12.0
     columns: Annotated[int, Field(ge=64, le=4096)] = 1024
     rows: Annotated[int, Field(ge=64, le=4096)] = 1024
-    radial_0: Annotated[float, bounded_field(-0.1, 0.1, "first term of CAHVOR's R")] = 0.00096
-    radial_1: Annotated[float, bounded_field(-0.5, 0.5, "second term of CAHVOR's R")] = -0.002183
-    radial_2: Annotated[float, bounded_field(-0.5, 0.5, "third term of CAHVOR's R")] = 0.018547
+    radial_0: Annotated[float, bounded_field(-0.1, 0.1, "radial distortion R0 (CAHVOR)")] = 0.00096
+    radial_1: Annotated[float, bounded_field(-0.5, 0.5, "radial distortion R1 (CAHVOR)")] = -0.002183
+    radial_2: Annotated[float, bounded_field(-0.5, 0.5, "radial distortion R2 (CAHVOR)")] = 0.018547
     alignment_error_deg: Annotated[float, bounded_field(0.0, 10.0, "RMS error of the mounting per axis")] = 0.02
-    focal_error: Annotated[float, bounded_field(0.0, 0.05, "RMS relative error of the calibrated focal length")] = (
-        0.0002
-    )
+    focal_error: Annotated[float, bounded_field(0.0, 0.05, "RMS relative error of the focal length")] = 0.0002
     centre_error_px: Annotated[float, bounded_field(0.0, 50.0, "RMS error of the calibrated centre, full-frame")] = 0.5
     distortion_error_px: Annotated[float, bounded_field(0.0, 50.0, "RMS error of the distortion in the corners")] = 0.3
 
@@ -189,7 +188,7 @@ class CameraParameters(Parameters):
 class RenderParameters(Parameters):
     """Rendering of the pictures."""
 
-    backend: Backend = Field(default_factory=default_backend, description="library that provides OpenGL's context")
+    backend: Backend = Field(default_factory=default_backend, description="OpenGL context provider")
 
 
 Flight = Annotated[
@@ -205,8 +204,8 @@ Altimeter = Annotated[
 class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     """Parameters of a descent campaign.
 
-    A `site` sets light, gravity, texture and rocks; keys of the table `terrain` change the site's own terrain. A site
-    belongs to a campaign, not to a case: it is merged into `terrain` when the campaign is read, and not dispersed.
+    A `site` sets light, gravity, texture and rocks; keys of the table `terrain` override the site's terrain. The
+    site is the same in all cases: it is merged into `terrain` when the campaign is read, and cannot be dispersed.
     """
 
     task = VELOCITY
@@ -214,30 +213,30 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
 
     site: Annotated[
         str | None,
-        check_site("a descent", "descent"),
-        Field(description="preset of terrain, light and gravity; none: a plain terrain"),
+        site_validator("a descent", "descent"),
+        Field(description="preset of terrain, light and gravity; none: generic terrain"),
     ] = None
     terrain_site: Annotated[str | None, Field(description="site of the terrain; filled in with `site`, not set")] = None
     location: Location = Location()
     terrain: CheckedTerrain = TerrainParameters()
-    meshes: Annotated[tuple[MeshParameters, ...], Field(description="own bodies on the ground")] = ()
+    meshes: Annotated[tuple[MeshParameters, ...], Field(description="custom objects on the ground")] = ()
     sun: SunParameters = SunParameters()
     descent: SwingParameters = SwingParameters()
-    pictures: Annotated[int, bounded_field(2, 100, "pictures, descent.interval_s apart; a stream gets all")] = PICTURES
-    #: By default the last picture and two others, as far apart as possible at equal intervals.
-    triple: Annotated[tuple[int, int, int] | None, Field(description="numbers of the three used, from 1")] = None
-    flight: Annotated[Flight | None, Field(description="recorded flight or own motion instead of the dynamics")] = None
+    pictures: Annotated[int, bounded_field(2, 100, "number, every descent.interval_s; a stream gets all")] = TRIPLE_SIZE
+    #: Default: the last picture and two earlier ones, at the longest possible equal intervals.
+    triple: Annotated[tuple[int, int, int] | None, Field(description="picture numbers of the triple, from 1")] = None
+    flight: Annotated[Flight | None, Field(description="recorded flight or custom motion")] = None
     lander: LanderParameters = LanderParameters()
     camera: CameraParameters = CameraParameters()
     faults: Faults = Faults()
-    algorithm: Annotated[str, Field(description="dimes, phase-correlation, homography, or your own")] = "dimes"
+    algorithm: Annotated[str, Field(description="dimes, phase-correlation, homography, or custom")] = "dimes"
     dimes: Annotated[DimesOptions, Field(description="options of DIMES")] = DimesOptions()
     detector: DetectorChoice = DetectorParameters()
     imu: ImuParameters = ImuParameters()
     approach: ApproachParameters = ApproachParameters()
     altimeter: Altimeter = RadarParameters()
-    attitude_source: Annotated[CustomAttitudeSource | None, Field(description="own source of attitudes")] = None
-    clock: Annotated[ClockParameters, Field(description="of the pictures' time tags")] = ClockParameters(
+    attitude_source: Annotated[CustomAttitudeSource | None, Field(description="custom source of attitudes")] = None
+    clock: Annotated[ClockParameters, Field(description="clock of the pictures' time tags")] = ClockParameters(
         offset_sd_s=0.001, jitter_sd_s=0.0005
     )
     landing: LandingParameters = LandingParameters()
@@ -245,70 +244,68 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
 
     @model_validator(mode="before")
     @classmethod
-    def _complete_terrain(cls, stated: Any) -> Any:
-        name = stated.get("site") if isinstance(stated, Mapping) else None
+    def _complete_terrain(cls, settings: Any) -> Any:
+        name = settings.get("site") if isinstance(settings, Mapping) else None
         if not isinstance(name, str) or getattr(sites().get(name), "descent", None) is None:
-            return stated
-        changes = stated.get("terrain", {})
+            return settings
+        changes = settings.get("terrain", {})
         if not isinstance(changes, Mapping):
-            return stated
-        of_site = site(name).terrain("descent").model_dump()
-        return {"terrain_site": name, **stated, "terrain": merge_settings(of_site, changes)}
+            return settings
+        site_terrain = site(name).terrain("descent").model_dump()
+        return {"terrain_site": name, **settings, "terrain": merge_settings(site_terrain, changes)}
 
     @model_validator(mode="after")
     def _check_consistency(self) -> DescentScenarioParameters:
         """Check terrain, binning, selected pictures and flight.
 
-        A terrain merged for one site must not be lit as another's. Pictures are binned to DIMES' size, as each case
+        Terrain and light must come from the same site. Pictures must be divisible into DIMES' bins because each case
         reports DIMES' feasible overlap.
         """
         if self.terrain_site != self.site:
-            raise ValueError(f"site is {self.site}, but the terrain is of {self.terrain_site}; a site is not dispersed")
+            raise ValueError(f"site is {self.site}, but terrain is of {self.terrain_site}; `site` cannot be dispersed")
         camera: CameraParameters | CustomCamera = self.camera if self.camera.model is None else self.camera.model
         columns, rows = camera.columns, camera.rows
         if rows % self.detector.rows_summed:
-            raise ValueError(
-                f"detector.rows_summed {self.detector.rows_summed} does not divide the camera's {rows} rows"
-            )
+            raise ValueError(f"detector.rows_summed {self.detector.rows_summed} does not divide the {rows} camera rows")
         check_binning(self.dimes.binned_size, (columns, rows // self.detector.rows_summed))
         if self.triple is not None and not 1 <= self.triple[0] < self.triple[1] < self.triple[2] <= self.pictures:
             raise ValueError(f"triple is {list(self.triple)}; allowed: three in ascending order, 1 to {self.pictures}")
-        if self.pictures < PICTURES:
-            of_three = [spec for spec in self.algorithms if VELOCITY.takes_stream(spec) is False]
-            if of_three:
+        if self.pictures < TRIPLE_SIZE:
+            specs = [spec for spec in self.algorithms if VELOCITY.takes_stream(spec) is False]
+            if specs:
                 raise ValueError(
-                    f"pictures is {self.pictures}, but '{of_three[0]}' takes {PICTURES}; allowed: {PICTURES} to 100"
+                    f"pictures is {self.pictures}, but '{specs[0]}' needs {TRIPLE_SIZE}; allowed: {TRIPLE_SIZE} to 100"
                 )
         affected = max(self.faults.repeated_picture, self.faults.black_picture)
         if affected > self.pictures:
-            raise ValueError(f"a fault strikes picture {affected}, but pictures is {self.pictures}")
+            raise ValueError(f"a fault affects picture {affected}, but the descent has only {self.pictures} pictures")
         if isinstance(self.flight, FlightFile):
-            self.flight.check(faulty_times(self.faults, self.picture_times_s))
+            self.flight.check(add_time_fault(self.faults, self.picture_times_s))
         return self
 
     @property
     def picture_times_s(self) -> list[float]:
-        """Nominal times of the pictures after the first."""
+        """Nominal picture times relative to the first picture."""
         return [number * self.descent.interval_s for number in range(self.pictures)]
 
     @property
     def triple_indices(self) -> tuple[int, int, int] | None:
-        """Indices of the pictures for estimators of three; None where fewer are taken."""
+        """Indices of the pictures for estimators that process a triple; None if there are fewer than three pictures."""
         if self.triple is not None:
             return self.triple[0] - 1, self.triple[1] - 1, self.triple[2] - 1
-        if self.pictures < PICTURES:
+        if self.pictures < TRIPLE_SIZE:
             return None
-        last, apart = self.pictures - 1, (self.pictures - 1) // 2
-        return last - 2 * apart, last - apart, last
+        last, spacing = self.pictures - 1, (self.pictures - 1) // 2
+        return last - 2 * spacing, last - spacing, last
 
     @property
     def preset(self) -> Site | None:
-        """The site; None for a plain terrain."""
+        """The site; None for a generic terrain."""
         return None if self.site is None else site(self.site)
 
 
 def check_binning(binned: tuple[int, int], delivered: tuple[int, int]) -> None:
-    """Raise ValueError where DIMES cannot bin a delivered picture (columns, rows) to a size."""
+    """Raise ValueError if DIMES cannot bin a delivered picture to this size; both are (columns, rows)."""
     if delivered[0] % binned[0] or delivered[1] % binned[1]:
         raise ValueError(
             f"dimes.binned_size {list(binned)} does not divide the delivered picture of {delivered[0]} x "
@@ -317,6 +314,6 @@ def check_binning(binned: tuple[int, int], delivered: tuple[int, int]) -> None:
 
 
 def binned_size_for(columns: int, rows: int) -> tuple[int, int]:
-    """Binned size for DIMES: square blocks that leave at least, and about, 256 columns."""
+    """Return a binned size for DIMES: square bins, and the smallest possible width of at least 256 columns."""
     factors = [f for f in range(1, max(columns // 256, 1) + 1) if columns % f == 0 and rows % f == 0]
     return columns // factors[-1], rows // factors[-1]

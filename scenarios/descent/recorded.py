@@ -1,4 +1,4 @@
-"""Recorded flight from a file, in place of the simulated dynamics: `[parameters.flight]` of a descent campaign."""
+"""Recorded flight from a file, instead of the simulated dynamics: `[parameters.flight]` of a descent campaign."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class FlightFile(UserFile, RecordedAxes):
     """A recorded flight: a CSV, Parquet, TUM or EuRoC file of poses, or SPICE kernels.
 
     Positions are the camera's, or with `lever_m` the vehicle's. The first picture is at the file's time
-    `first_picture_s`; others follow every `descent.interval_s`. Instruments measure it like a simulated one.
+    `first_picture_s`; others follow every `descent.interval_s`. Instruments measure it like a simulated flight.
     """
 
     origin: Annotated[
@@ -30,14 +30,14 @@ class FlightFile(UserFile, RecordedAxes):
         Field(description="origin of positions: ground at `place`, or the terrain's origin"),
     ] = "place"
     first_picture_s: Annotated[
-        float | None, Field(description="file's time of the first picture; default: `lead_s` after its beginning")
+        float | None, Field(description="file's time of the first picture; default: file's start + `lead_s`")
     ] = None
-    lead_s: Annotated[float, bounded_field(0.2, 30.0, "start of the navigation before the first picture")] = 5.0
+    lead_s: Annotated[float, bounded_field(0.2, 30.0, "navigation time before the first picture")] = 5.0
     turn_deg: Annotated[float, bounded_field(-720.0, 720.0, "rotation about the vertical, clockwise from above")] = 0.0
 
     @classmethod
     def file_hash(cls, file: str) -> str:
-        """SHA-256 of the file; its poses are checked."""
+        """Check the poses of the file and return its SHA-256."""
         return read_poses(file).sha256
 
     @property
@@ -48,7 +48,7 @@ class FlightFile(UserFile, RecordedAxes):
         return float(read_poses(self.file).times_s[0]) + self.lead_s
 
     def check(self, pictures_s: Sequence[float]) -> None:
-        """Raise ValueError where the flight does not cover the pictures, looks up, or is below the ground at one."""
+        """Raise ValueError if the flight does not cover the pictures, or its camera looks up or is below the ground."""
         motion = self.motion(np.zeros(3), 0.0)
         first, last = motion.span_s
         if first > -self.lead_s + 1e-9 or last < max(pictures_s) + AFTER_S:
@@ -63,27 +63,27 @@ class FlightFile(UserFile, RecordedAxes):
             if self.origin == "place" and position[2] <= 0.0:
                 raise TrajectoryFileError(
                     f"{self.file}: at picture {number} the camera is {-position[2]:.1f} m below the ground at the "
-                    'place; allowed: above it (origin = "terrain" counts heights as the terrain does)'
+                    'place; allowed: above it (with origin = "terrain", heights refer to the terrain\'s origin)'
                 )
 
     def motion(self, ground_m: Float64[np.ndarray, "3"], gravity_m_s2: float) -> RecordedMotion:
-        """The flight in the terrain's world, time 0 at the first picture; `ground_m` is the ground at the place."""
+        """Transform the flight to world axes, time 0 at the first picture; `ground_m` is the ground below it."""
         poses = read_poses(self.file)
         world = Rotation.from_rotvec(np.radians(-self.turn_deg) * np.array([0.0, 0.0, 1.0])) * self.world
         recorded = world * Rotation.from_quat(poses.quaternions)
-        positions = world.apply(poses.positions_m) + self.levers(recorded)
+        positions = world.apply(poses.positions_m) + self.lever_arms(recorded)
         if self.origin == "place":
             positions = positions + ground_m
-        return RecordedMotion(poses.times_s - self.start_s, positions, self.bodies(recorded), gravity_m_s2)
+        return RecordedMotion(poses.times_s - self.start_s, positions, self.body_attitudes(recorded), gravity_m_s2)
 
 
 def check_looks_down(name: str, motion: RecordedMotion, pictures_s: Sequence[float]) -> None:
-    """Raise TrajectoryFileError where the camera of the named flight looks up at a picture."""
+    """Raise TrajectoryFileError if the camera of the flight looks up at a picture; `name` is used in the message."""
     for number, attitude in enumerate(motion.motion(np.array(pictures_s)).attitudes, start=1):
         axis = attitude.apply(np.array([0.0, 0.0, -1.0]))
         if axis[2] >= 0.0:
             elevation = np.degrees(np.arcsin(np.clip(axis[2], -1.0, 1.0)))
             raise TrajectoryFileError(
                 f"{name}: at picture {number} the camera looks up, {elevation:.1f} deg above the horizon; "
-                "allowed: down (flight.axes, attitude_of and mounting say whose axes are meant)"
+                "allowed: down (flight.axes, attitude_of and mounting define the axes)"
             )

@@ -13,23 +13,23 @@ from pydantic import BaseModel
 from marsyard.algorithms.dimes import DimesDetails
 from marsyard.scenarios.algorithm_run import case_result
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
-from marsyard.scenarios.conditions import deliver, faulty_detector, hash_images, picture_columns
+from marsyard.scenarios.conditions import add_detector_faults, corrupt_images, hash_images, image_columns
 from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, picture_states, true_velocity
 from marsyard.scenarios.descent.measurement import Instruments, measure
-from marsyard.scenarios.descent.parameters import DescentScenarioParameters, faulty_terrain
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_terrain_fault
 from marsyard.scenarios.descent.score import (
     Pictures,
+    compute_touchdown,
     conditions,
     feasible_overlap_row,
     instrument_errors,
     propagate_to_firing,
-    touchdown,
 )
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import Optics, Sample, pixel_sample
 from marsyard.scenarios.interface import CaseResult, Scalar
-from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, Kind
+from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, PartKind
 from marsyard.scenarios.parts.scores import ScoredDescent, compute_scores
 from marsyard.scenarios.velocity import (
     Horizontal,
@@ -54,7 +54,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
     name = "descent"
     parameters_type = DescentScenarioParameters
     task = VELOCITY
-    part_keys: Mapping[str, Kind] = {
+    part_keys: Mapping[str, PartKind] = {
         "flight.motion": DYNAMICS,
         "altimeter.instrument": INSTRUMENT,
         "attitude_source.instrument": INSTRUMENT,
@@ -62,29 +62,29 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
     }
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Numbers of the bank's terrains."""
+        """Return the indices of the terrains in the terrain bank."""
         return tuple(range(self.check_parameters(parameters).location.bank))
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
-        """The terrain below the descent; none with dunes of a fault, which are not in the bank."""
+        """Return the terrain below the descent; empty with the dune fault, because that terrain is not in the bank."""
         p = self.check_parameters(parameters)
-        return (p.location.terrain,) if faulty_terrain(p.faults, p.terrain) == p.terrain else ()
+        return (p.location.terrain,) if add_terrain_fault(p.faults, p.terrain) == p.terrain else ()
 
     def input_terrain(self, p: DescentScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
-        """A terrain of the bank."""
+        """Return the terrain bank and the index of a terrain in it."""
         return TerrainBank(p.terrain, p.location.bank_seed), shared_input
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
-        """Pictures of a case without delivery faults, with the truth of their pixels."""
+        """Yield the pictures of a case without delivery faults, with the ground truth of their pixels."""
         p = self.check_parameters(parameters)
-        world = World.of(p)
+        world = World.from_parameters(p)
         states = picture_states(p, create_flight(p, world.surface, streams))
         optics = camera_optics(p.camera)
         camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
-        exposed = take_exposures(p, world, states, optics, draw_detector(p, optics, streams), streams)
-        for state, (counts, frame) in zip(states, exposed, strict=True):
+        exposures = take_exposures(p, world, states, optics, draw_detector(p, optics, streams), streams)
+        for state, (counts, frame) in zip(states, exposures, strict=True):
             pose = frame.world_from_body
-            about: dict[str, Any] = {
+            metadata: dict[str, Any] = {
                 "site": p.site or "plain",
                 "time_s": state.time_s,
                 # the camera's axes are the body's, rotated by the alignment error
@@ -93,7 +93,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
                 "velocity_m_s": state.velocity_m_s.tolist(),
                 "sun_direction": world.sun.direction.tolist(),
             }
-            yield pixel_sample(counts, frame, p.detector, camera, about)
+            yield pixel_sample(counts, frame, p.detector, camera, metadata)
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Simulate one descent and score all algorithms."""
@@ -104,14 +104,14 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
             **conditions(p, descent.world, descent.states, descent.at_firing, descent.instruments),
             **instrument_errors(descent.world, descent.states, descent.measurements),
             **descent.flight.row,
-            **picture_columns(p.render.backend, hash_images(descent.pictures)),
+            **image_columns(p.render.backend, hash_images(descent.pictures)),
         }
         return case_result(p.algorithms, lambda algorithm: _score_algorithm(descent, algorithm, shared), shared)
 
 
 def draw_detector(p: DescentScenarioParameters, optics: Optics, streams: Streams) -> Detector:
-    """Draw the pixel response of a case's detector, its faults included."""
-    settings = faulty_detector(p.faults, p.detector)
+    """Draw the detector of a case: pixel response and faults."""
+    settings = add_detector_faults(p.faults, p.detector)
     return Detector.draw(optics.fall_off, settings, streams.generator("detector response"))
 
 
@@ -119,8 +119,8 @@ def draw_detector(p: DescentScenarioParameters, optics: Optics, streams: Streams
 class Descent:
     """A simulated descent and its measurements.
 
-    - states, pictures: truth at the pictures, and the pictures as delivered
-    - overlap: columns of `feasible_overlap_row`, empty without three pictures
+    - states, pictures: true states at the pictures, and the delivered pictures
+    - overlap: columns of `feasible_overlap_row`, empty if there are fewer than three pictures
     """
 
     p: DescentScenarioParameters
@@ -135,21 +135,21 @@ class Descent:
 
     @classmethod
     def simulate(cls, p: DescentScenarioParameters, streams: Streams) -> Descent:
-        """Simulate a case."""
-        world = World.of(p)
+        """Simulate the descent of a case and its measurements."""
+        world = World.from_parameters(p)
         flight = create_flight(p, world.surface, streams)
         states = picture_states(p, flight)
         optics = camera_optics(p.camera)
         detector = draw_detector(p, optics, streams)
-        exposed = take_exposures(p, world, states, optics, detector, streams)
-        pictures = deliver([counts for counts, _ in exposed], p.faults.repeated_picture, p.faults.black_picture)
+        images = [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
+        pictures = corrupt_images(images, p.faults.repeated_picture, p.faults.black_picture)
         instruments = Instruments.draw(p, world, flight, streams)
         measurements = measure(p, world, flight.motion, pictures, detector, instruments, streams)
         overlap: Mapping[str, Scalar] = {}
         if p.triple_indices is not None:
-            three = [states[index] for index in p.triple_indices]
+            triple = [states[index] for index in p.triple_indices]
             camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
-            overlap = feasible_overlap_row(three, world, camera, detector.calibration, p.dimes)
+            overlap = feasible_overlap_row(triple, world, camera, detector.calibration, p.dimes)
         return cls(p, streams, world, flight, instruments, states, pictures, measurements, overlap)
 
     @cached_property
@@ -158,46 +158,46 @@ class Descent:
         return self.flight.motion.state(self.flight.firing_s)
 
     def truth(self, span_s: Span) -> Horizontal:
-        """True horizontal velocity over a span of time tags."""
+        """Compute the true horizontal velocity over a span of time tags."""
         return true_velocity(self.flight.motion, self.states, self.measurements.tags_s, span_s)
 
 
 def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scalar]) -> CaseResult:
-    p, firing, measurements = descent.p, descent.at_firing, descent.measurements
-    make = partial(VELOCITY.make, algorithm, p.dimes, p.executable, descent.streams.case)
-    attempt = run_estimator(make, measurements, p.triple_indices)
-    estimate = attempt.answer
+    p, state_at_firing, measurements = descent.p, descent.at_firing, descent.measurements
+    create_estimator = partial(VELOCITY.make, algorithm, p.dimes, p.executable, descent.streams.case)
+    algorithm_run = run_estimator(create_estimator, measurements, p.triple_indices)
+    estimate = algorithm_run.answer
     velocity = None if estimate is None else estimate.velocity_m_s
-    true = descent.truth((estimate and estimate.span_s) or measurements.last_interval_s)
-    propagated = propagate_to_firing(estimate, descent.instruments, firing.time_s)
-    available_s, at_firing = firing.time_s - descent.states[-1].time_s, firing.velocity_m_s[:2]
-    landed = touchdown(p.landing, at_firing, propagated, available_s, descent.streams.generator("landing"))
+    truth = descent.truth((estimate and estimate.span_s) or measurements.last_interval_s)
+    propagated = propagate_to_firing(estimate, descent.instruments, state_at_firing.time_s)
+    available_s, firing_truth = state_at_firing.time_s - descent.states[-1].time_s, state_at_firing.velocity_m_s[:2]
+    landing = compute_touchdown(p.landing, firing_truth, propagated, available_s, descent.streams.generator("landing"))
     row = {
-        **velocity_row("velocity", velocity, true),
-        **consistency_row(estimate, true),
-        **velocity_row("firing_velocity", propagated, at_firing),
-        "touchdown_speed_corrected_m_s": float(np.hypot(*landed.with_answer)),
-        "touchdown_speed_uncorrected_m_s": float(np.hypot(*landed.without_answer)),
-        "answer_punctual": landed.punctual,
-        # the measured computation time, scaled to the flight computer
-        "answer_in_time": p.landing.processor_factor * float(attempt.row["estimation_time_s"]) <= available_s,
+        **velocity_row("velocity", velocity, truth),
+        **consistency_row(estimate, truth),
+        **velocity_row("firing_velocity", propagated, firing_truth),
+        "touchdown_speed_corrected_m_s": float(np.hypot(*landing.with_answer)),
+        "touchdown_speed_uncorrected_m_s": float(np.hypot(*landing.without_answer)),
+        "in_time_assumed": landing.is_in_time,
+        # measured computation time, scaled to the flight computer
+        "in_time_measured": p.landing.processor_factor * float(algorithm_run.row["estimation_time_s"]) <= available_s,
         **stream_row(estimate, descent.truth),
-        **attempt.row,
+        **algorithm_run.row,
     }
     if estimate is not None:
         case = ScoredDescent(
             measurements=measurements,
             answer=estimate,
-            true_velocity_m_s=true,
+            true_velocity_m_s=truth,
             states=tuple(descent.states),
             motion=descent.flight.motion,
-            at_firing=firing,
-            touchdown_m_s=landed.with_answer,
+            at_firing=state_at_firing,
+            touchdown_m_s=landing.with_answer,
         )
         row |= compute_scores(p.scores, case, {*row, *shared})
-    # figures show the three pictures of DIMES' input, or all of other algorithms
+    # figures show the three input pictures of DIMES, or all pictures of other algorithms
     is_dimes = estimate is not None and isinstance(estimate.details, DimesDetails)
-    shown = p.triple_indices if is_dimes and p.triple_indices is not None else range(len(descent.pictures))
-    pictures = [descent.pictures[index] for index in shown]
-    products = {**velocity_products(pictures, estimate, true), **stream_products(estimate, descent.truth)}
-    return algorithm_result(attempt, velocity is not None, row, products)
+    indices = p.triple_indices if is_dimes and p.triple_indices is not None else range(len(descent.pictures))
+    pictures = [descent.pictures[index] for index in indices]
+    products = {**velocity_products(pictures, estimate, truth), **stream_products(estimate, descent.truth)}
+    return algorithm_result(algorithm_run, velocity is not None, row, products)

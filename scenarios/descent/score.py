@@ -35,66 +35,66 @@ PATCH_M = 200.0
 class Touchdown:
     """Horizontal touchdown velocities of the same descent with and without the estimate, m/s.
 
-    - punctual: the estimate is available at the rockets' firing by the assumed computation time
+    - is_in_time: with the assumed computation time, the estimate is available before the rockets fire
     """
 
     with_answer: Horizontal
     without_answer: Horizontal
-    punctual: bool
+    is_in_time: bool
 
 
-def touchdown(
+def compute_touchdown(
     p: LandingParameters,
     true_m_s: Horizontal,
-    believed_m_s: Horizontal | None,
+    estimated_m_s: Horizontal | None,
     available_s: float,
     rng: np.random.Generator,
 ) -> Touchdown:
     """Compute touchdown velocities with a simple model of MER's last seconds; `rng` draws errors of burn and steering.
 
-    Near 100 m solid rockets in the backshell stop the fall; small rockets next to them (TIRS) can tilt the backshell
-    first, so that the burn has a horizontal component. The lander keeps its horizontal velocity at the rockets' firing,
+    Solid rockets in the backshell stop the fall near 100 m; small rockets next to them (TIRS) can tilt the backshell
+    first to give the burn a horizontal component. The lander keeps its horizontal velocity at the rockets' firing,
     and the burn adds an error. If an estimate is available in time and large enough, the burn is steered against the
-    velocity that the inertial unit has propagated from it, up to the limit of the tilt. Without an estimate the burn is
-    not steered. Swinging and wind during the burn's three seconds are not modelled. Steering depends on an assumed
-    computation time, so that rows are reproducible bit for bit.
+    estimate, which the inertial unit has propagated to the firing, up to the tilt limit. Otherwise the burn is not
+    steered. Swinging and wind during the burn's three seconds are not modelled. The computation time is an assumed
+    constant, so that rows are reproducible bit for bit.
 
     - true_m_s: horizontal velocity of the lander at the rockets' firing
-    - believed_m_s: the estimate, propagated to that time by the inertial unit; None without an estimate
+    - estimated_m_s: the estimate, propagated to that time by the inertial unit; None without an estimate
     - available_s: time from the last picture to the firing
     """
     burn, steering = p.burn_error_m_s * rng.standard_normal(2), p.steering_error * rng.standard_normal(2)
     unsteered = true_m_s + burn
-    punctual = p.computation_s <= available_s
-    speed = 0.0 if believed_m_s is None else float(np.hypot(*believed_m_s))
-    if believed_m_s is None or not punctual or speed <= p.min_steered_m_s:
-        return Touchdown(unsteered, unsteered, punctual)
-    removed = believed_m_s * min(1.0, p.max_steered_m_s / speed)
-    return Touchdown(unsteered - removed + steering * np.hypot(*removed), unsteered, punctual)
+    is_in_time = p.computation_s <= available_s
+    speed = 0.0 if estimated_m_s is None else float(np.hypot(*estimated_m_s))
+    if estimated_m_s is None or not is_in_time or speed <= p.steering_deadband_m_s:
+        return Touchdown(unsteered, unsteered, is_in_time)
+    correction = estimated_m_s * min(1.0, p.max_steering_m_s / speed)
+    return Touchdown(unsteered - correction + steering * np.hypot(*correction), unsteered, is_in_time)
 
 
 def propagate_to_firing(
     estimate: VelocityEstimate | None, instruments: Instruments, firing_s: float
 ) -> Horizontal | None:
-    """The estimate, propagated to the thrusters' firing by the inertial unit; None without an estimate."""
+    """Propagate the estimate to the thrusters' firing with the inertial unit; None without an estimate."""
     if estimate is None or estimate.velocity_m_s is None or estimate.span_s is None:
         return None
     navigation, span = instruments.navigation, np.array(estimate.span_s)
     is_instant = estimate.span_s[0] == estimate.span_s[1]
-    then = (navigation.velocity(span) if is_instant else navigation.mean_velocities(span))[0]
-    now = navigation.velocity(np.array([firing_s]))[0]
-    return propagate_velocity(estimate.velocity_m_s, then[:2], now[:2])
+    start = (navigation.velocity(span) if is_instant else navigation.mean_velocities(span))[0]
+    end = navigation.velocity(np.array([firing_s]))[0]
+    return propagate_velocity(estimate.velocity_m_s, start[:2], end[:2])
 
 
 def conditions(
     p: DescentScenarioParameters, world: World, states: Sequence[State], at_firing: State, instruments: Instruments
 ) -> dict[str, Scalar]:
-    """Columns of the case's conditions, from the simulated objects, and of the user's own instruments.
+    """Compute the columns of a case's conditions: true states, flight azimuth before entry, IMU temperature change.
 
-    Before entry: the azimuth of flight. Of the inertial unit: the change of temperature.
+    The columns of custom instruments are included.
     """
     approach = instruments.approach
-    entry = -approach.attitudes(np.array([approach.start_s])).as_matrix()[0, :, 2]
+    entry_direction = -approach.attitudes(np.array([approach.start_s])).as_matrix()[0, :, 2]
     heights = height_above_ground(world.surface, np.stack([state.position_m for state in states]))
     row: dict[str, Scalar] = {
         "site": p.site or "plain",
@@ -114,17 +114,18 @@ def conditions(
         row[f"attitude_rate_{number}_deg_s"] = attitude_rate_deg_s(state)
     row["off_nadir_max_deg"] = max(off_nadir_deg(state) for state in states)
     row["attitude_rate_max_deg_s"] = max(attitude_rate_deg_s(state) for state in states)
-    row["approach_heading_deg"] = float(np.degrees(np.arctan2(entry[0], entry[1])) % 360.0)
+    row["approach_heading_deg"] = float(np.degrees(np.arctan2(entry_direction[0], entry_direction[1])) % 360.0)
     row["imu_warm_up_change_k"] = float(instruments.imu.gyro.warm_up.temperature_k(np.array([np.inf]))[0])
     return {**row, **instruments.row}
 
 
 def instrument_errors(world: World, states: Sequence[State], measurements: DescentMeasurements) -> dict[str, Scalar]:
-    """Columns of measurement errors, divided into a part common to the pictures and each picture's own part.
+    """Compute the columns of measurement errors, split into a part common to all pictures and an independent part.
 
-    The common attitude error is the mean of the pictures' rotation vectors (world axes), the own part the RMS length of
-    the residuals; relative altitude errors likewise. Altitudes are those at the pictures, over the ground straight
-    below, so that closer relief in the radar's beam is an error. The velocity change is between the last two intervals.
+    The common attitude error is the mean of the pictures' rotation vectors (world axes); the independent part is the
+    RMS length of the residuals. Relative altitude errors are split likewise. True altitudes are heights above the
+    ground directly below; closer relief in the radar beam is an error. Velocity changes are between the last two
+    intervals.
     """
     rotations = np.stack(
         [
@@ -139,10 +140,10 @@ def instrument_errors(world: World, states: Sequence[State], measurements: Desce
         np.diff(velocities[:, :2], axis=0)
         for velocities in (mean_velocities(states), measurements.interval_velocities_m_s)
     )
-    own_rotations = rotations - rotations.mean(axis=0)
+    residuals = rotations - rotations.mean(axis=0)
     row: dict[str, Scalar] = {
         "attitude_error_common_deg": float(np.degrees(np.linalg.norm(rotations.mean(axis=0)))),
-        "attitude_error_independent_deg": float(np.degrees(np.sqrt(np.mean(np.sum(own_rotations**2, axis=1))))),
+        "attitude_error_independent_deg": float(np.degrees(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))),
         "altitude_error_common": float(relative.mean()),
         "altitude_error_independent": float(np.sqrt(np.mean((relative - relative.mean()) ** 2))),
     }
@@ -158,10 +159,10 @@ def instrument_errors(world: World, states: Sequence[State], measurements: Desce
 def feasible_overlap_row(
     states: Sequence[State], world: World, camera: CameraModel, calibration: DetectorCalibration, options: DimesOptions
 ) -> dict[str, Scalar]:
-    """Columns of the feasible overlap of three pictures: DIMES' grid points at which template and search area fit.
+    """Count the grid points of the feasible overlap of three pictures: template and search window of DIMES fit there.
 
-    Attitudes, times, altitudes and camera are the true ones; as in DIMES the zero-phase spot is excluded. Without a
-    point in either pair of pictures the geometry makes DIMES fail.
+    Attitudes, times, altitudes and camera are the true ones. As in DIMES, the zero-phase spot is excluded. If a pair
+    of pictures has no such point, the geometry makes DIMES fail.
     """
     columns, rows = bin_factors(camera.size[::-1], options.binned_size)
     samples = PATCH_M / world.surface.spacing_m
@@ -170,12 +171,12 @@ def feasible_overlap_row(
     views = []
     for state in states:
         altitude_m = float(state.position_m[2] - world.surface.height(state.position_m[0], state.position_m[1], level))
-        placed, centre = place_camera(camera.bin(columns, rows), state.attitude, altitude_m)
-        views.append(View(blank, blank, placed, centre, state.time_s, calibration, calibration.rows_summed * rows))
+        model, centre = place_camera(camera.bin(columns, rows), state.attitude, altitude_m)
+        views.append(View(blank, blank, model, centre, state.time_s, calibration, calibration.rows_summed * rows))
     sun = world.sun.direction
     first, second = (
-        len(template_candidates(one, other, search_geometry(one, other, options), sun, options).pixels)
-        for one, other in pairwise(views)
+        len(template_candidates(view, later, search_geometry(view, later, options), sun, options).pixels)
+        for view, later in pairwise(views)
     )
     return {
         "feasible_overlap": min(first, second) > 0,

@@ -10,7 +10,7 @@ from marsyard.scenarios.algorithm_run import AlgorithmSelection
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import CalibrationParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredFlight
-from marsyard.scenarios.terrain_files import check_site
+from marsyard.scenarios.terrain_files import site_validator
 from marsyard.sim.dynamics.helicopter import HelicopterParameters
 from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.render import CloudParameters
@@ -23,21 +23,21 @@ from marsyard.sim.terrain import TerrainParameters, site
 
 Count = Annotated[int, Field(ge=0, le=100000)]
 
-#: The camera of the field test: section III.B.
+#: Preset of the field test's camera (paper, III.B).
 CAMERA = "mer-descent-field"
 
 
 class RunParameters(Parameters):
-    """A run: site, time, and number of triples of each category."""
+    """A run: site, time, and number of picture triples of each category."""
 
-    name: Annotated[str, Field(min_length=1, description="what the report calls the run")]
-    site: Annotated[str, check_site("a flight", "descent"), Field(description="preset of terrain and light")]
+    name: Annotated[str, Field(min_length=1, description="name of the run in the report")]
+    site: Annotated[str, site_validator("a flight", "descent"), Field(description="preset of terrain and light")]
     begins: Annotated[AwareDatetime, Field(description="start of the first pass, with time zone")]
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
     longitude_deg: Annotated[float, Field(ge=-180.0, le=180.0, description="east positive")]
     short_time: Annotated[Count, Field(description="triples of pictures close in time")] = 0
-    same_direction: Annotated[Count, Field(description="triples apart in altitude, flown in one direction")] = 0
-    opposite_direction: Annotated[Count, Field(description="triples apart in altitude, direction switched")] = 0
+    same_direction: Annotated[Count, Field(description="triples at three altitudes, one flight direction")] = 0
+    opposite_direction: Annotated[Count, Field(description="triples at three altitudes, both directions")] = 0
     clouds: Annotated[CloudParameters | None, Field(description="clouds whose shadows drift over the site")] = None
 
     @property
@@ -47,19 +47,17 @@ class RunParameters(Parameters):
 
 
 class DriftParameters(Parameters):
-    """Drift of the gyro bias with the temperature of the inertial unit, which the air cools on the passes.
+    """Drift of the gyro bias with the temperature of the inertial unit, which cools in the air during the passes.
 
-    The paper explains the spread of the opposite-direction triples by "temperature variations in the IMU which negated
-    the constant bias assumption", without their size. The drift is calibrated: some of those triples pass 5 m/s.
+    The paper explains the scatter of the opposite-direction triples by "temperature variations in the IMU which negated
+    the constant bias assumption", without a value. The drift is chosen so that some of them exceed 5 m/s of error.
     """
 
     across_deg_h_k: Annotated[
-        float, Field(description="bias of the gyro along the line of flight for a change of temperature, deg/h/K")
+        float, Field(description="bias per temperature change of the gyro along the flight line, deg/h/K")
     ] = 1.0
-    change_k: Annotated[
-        float, Field(ge=-100.0, le=100.0, description="change of temperature on the passes in the end, K; 0: no drift")
-    ] = -22.0
-    time_constant_s: Annotated[Positive, Field(description="time constant of the change, s (assumed)")] = 300.0
+    change_k: Annotated[float, Field(ge=-100.0, le=100.0, description="final temperature change, K; 0: none")] = -22.0
+    time_constant_s: Annotated[Positive, Field(description="time constant of that change, s (assumed)")] = 300.0
 
 
 class TargetParameters(Parameters):
@@ -67,32 +65,32 @@ class TargetParameters(Parameters):
 
     placed: Annotated[int, Field(ge=3, le=1000, description="targets on the ground")] = 11
     used: Annotated[int, Field(ge=3, le=1000, description="targets used for attitude")] = 9
-    within_m: Annotated[Positive, Field(description="half the side of the square they lie in, m (assumed)")] = 90.0
-    pictures: Annotated[int, Field(ge=1, le=1000, description="pictures of a pass over them")] = 20
+    within_m: Annotated[Positive, Field(description="half the side length of the targets' square, m (assumed)")] = 90.0
+    pictures: Annotated[int, Field(ge=1, le=1000, description="pictures of a pass over the targets")] = 20
     centroid_px: Annotated[NonNegative, Field(description="error of a centroid per axis, px (assumed)")] = 0.15
     survey_m: Annotated[NonNegative, Field(description="error of the survey per axis, m (assumed)")] = 0.02
 
     @model_validator(mode="after")
     def _check_used(self) -> TargetParameters:
         if self.used > self.placed:
-            raise ValueError(f"{self.used} targets are used, but {self.placed} placed")
+            raise ValueError(f"{self.used} targets are used, but only {self.placed} are placed")
         return self
 
 
 class ElevationParameters(Parameters):
-    """The elevation model subtracted from the GPS height: of the class of SRTM (paper, III.D.1)."""
+    """The elevation model subtracted from the GPS height, with the accuracy class of SRTM (paper, III.D.1)."""
 
-    posting_m: Annotated[Positive, Field(description="distance of its posts, m")] = 30.0
-    error_m: Annotated[NonNegative, Field(description="error of its posts, m")] = 6.0
-    correlation_m: Annotated[Positive, Field(description="distance over which that error changes, m (assumed)")] = 150.0
-    interpolation_m: Annotated[NonNegative, Field(description="error of interpolation between posts, m")] = 1.0
+    posting_m: Annotated[Positive, Field(description="distance between posts, m")] = 30.0
+    error_m: Annotated[NonNegative, Field(description="standard deviation of a post's error, m")] = 6.0
+    correlation_m: Annotated[Positive, Field(description="correlation length of post errors, m (assumed)")] = 150.0
+    interpolation_m: Annotated[NonNegative, Field(description="standard deviation of the interpolation error, m")] = 1.0
 
 
 class PictureParameters(Parameters):
-    """Times of the pictures: 20 of them in less than 2 min (paper, III.D.2)."""
+    """Times of the pictures: the paper takes 20 pictures in less than 2 min (III.D.2)."""
 
     interval_s: Annotated[Positive, Field(le=60.0, description="time between pictures, s (assumed)")] = 3.0
-    clock: Annotated[ClockParameters, Field(description="errors of their time tags (assumed)")] = ClockParameters(
+    clock: Annotated[ClockParameters, Field(description="time tag errors (assumed)")] = ClockParameters(
         offset_sd_s=0.0005, jitter_sd_s=0.0005
     )
 
@@ -101,16 +99,14 @@ class TripleParameters(Parameters):
     """Selection of triples from a run's pictures (paper, III.D and IV)."""
 
     virtual_interval_s: Annotated[
-        Positive, Field(le=60.0, description="time that is put between two pictures, s: that of the landings")
+        Positive, Field(le=60.0, description="time assigned to the interval of two pictures, s, as in the landings")
     ] = 3.75
-    max_speed_m_s: Annotated[
-        Positive, Field(description="greatest speed that the virtual interval may give, m/s: DIMES' own limit")
-    ] = 30.0
+    max_speed_m_s: Annotated[Positive, Field(description="maximum speed over that interval, m/s, as in DIMES")] = 30.0
     overlap_fraction: Annotated[
-        Positive, Field(description="distance between what two pictures are centred on, over the altitude (assumed)")
+        Positive, Field(description="maximum distance between two picture centres divided by the altitude (assumed)")
     ] = 0.3
-    min_step_m: Annotated[Positive, Field(description="least height between pictures apart, m (assumed)")] = 150.0
-    max_step_m: Annotated[Positive, Field(description="most height between pictures apart, m (assumed)")] = 390.0
+    min_step_m: Annotated[Positive, Field(description="minimum height step between pictures, m (assumed)")] = 150.0
+    max_step_m: Annotated[Positive, Field(description="maximum height step between pictures, m (assumed)")] = 390.0
 
 
 class FieldTestParameters(AlgorithmSelection, CustomScores):
@@ -119,10 +115,8 @@ class FieldTestParameters(AlgorithmSelection, CustomScores):
     task = VELOCITY
     scored = ScoredFlight
 
-    algorithm: Annotated[
-        str, Field(description="velocity estimator under test, see `marsyard.scenarios.estimators`")
-    ] = "dimes"
-    runs: Annotated[tuple[RunParameters, ...], Field(min_length=1, description="in the report's order")]
+    algorithm: Annotated[str, Field(description="velocity estimator under test, see `estimators`")] = "dimes"
+    runs: Annotated[tuple[RunParameters, ...], Field(min_length=1, description="runs in the order of the report")]
     bank_seed: Annotated[int, Field(ge=0, description="seed of the sites' terrains; each site has one")] = 1
     samples: Annotated[int, Field(ge=64, le=8192, description="samples along each side of a terrain")] = 4096
     helicopter: HelicopterParameters = HelicopterParameters()
@@ -134,22 +128,22 @@ class FieldTestParameters(AlgorithmSelection, CustomScores):
     pictures: PictureParameters = PictureParameters()
     triples: TripleParameters = TripleParameters()
     calibration: Annotated[
-        CalibrationParameters, Field(description="errors of the calibrated camera, the same in all cases")
+        CalibrationParameters, Field(description="camera calibration errors, the same in all cases")
     ] = CalibrationParameters()
     detector: DetectorChoice = Field(default_factory=lambda: preset(CAMERA).detector)
-    backend: Backend = Field(default_factory=default_backend, description="library that provides OpenGL's context")
+    backend: Backend = Field(default_factory=default_backend, description="OpenGL context provider")
 
     @model_validator(mode="after")
     def _check_run_names(self) -> FieldTestParameters:
         names = [run.name for run in self.runs]
         repeated = sorted({name for name in names if names.count(name) > 1})
         if repeated:
-            raise ValueError(f"runs share a name: {', '.join(repeated)}")
+            raise ValueError(f"several runs have the same name: {', '.join(repeated)}")
         return self
 
     @property
     def site_names(self) -> tuple[str, ...]:
-        """Sites of the runs, each once; a site's number is that of its terrain."""
+        """Sites of the runs without duplicates; the index of a site is that of its terrain."""
         return tuple(dict.fromkeys(run.site for run in self.runs))
 
     def terrain(self, site_name: str) -> TerrainParameters:

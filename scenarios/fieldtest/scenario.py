@@ -1,4 +1,4 @@
-"""The field test as a scenario: simulate, measure, estimate and score one triple of one run."""
+"""Field test scenario: simulate, measure, estimate and score one picture triple of one run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
 from marsyard.scenarios.base import LoadGround, TerrainScenario, algorithm_result
-from marsyard.scenarios.conditions import attitude_rate_deg_s, hash_images, off_nadir_deg, picture_columns, sun_columns
+from marsyard.scenarios.conditions import attitude_rate_deg_s, hash_images, image_columns, off_nadir_deg, sun_columns
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import camera_optics, draw_calibrated, render_state, sunlight_ratio
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
@@ -32,9 +32,9 @@ from marsyard.sim.sensor.ranging import height_above_ground
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface, TerrainBank, site
 
-#: Spacing of the pixels whose ground points are kept.
-GRID_PX = 32
-#: Grounds, runs and their scenes in a process's caches: at least those of the paper, among which cases alternate.
+#: Pixel spacing of the grid on which cloud transmittance is evaluated.
+CLOUD_GRID_PX = 32
+#: Cache sizes of grounds, runs and scenes: large enough for the paper's runs, because cases use them in turn.
 _CACHED_GROUNDS, _CACHED_RUNS, _CACHED_SCENES = 3, 16, 5
 
 
@@ -48,7 +48,7 @@ class Case:
 
 
 class FieldTestScenario(TerrainScenario[FieldTestParameters]):
-    """Triples of pictures of a helicopter, measured as in the paper and given to a velocity estimator."""
+    """Picture triples of a helicopter flight, measured as in the paper, as input of a velocity estimator."""
 
     name = "fieldtest"
     parameters_type = FieldTestParameters
@@ -62,21 +62,21 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         )
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Return the numbers of the sites."""
+        """Return the indices of the sites."""
         return tuple(range(len(self.check_parameters(parameters).site_names)))
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
-        """Return the site of the case's run. Raises ValueError for a case beyond the runs' triples."""
+        """Return the site of the case's run. Raises ValueError if there is no such triple."""
         p = self.check_parameters(parameters)
         number, _ = _find_triple(p, case)
         return (p.site_names.index(p.runs[number].site),)
 
     def input_terrain(self, p: FieldTestParameters, shared_input: int) -> tuple[TerrainBank, int]:
-        """Return the bank and number of a site's terrain."""
+        """Return the terrain bank and index of a site's terrain."""
         return TerrainBank(p.terrain(p.site_names[shared_input]), p.bank_seed), 0
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """Run one triple."""
+        """Simulate one triple and score all algorithms."""
         p = self.check_parameters(parameters)
         number, index = _find_triple(p, streams.case)
         key = RunKey(p, number, streams.seed, streams.campaign)
@@ -84,38 +84,39 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         triple = run.triples[index]
         first, second, third = (run.flight.state(float(time)) for time in run.truth.times_s[list(triple.pictures)])
         case = Case(run, triple, (first, second, third))
-        # one camera took all pictures
+        # the same detector takes the pictures of all cases
         response = Streams(streams.seed, streams.campaign, 0).generator("detector response")
         detector = Detector.draw(camera_optics(field_camera()).fall_off, p.detector, response)
         noise, scene = streams.generator("detector noise"), self._start_scene(key)
-        shots = [take_picture(run, scene, ground, state, detector, noise) for state in case.states]
-        pictures = [counts for counts, _ in shots]
+        exposures = [take_picture(run, scene, ground, state, detector, noise) for state in case.states]
+        pictures = [counts for counts, _ in exposures]
         truth = truth_velocities(p, case)[1, :2]
         measurements = measure(p, case, pictures, detector, calibrated_camera(p, streams))
-        # the clouds' transmittance over the middle picture's ground at each picture, and its changes
-        light = cloud_transmittances(run, shots[1][1], [state.time_s for state in case.states])
-        changes = np.abs(np.diff(light, axis=0))
+        # cloud transmittance on the ground of the second picture, at the time of each picture, and its changes
+        transmittances = cloud_transmittances(run, exposures[1][1], [state.time_s for state in case.states])
+        changes = np.abs(np.diff(transmittances, axis=0))
         conditions = {
             **_conditions(p, case, measurements, ground.surface),
-            **{f"cloud_transmittance_{number}": float(np.nanmean(one)) for number, one in enumerate(light, start=1)},
-            **{f"cloud_change_{pair}": float(np.nanmean(one)) for pair, one in enumerate(changes, start=1)},
-            **picture_columns(p.backend, hash_images(pictures)),
+            **{f"cloud_transmittance_{n}": float(np.nanmean(field)) for n, field in enumerate(transmittances, start=1)},
+            **{f"cloud_change_{pair}": float(np.nanmean(change)) for pair, change in enumerate(changes, start=1)},
+            **image_columns(p.backend, hash_images(pictures)),
         }
 
         def evaluate(algorithm: str) -> CaseResult:
-            attempt = run_algorithm_on_copy(
-                lambda given: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case).estimate(given),
+            algorithm_run = run_algorithm_on_copy(
+                lambda copy: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case).estimate(copy),
                 lambda answer: check_last_interval(answer, measurements),
                 measurements,
             )
-            estimate = attempt.answer
+            estimate = algorithm_run.answer
             velocity = None if estimate is None else estimate.velocity_m_s
-            row = {**velocity_row("velocity", velocity, truth), **consistency_row(estimate, truth), **attempt.row}
+            row = {**velocity_row("velocity", velocity, truth), **consistency_row(estimate, truth), **algorithm_run.row}
             if estimate is not None:
-                known: dict[str, Any] = {"true_velocity_m_s": truth, "states": case.states, "motion": run.flight}
-                flight = ScoredFlight(measurements=measurements, answer=estimate, **known)
+                truths: dict[str, Any] = {"true_velocity_m_s": truth, "states": case.states, "motion": run.flight}
+                flight = ScoredFlight(measurements=measurements, answer=estimate, **truths)
                 row |= compute_scores(p.scores, flight, {*row, *conditions})
-            return algorithm_result(attempt, velocity is not None, row, velocity_products(pictures, estimate, truth))
+            products = velocity_products(pictures, estimate, truth)
+            return algorithm_result(algorithm_run, velocity is not None, row, products)
 
         return case_result(p.algorithms, evaluate, conditions)
 
@@ -127,28 +128,28 @@ def calibrated_camera(p: FieldTestParameters, streams: Streams) -> CameraModel:
 
 
 def _find_triple(p: FieldTestParameters, case: int) -> tuple[int, int]:
-    """Return the run of a case and its index among the run's triples. Raises ValueError where there is none."""
+    """Return the indices of a case's run and triple. Raises ValueError if the case does not exist."""
     total = sum(run.triples for run in p.runs)
     if case >= total:
-        raise ValueError(f"case {case} is asked for, but the runs state {total} triples; allowed: 0 to {total - 1}")
+        raise ValueError(f"case {case} does not exist: the runs define {total} triples; allowed: 0 to {total - 1}")
     return case_order(p)[case]
 
 
 def case_order(p: FieldTestParameters) -> list[tuple[int, int]]:
-    """Return run and triple of each case: any first cases contain all runs and categories in proportion."""
-    cells = []
+    """Return the run and triple of each case; the first n cases contain all runs and categories in proportion."""
+    ranked = []
     for number, run in enumerate(p.runs):
         start = 0
         for count in (run.short_time, run.same_direction, run.opposite_direction):
-            cells += [((index + 0.5) / count, number, start + index) for index in range(count)]
+            ranked += [((index + 0.5) / count, number, start + index) for index in range(count)]
             start += count
-    return [(number, index) for _, number, index in sorted(cells)]
+    return [(number, index) for _, number, index in sorted(ranked)]
 
 
 def truth_velocities(p: FieldTestParameters, case: Case) -> Float64[np.ndarray, "2 3"]:
-    """Compute the paper's truth velocities, GPS differences over the virtual interval, world axes (III.D.3).
+    """Compute the paper's truth velocities: GPS differences divided by the virtual interval, world axes (III.D.3).
 
-    The "biased IMU velocities" are the same differences (III.D.5).
+    The paper's "biased IMU velocities" are the same differences (III.D.5).
     """
     fixes = case.run.pictures.position_m[list(case.triple.pictures)]
     return np.asarray(np.diff(fixes, axis=0) / p.triples.virtual_interval_s)
@@ -161,15 +162,16 @@ def measure(
     detector: Detector,
     camera: CameraModel,
 ) -> DescentMeasurements:
-    """Return the inputs of an estimator, with tags a virtual interval apart and the calibrated camera (III.D)."""
+    """Create the inputs of an estimator: time tags at virtual intervals, and the calibrated camera (paper, III.D)."""
     tags = [number * p.triples.virtual_interval_s for number in range(len(pictures))]
-    tagged = list(zip(case.triple.pictures, tags, strict=True))
+    tagged_indices = list(zip(case.triple.pictures, tags, strict=True))
+    altitudes = case.run.pictures.altitude_m
     return DescentMeasurements(
         images=tuple(
-            DetectorImage(one, tag, camera, detector.calibration) for one, tag in zip(pictures, tags, strict=True)
+            DetectorImage(counts, tag, camera, detector.calibration) for counts, tag in zip(pictures, tags, strict=True)
         ),
-        attitudes=tuple(AttitudeMeasurement(case.run.attitudes[k], tag) for k, tag in tagged),
-        altitudes=tuple(AltitudeMeasurement(float(case.run.pictures.altitude_m[k]), tag) for k, tag in tagged),
+        attitudes=tuple(AttitudeMeasurement(case.run.attitudes[k], tag) for k, tag in tagged_indices),
+        altitudes=tuple(AltitudeMeasurement(float(altitudes[k]), tag) for k, tag in tagged_indices),
         interval_velocities_m_s=truth_velocities(p, case),
         sun_direction=case.run.sun(case.states[1].time_s),
     )
@@ -178,7 +180,7 @@ def measure(
 def _conditions(
     p: FieldTestParameters, case: Case, measurements: DescentMeasurements, surface: Surface
 ) -> dict[str, Scalar]:
-    run, numbers = case.run, list(case.triple.pictures)
+    run, indices = case.run, list(case.triple.pictures)
     true_altitudes = height_above_ground(surface, np.stack([state.position_m for state in case.states]))
     row: dict[str, Scalar] = {
         "run": run.parameters.name,
@@ -193,13 +195,13 @@ def _conditions(
         "horizontal_speed_m_s": float(np.hypot(*case.states[1].velocity_m_s[:2])),
     }
     errors = []
-    each = zip(case.states, measurements.attitudes, measurements.altitudes, true_altitudes, strict=True)
-    for number, (state, attitude, altitude, true) in enumerate(each, start=1):
+    samples = zip(case.states, measurements.attitudes, measurements.altitudes, true_altitudes, strict=True)
+    for number, (state, attitude, altitude, true_altitude) in enumerate(samples, start=1):
         errors.append((attitude.world_from_body * state.attitude.inv()).as_rotvec())
         row[f"picture_time_{number}_s"] = state.time_s
-        row[f"pass_{number}"] = int(run.pictures.flown[numbers[number - 1]])
-        row[f"altitude_{number}_m"] = float(true)
-        row[f"altitude_error_{number}_m"] = altitude.altitude_m - float(true)
+        row[f"pass_{number}"] = int(run.pictures.pass_number[indices[number - 1]])
+        row[f"altitude_{number}_m"] = float(true_altitude)
+        row[f"altitude_error_{number}_m"] = altitude.altitude_m - float(true_altitude)
         row[f"off_nadir_{number}_deg"] = off_nadir_deg(state)
         row[f"attitude_rate_{number}_deg_s"] = attitude_rate_deg_s(state)
         row[f"attitude_error_{number}_deg"] = float(np.degrees(np.linalg.norm(errors[-1])))
@@ -214,17 +216,17 @@ def _conditions(
 def take_picture(
     run: Run, start_scene: Scene, ground: SiteGround, state: State, detector: Detector, rng: np.random.Generator
 ) -> tuple[UInt16[np.ndarray, "rows columns"], Float64[np.ndarray, "m n 3"]]:
-    """Render and expose the picture of a state; return counts, and ground points of a coarse grid of pixels, world."""
+    """Render and expose a picture; return its counts and the ground points of a coarse pixel grid, world axes."""
     p, scene = run.key.field_test, scene_at(run, start_scene, ground, state.time_s)
     frame, motion = render_state(p.backend, scene, camera_optics(field_camera()), state)
     brightness = sunlight_ratio(ground.site.environment, float(np.arcsin(scene.sun.direction[2])), p.detector)
-    return detector.expose(frame.radiance * np.float32(brightness), rng, motion), frame.points_world(GRID_PX)
+    return detector.expose(frame.radiance * np.float32(brightness), rng, motion), frame.points_world(CLOUD_GRID_PX)
 
 
 def cloud_transmittances(
     run: Run, ground_m: Float64[np.ndarray, "m n 3"], times_s: Sequence[float]
 ) -> Float64[np.ndarray, "times m n"]:
-    """Compute the fraction of the direct sunlight that clouds transmit to points of the ground."""
+    """Compute the fraction of direct sunlight that clouds transmit to points on the ground."""
     if run.clouds is None:
         return np.ones((len(times_s), *ground_m.shape[:2]))
     return np.stack([run.clouds.transmittance(ground_m, sun_at(run, time), time) for time in times_s])
@@ -236,10 +238,10 @@ def sun_at(run: Run, time_s: float) -> Sun:
 
 
 def scene_at(run: Run, start_scene: Scene, ground: SiteGround, time_s: float) -> Scene:
-    """Return the run's scene with the sun of a time.
+    """Return the run's scene with the sun at a given time.
 
-    The sun is updated for every picture: shadows of clouds 2.5 km up move by a third of a metre a second with it, and
-    would jump if it were held.
+    The sun is updated for every picture: it moves the shadows of clouds at 2.5 km by a third of a metre per second, and
+    the shadows would jump if the sun were fixed.
     """
     sun = sun_at(run, time_s)
     return replace(start_scene, sun=sun, photometry=ground.photometry(sun))
@@ -253,7 +255,7 @@ def run_ground(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) -> S
 
 
 def build_start_scene(run: Run, ground: SiteGround) -> Scene:
-    """Build a run's scene with the sun of its start; the objects are kept as the sun moves."""
+    """Build a run's scene with the sun at its start; later pictures use the same objects with a new sun."""
     east, north, _ = run.flight.origin_m.tolist()
     pixel_rad = camera_optics(field_camera()).rays.pixel_rad
     eye = Eye(east, north, run.key.field_test.helicopter.lowest_m, pixel_rad)

@@ -11,11 +11,11 @@ from scipy.ndimage import distance_transform_edt
 
 from marsyard.algorithms.hda import Ground, Safety
 from marsyard.scenarios.base import LoadGround
-from marsyard.scenarios.conditions import deliver, faulty_detector
+from marsyard.scenarios.conditions import add_detector_faults, corrupt_images
 from marsyard.scenarios.exposure import Optics, camera_optics, draw_calibrated, render_state, sunlight_ratio
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import Flight
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters, faulty_ranges, faulty_sun_deg
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters, add_range_faults, raise_sun_deg
 from marsyard.scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
 from marsyard.scenarios.meshes import MeshParameters, add_meshes
 from marsyard.scenarios.views import Eye, SiteGround, site_scene
@@ -28,8 +28,8 @@ from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import site
 from marsyard.sim.terrain.sites import SiteTexture
 
-#: Grounds that a worker keeps: their rocks take a second or two to place.
-KEPT_GROUNDS = 64
+#: Maximum number of grounds in a worker's cache; placing the rocks of a ground takes one or two seconds.
+MAX_GROUNDS = 64
 
 
 @dataclass(frozen=True)
@@ -39,19 +39,18 @@ class World:
     ground: SiteGround
     sun: Sun
     meshes: tuple[MeshParameters, ...]
-    brightness: float  #: sunlight at the ground relative to that of the detector's stated responsivity
+    brightness: float  #: sunlight at the ground / reference sunlight of the detector
 
     @classmethod
-    def of(cls, p: LandingScenarioParameters, load_ground: LoadGround = SiteGround.from_bank) -> World:
-        """The world of a case."""
+    def from_parameters(cls, p: LandingScenarioParameters, load_ground: LoadGround = SiteGround.from_bank) -> World:
+        """Create the world of a case."""
         ground = load_ground(site(p.site), p.terrain, p.location.bank_seed, p.location.terrain)
         texture = p.preset.ground_texture
-        textured = SiteTexture(
-            coarsest_m=texture.coarsest_m, amplitudes=tuple(p.texture * one for one in texture.amplitudes)
-        )
-        ground = replace(ground, site=p.preset.model_copy(update={"ground_texture": textured}))
+        amplitudes = tuple(p.texture * amplitude for amplitude in texture.amplitudes)
+        scaled_texture = SiteTexture(coarsest_m=texture.coarsest_m, amplitudes=amplitudes)
+        ground = replace(ground, site=p.preset.model_copy(update={"ground_texture": scaled_texture}))
         air = p.preset.environment
-        elevation = float(np.radians(faulty_sun_deg(p.faults, p.sun.elevation_deg)))
+        elevation = float(np.radians(raise_sun_deg(p.faults, p.sun.elevation_deg)))
         sun = Sun(direction(np.radians(p.sun.azimuth_deg), elevation), air.sun_radius_rad)
         return cls(ground, sun, p.meshes, sunlight_ratio(air, elevation, p.detector))
 
@@ -60,157 +59,158 @@ class World:
 class Pair:
     """Two pictures of a flight."""
 
-    images: tuple[DetectorImage, DetectorImage]  #: as delivered, with the true camera
-    frames: tuple[Frame, Frame]  #: rendered radiance and truth
+    images: tuple[DetectorImage, DetectorImage]  #: delivered images with the true camera
+    frames: tuple[Frame, Frame]  #: rendered radiance and ground truth
 
     @property
     def counts(self) -> tuple[UInt16[np.ndarray, "rows columns"], UInt16[np.ndarray, "rows columns"]]:
-        """The pictures' counts."""
+        """Detector counts of both pictures."""
         return self.images[0].counts, self.images[1].counts
 
     @property
     def axis_range_m(self) -> float:
-        """True range along the first picture's optical axis to ground or rock, metres."""
+        """True range from the camera along the first optical axis to ground or rock, metres."""
         frame = self.frames[0]
         column, row = self.images[0].camera.project(np.array([self.images[0].camera.a]))[0][0]
-        # the four pixels about the axis, at most 0.7 px away
-        near = frame.range_m[int(row) : int(row) + 2, int(column) : int(column) + 2]
-        return float(np.median(near))
+        # the four pixels around the axis, at most 0.7 px from it
+        ranges = frame.range_m[int(row) : int(row) + 2, int(column) : int(column) + 2]
+        return float(np.median(ranges))
 
 
 def take_pictures(p: LandingScenarioParameters, world: World, flight: Flight, optics: Optics, streams: Streams) -> Pair:
-    """The pictures of a flight; both have the exposure that suits the first."""
-    detector = Detector.draw(
-        optics.fall_off, faulty_detector(p.faults, p.detector), streams.generator("detector response")
-    )
-    caster = max(p.lander.caster_diameter_m, p.faults.vehicle_shadow_m)
-    lower = min(flight.states, key=lambda state: float(state.position_m[2]))
-    # one scene for both pictures, as detailed as the lower one needs
-    eye = Eye.of(optics.rays, lower.world_from_body, world.ground.surface)
+    """Take both pictures of a flight; the first picture determines the exposure of both."""
+    settings = add_detector_faults(p.faults, p.detector)
+    detector = Detector.draw(optics.fall_off, settings, streams.generator("detector response"))
+    shadow_disc_m = max(p.lander.caster_diameter_m, p.faults.vehicle_shadow_m)
+    lowest = min(flight.states, key=lambda state: float(state.position_m[2]))
+    # one scene for both pictures, with the detail that the lower picture needs
+    eye = Eye.of(optics.rays, lowest.world_from_body, world.ground.surface)
     scene = add_meshes(site_scene(world.ground, eye, world.sun), world.meshes, (eye.east_m, eye.north_m))
-    scene = replace(scene, caster_diameter_m=caster)
+    scene = replace(scene, caster_diameter_m=shadow_disc_m)
     noise = streams.generator("detector noise")
     rendered = [render_state(p.render.backend, scene, optics, state) for state in flight.states]
     frames, motions = zip(*rendered, strict=True)
-    light = [frame.radiance * np.float32(world.brightness) for frame in frames]
-    detector = auto_expose(detector, light[0], p.exposure, streams.generator("test pictures")).detector
-    counts = [detector.expose(one, noise, motion) for one, motion in zip(light, motions, strict=True)]
-    delivered = deliver(counts, 2 * p.faults.repeated_picture, p.faults.black_picture, p.faults.lost_rows)
+    radiances = [frame.radiance * np.float32(world.brightness) for frame in frames]
+    detector = auto_expose(detector, radiances[0], p.exposure, streams.generator("test pictures")).detector
+    counts = [detector.expose(radiance, noise, motion) for radiance, motion in zip(radiances, motions, strict=True)]
+    delivered = corrupt_images(counts, 2 * p.faults.repeated_picture, p.faults.black_picture, p.faults.lost_rows)
     camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
     first, second = (
-        DetectorImage(one, state.time_s, camera, detector.calibration)
-        for one, state in zip(delivered, flight.states, strict=True)
+        DetectorImage(image, state.time_s, camera, detector.calibration)
+        for image, state in zip(delivered, flight.states, strict=True)
     )
     return Pair((first, second), (frames[0], frames[1]))
 
 
 def measure(p: LandingScenarioParameters, flight: Flight, pair: Pair, streams: Streams) -> LandingMeasurements:
-    """The measurements of a case.
+    """Simulate the measurements of a case.
 
-    The a-priori site is the ground on the first picture's optical axis, at the measured range; without one, at the
-    commanded height.
+    The a-priori site is the point on the first optical axis at the measured range, or at the commanded height if there
+    is no range.
     """
     unit = RangingUnit.draw(p.laser, streams.generator("laser"))
     reading = unit.readings(np.zeros(1), np.array([pair.axis_range_m]), streams.generator("laser noise"))
-    slant = float(faulty_ranges(p.faults, reading.values, p.height_m)[0])
+    slant = float(add_range_faults(p.faults, reading.values, p.height_m)[0])
     calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
     camera = calibrated.bin(columns=1, rows=p.detector.rows_summed)
     first, second = (replace(image, camera=camera) for image in pair.images)
-    ahead = (slant if np.isfinite(slant) else p.height_m) * camera.a
+    axis_m = (slant if np.isfinite(slant) else p.height_m) * camera.a
     return LandingMeasurements(
         images=(first, second),
         poses=flight.poses,
         slant_range_m=slant,
         up_body=flight.up_body,
-        apriori_site_world=np.asarray(flight.poses[0].world_from_body.apply(ahead)),
+        apriori_site_world=np.asarray(flight.poses[0].world_from_body.apply(axis_m)),
     )
 
 
-#: Spacing of the lattice, in diameters of the footprint: 20 cm for 2 m.
+#: Spacing of the truth's sampling grid, in footprint diameters: 20 cm for 2 m.
 STEP_DIAMETERS = 0.1
-#: Margin of the relief beyond the ground in sight, in diameters: for footprints and landings next to it.
+#: Margin of the relief around the visible ground, in footprint diameters: for footprints and landings outside.
 MARGIN_DIAMETERS = 1.5
-#: Values of a hazard map: the footprint about the pixel's point is safe, unsafe, or partly out of sight.
+#: Values of a hazard map: the footprint around the pixel's ground point is safe, unsafe, or partly out of view.
 SAFE, UNSAFE, UNKNOWN = 0, 1, 255
 
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """The true ground of a flight on a lattice about the first picture, along its horizontal axes."""
+    """Ground truth of a flight on a sampling grid aligned with the first picture's horizontal axes."""
 
     relief: Relief
     limits: Limits
-    places: Float[np.ndarray, "rows columns 2"]  #: world x, y of the lattice
-    footprints: Footprints  #: the ground under a lander at each position
+    positions: Float[np.ndarray, "rows columns 2"]  #: world x, y of the grid points
+    footprints: Footprints  #: slope and roughness under a lander at each position
     covered: Bool[np.ndarray, "rows columns"]  #: whether both pictures show the whole footprint
     step_m: float
 
     @classmethod
-    def of(cls, world: World, flight: Flight, pair: Pair, limits: Limits) -> GroundTruth:
-        """The truth over the ground of the first picture."""
+    def from_pictures(cls, world: World, flight: Flight, pair: Pair, limits: Limits) -> GroundTruth:
+        """Compute the ground truth of the area in the first picture."""
         centre = flight.states[0].position_m
-        # the picture's right and up, as unit vectors on the ground (rows)
+        # rows: unit vectors of the picture's right and up directions on the ground
         right = flight.states[0].attitude.apply(np.array([1.0, 0.0, 0.0]))[:2]
         right = right / np.hypot(*right)
         axes = np.array([right, [-right[1], right[0]]])
-        points_seen = pair.frames[0].points_world()[::8, ::8, :2].reshape(-1, 2)
-        hull = cv2.convexHull(points_seen[np.all(np.isfinite(points_seen), axis=1)].astype(np.float32))
+        ground_points = pair.frames[0].points_world()[::8, ::8, :2].reshape(-1, 2)
+        hull = cv2.convexHull(ground_points[np.all(np.isfinite(ground_points), axis=1)].astype(np.float32))
         outline = (hull[:, 0].astype(np.float64) - centre[:2]) @ axes.T
         step = STEP_DIAMETERS * limits.diameter_m
-        low, high = (np.floor(end / step) * step for end in (outline.min(axis=0), outline.max(axis=0)))
-        x, y = (np.arange(a, b + 0.5 * step, step) for a, b in zip(low, high, strict=True))
+        low, high = (np.floor(limit / step) * step for limit in (outline.min(axis=0), outline.max(axis=0)))
+        x, y = (np.arange(first, last + 0.5 * step, step) for first, last in zip(low, high, strict=True))
         local = np.stack(np.meshgrid(x, y), axis=-1)
-        places = np.asarray(centre[:2] + local @ axes)
+        positions = np.asarray(centre[:2] + local @ axes)
         margin = MARGIN_DIAMETERS * limits.diameter_m
-        corners = places.reshape(-1, 2)
-        west_south, east_north = corners.min(axis=0) - margin, corners.max(axis=0) + margin
-        relief = Relief.of(world.ground, west_south, east_north, SPACING_DIAMETERS * limits.diameter_m, world.meshes)
-        heights = relief.average(places, relief.spacing_m)
-        # points of the ground in both pictures
-        points, visible = np.concatenate([corners, heights.reshape(-1, 1)], axis=1), np.ones(len(corners), dtype=bool)
+        flat_positions = positions.reshape(-1, 2)
+        west_south, east_north = flat_positions.min(axis=0) - margin, flat_positions.max(axis=0) + margin
+        spacing = SPACING_DIAMETERS * limits.diameter_m
+        relief = Relief.from_ground(world.ground, west_south, east_north, spacing, world.meshes)
+        heights = relief.average(positions, relief.spacing_m)
+        # ground points that both pictures show
+        points = np.concatenate([flat_positions, heights.reshape(-1, 1)], axis=1)
+        visible = np.ones(len(points), dtype=bool)
         for image, state in zip(pair.images, flight.states, strict=True):
-            pixels, ahead = image.camera.transform(state.world_from_body).project(points)
+            pixels, in_front = image.camera.transform(state.world_from_body).project(points)
             with np.errstate(invalid="ignore"):
-                visible &= ahead & np.all((pixels >= 0.0) & (pixels <= np.array(image.camera.size) - 1.0), axis=1)
-        around = distance_transform_edt(np.pad(visible.reshape(heights.shape), 1))[1:-1, 1:-1] * step
-        covered = around >= 0.5 * limits.diameter_m
-        return cls(relief, limits, places, relief.footprints(places, limits), covered, step)
+                visible &= in_front & np.all((pixels >= 0.0) & (pixels <= np.array(image.camera.size) - 1.0), axis=1)
+        visible_radius = distance_transform_edt(np.pad(visible.reshape(heights.shape), 1))[1:-1, 1:-1] * step
+        covered = visible_radius >= 0.5 * limits.diameter_m
+        return cls(relief, limits, positions, relief.footprints(positions, limits), covered, step)
 
     @property
     def safe(self) -> Bool[np.ndarray, "rows columns"]:
-        """Safe positions whose footprint both pictures show."""
+        """Safe positions whose whole footprint is in both pictures."""
         return np.asarray(self.covered & self.footprints.safe)
 
     @property
     def safe_with_margin(self) -> Bool[np.ndarray, "rows columns"]:
-        """Safe positions with safe positions all around up to the footprint's radius, as margin for errors."""
+        """Positions whose surroundings are safe up to the footprint's radius: a margin for position errors."""
         distance_m = distance_transform_edt(np.pad(self.safe, 1))[1:-1, 1:-1] * self.step_m
         return np.asarray(distance_m > 0.5 * self.limits.diameter_m)
 
-    def distance_to_hazard_m(self, place: Float[np.ndarray, "2"]) -> float:
-        """Distance of a position (x, y) from the nearest unsafe position of the lattice."""
-        unsafe = self.places[~self.footprints.safe]
-        return float(np.hypot(*(unsafe - place).T).min()) if len(unsafe) else float("inf")
+    def distance_to_hazard_m(self, position: Float[np.ndarray, "2"]) -> float:
+        """Compute the distance from a position (x, y) to the nearest unsafe grid position."""
+        unsafe = self.positions[~self.footprints.safe]
+        return float(np.hypot(*(unsafe - position).T).min()) if len(unsafe) else float("inf")
 
     def hazard_map(self, points: Float[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns"]:
-        """Hazard class of the footprint about each pixel's point, at the nearest position of the lattice."""
-        origin = self.places[0, 0]
-        axes = np.stack([self.places[0, 1] - origin, self.places[1, 0] - origin], axis=1)
+        """Classify the footprint around each pixel's ground point by the nearest grid position."""
+        origin = self.positions[0, 0]
+        axes = np.stack([self.positions[0, 1] - origin, self.positions[1, 0] - origin], axis=1)
         cells = np.linalg.solve(axes, (points[..., :2] - origin).reshape(-1, 2).T).T
-        inside = np.asarray(np.isfinite(cells).all(axis=1))
-        columns, rows = np.rint(np.where(inside[:, None], cells, -1.0)).astype(np.int64).T
+        is_inside = np.asarray(np.isfinite(cells).all(axis=1))
+        columns, rows = np.rint(np.where(is_inside[:, None], cells, -1.0)).astype(np.int64).T
         shape = self.covered.shape
-        inside &= (rows >= 0) & (columns >= 0) & (rows < shape[0]) & (columns < shape[1])
+        is_inside &= (rows >= 0) & (columns >= 0) & (rows < shape[0]) & (columns < shape[1])
         hazard = np.full(len(cells), UNKNOWN, dtype=np.uint8)
-        at = rows[inside], columns[inside]
-        site_class = np.where(self.footprints.safe[at], SAFE, UNSAFE)
-        hazard[inside] = np.where(self.covered[at], site_class, UNKNOWN)
+        indices = rows[is_inside], columns[is_inside]
+        site_class = np.where(self.footprints.safe[indices], SAFE, UNSAFE)
+        hazard[is_inside] = np.where(self.covered[indices], site_class, UNKNOWN)
         return hazard.reshape(points.shape[:2])
 
-    def under(self, place: Float[np.ndarray, "2"]) -> Footprints | None:
-        """The ground under a lander at any position (x, y); None outside the relief."""
+    def footprint_at(self, position: Float[np.ndarray, "2"]) -> Footprints | None:
+        """Compute slope and roughness under a lander at any position (x, y); None outside the relief."""
         try:
-            return self.relief.footprints(place[None], self.limits)
+            return self.relief.footprints(position[None], self.limits)
         except ValueError:
             return None
 
@@ -226,121 +226,123 @@ class RenderedFlight:
     truth: GroundTruth
 
     @classmethod
-    def of(
+    def simulate(
         cls, p: LandingScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank
     ) -> RenderedFlight:
-        """Fly a case and take its pictures."""
-        world = World.of(p, load_ground)
-        flight = Flight.of(p, world.ground.surface, streams)
+        """Simulate the flight of a case and take its pictures."""
+        world = World.from_parameters(p, load_ground)
+        flight = Flight.from_parameters(p, world.ground.surface, streams)
         pair = take_pictures(p, world, flight, camera_optics(p.optics), streams)
-        return cls(p, world, flight, pair, GroundTruth.of(world, flight, pair, p.lander.limits))
+        return cls(p, world, flight, pair, GroundTruth.from_pictures(world, flight, pair, p.lander.limits))
 
 
-#: Bounds of the hazard classes over the limit, and names of the classes between them.
-CLASSES = (1.0, 1.5, 2.0, 3.0)
+#: Bounds of the hazard classes (slope or roughness divided by its limit), and names of the classes between them.
+CLASS_BOUNDS = (1.0, 1.5, 2.0, 3.0)
 CLASS_NAMES = ("below_1", "1_to_1.5", "1.5_to_2", "2_to_3", "above_3")
-#: Gross hazards (bar 2 of the validation): minimum diameter in cells, and minimum roughness over the limit.
-GROSS_CELLS, GROSS = 3.0, 2.0
+#: Gross hazards (criterion 2 of the validation): minimum diameter in cells, and minimum roughness / limit.
+MIN_GROSS_CELLS, MIN_GROSS_ROUGHNESS = 3.0, 2.0
 
 
 @dataclass(frozen=True)
 class SampledMap:
-    """The algorithm's map at the truth's positions."""
+    """The algorithm's hazard map, sampled at the truth's grid positions."""
 
-    #: whether the map has slope and roughness there, and both pictures show the footprint
-    known: Bool[np.ndarray, "rows columns"]
-    safe: Bool[np.ndarray, "rows columns"]  #: whether the map calls the position safe
-    flagged: Bool[np.ndarray, "rows columns"]  #: whether a hazard cell, before growth, lies under the lander
+    #: whether the map has slope and roughness at the position, and both pictures show the whole footprint
+    valid: Bool[np.ndarray, "rows columns"]
+    safe: Bool[np.ndarray, "rows columns"]  #: whether the map classifies the position as safe
+    flagged: Bool[np.ndarray, "rows columns"]  #: whether a hazard cell, before growth, is under the lander
     slope_rad: Float[np.ndarray, "rows columns"]
 
     @classmethod
-    def of(cls, ground: Ground, flight: Flight, truth: GroundTruth, limits_rad_m: tuple[float, float]) -> SampledMap:
-        """The map at the truth's positions; `limits_rad_m`: the algorithm's own limits of slope and roughness."""
-        away = truth.places - flight.states[0].position_m[:2]
-        local = np.asarray(away @ ground.world_from_surface.as_matrix()[:2, :2])
+    def sample(cls, ground: Ground, flight: Flight, truth: GroundTruth, limits: tuple[float, float]) -> SampledMap:
+        """Sample the map at the truth's positions; `limits`: the algorithm's slope (rad) and roughness (m) limits."""
+        offsets = truth.positions - flight.states[0].position_m[:2]
+        local = np.asarray(offsets @ ground.world_from_surface.as_matrix()[:2, :2])
         cells = np.rint(ground.elevation.cells(local)).astype(np.int64)
         shape = np.array(ground.elevation.elevation_m.shape)
-        inside = np.all((cells >= 0) & (cells < shape), axis=-1) & truth.covered
+        is_inside = np.all((cells >= 0) & (cells < shape), axis=-1) & truth.covered
         rows, columns = np.moveaxis(np.clip(cells, 0, shape - 1), -1, 0)
         hazards = ground.hazards
         with np.errstate(invalid="ignore"):
-            raw = (hazards.slope_rad > limits_rad_m[0]) | (hazards.roughness_m > limits_rad_m[1])
-        reach = 0.5 * truth.limits.diameter_m / ground.elevation.cell_m
-        near = distance_transform_edt(~raw) <= reach if np.any(raw) else np.zeros_like(raw)
+            is_hazard = (hazards.slope_rad > limits[0]) | (hazards.roughness_m > limits[1])
+        radius = 0.5 * truth.limits.diameter_m / ground.elevation.cell_m
+        flagged = distance_transform_edt(~is_hazard) <= radius if np.any(is_hazard) else np.zeros_like(is_hazard)
         slope = hazards.slope_rad[rows, columns]
-        finite = inside & np.isfinite(slope) & np.isfinite(hazards.roughness_m[rows, columns])
-        safe = finite & (hazards.safety[rows, columns] == Safety.SAFE)
-        return cls(finite, safe, finite & near[rows, columns], slope)
+        valid = is_inside & np.isfinite(slope) & np.isfinite(hazards.roughness_m[rows, columns])
+        safe = valid & (hazards.safety[rows, columns] == Safety.SAFE)
+        return cls(valid, safe, valid & flagged[rows, columns], slope)
 
 
-def hazard_counts(ground: Ground, at: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
-    """Confusion counts of footprints, truth against map; sums over cases give rates.
+def count_hazards(ground: Ground, sampled: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
+    """Count footprints by truth and map; sums over cases give rates.
 
-    For each class of roughness and of slope over the limit: `footprints_*` in all, `footprints_*_safe` that the map
-    calls safe, `footprints_*_unflagged` without a map hazard before growth. `gross_*` are hazards of twice the limit of
-    roughness with a diameter of at least three cells; `false_alarms` are truly safe footprints with a map hazard.
+    For each class of roughness / limit and slope / limit: `footprints_*` counts all, `footprints_*_safe` those that the
+    map classifies as safe, `footprints_*_unflagged` those without a map hazard before growth. `gross_*` hazards have
+    twice the roughness limit and a diameter of at least three cells; `false_alarms` are flagged safe footprints.
     """
-    under, known, safe = truth.footprints, at.known, at.safe
-    over = {
-        "roughness": under.roughness_m / truth.limits.max_roughness_m,
-        "slope": under.slope_rad / truth.limits.max_slope_rad,
+    footprints, valid, safe = truth.footprints, sampled.valid, sampled.safe
+    ratios = {
+        "roughness": footprints.roughness_m / truth.limits.max_roughness_m,
+        "slope": footprints.slope_rad / truth.limits.max_slope_rad,
     }
-    diameter_cells = 2.0 * np.sqrt(under.exceeding_m2 / np.pi) / ground.elevation.cell_m
-    gross = (under.roughness_m >= GROSS * truth.limits.max_roughness_m) & (diameter_cells >= GROSS_CELLS)
-    counted = {
-        "footprints": known,
+    diameter_cells = 2.0 * np.sqrt(footprints.exceeding_m2 / np.pi) / ground.elevation.cell_m
+    is_gross = footprints.roughness_m >= MIN_GROSS_ROUGHNESS * truth.limits.max_roughness_m
+    is_gross &= diameter_cells >= MIN_GROSS_CELLS
+    masks = {
+        "footprints": valid,
         "footprints_called_safe": safe,
-        "footprints_called_safe_unsafe": safe & ~under.safe,
-        "footprints_truly_safe": known & under.safe,
-        "false_alarms": known & under.safe & at.flagged,
-        "missed": known & ~under.safe & ~at.flagged,
-        "gross_hazards": known & gross,
-        "gross_hazards_called_safe": safe & gross,
-        "gross_hazards_unflagged": known & gross & ~at.flagged,
+        "footprints_called_safe_unsafe": safe & ~footprints.safe,
+        "footprints_truly_safe": valid & footprints.safe,
+        "false_alarms": valid & footprints.safe & sampled.flagged,
+        "missed": valid & ~footprints.safe & ~sampled.flagged,
+        "gross_hazards": valid & is_gross,
+        "gross_hazards_called_safe": safe & is_gross,
+        "gross_hazards_unflagged": valid & is_gross & ~sampled.flagged,
     }
-    for kind, ratio in over.items():
-        classes = np.digitize(ratio, CLASSES)
+    for kind, ratio in ratios.items():
+        classes = np.digitize(ratio, CLASS_BOUNDS)
         for number, name in enumerate(CLASS_NAMES):
-            members = known & (classes == number)
+            members = valid & (classes == number)
             column = f"footprints_{kind}_{name}"
-            counted |= {column: members, f"{column}_safe": members & safe, f"{column}_unflagged": members & ~at.flagged}
-    return {column: int(np.count_nonzero(chosen)) for column, chosen in counted.items()}
+            unflagged = members & ~sampled.flagged
+            masks |= {column: members, f"{column}_safe": members & safe, f"{column}_unflagged": unflagged}
+    return {column: int(np.count_nonzero(mask)) for column, mask in masks.items()}
 
 
-def map_errors(ground: Ground, flight: Flight, at: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
-    """Errors of the map's elevation and slope.
+def map_errors(ground: Ground, flight: Flight, sampled: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
+    """Compute the errors of the map's elevation and slope.
 
-    The elevation is compared with the mean of the exact heights over each cell, relative to the camera. `bias` is the
-    mean error, `rms` its RMS about zero, `noise` the robust standard deviation about the error's plane, which affects
-    roughness; `outliers` is the fraction beyond five of these.
+    The reference elevation is the mean of the exact heights in each cell, relative to the camera. `bias` is the mean
+    error, `rms` its RMS about zero, `noise` the robust standard deviation about the plane fitted to the errors, which
+    affects roughness. `outliers` is the fraction of errors beyond five standard deviations.
     """
     rows, columns = np.indices(ground.elevation.elevation_m.shape)
-    local = ground.elevation.places(np.stack([rows, columns], axis=-1).astype(np.float64))
+    local = ground.elevation.positions(np.stack([rows, columns], axis=-1).astype(np.float64))
     start = flight.states[0].position_m
-    places = start[:2] + local @ ground.world_from_surface.as_matrix()[:2, :2].T
-    exact = truth.relief.average(places, ground.elevation.cell_m) - start[2]
+    positions = start[:2] + local @ ground.world_from_surface.as_matrix()[:2, :2].T
+    exact = truth.relief.average(positions, ground.elevation.cell_m) - start[2]
     error = ground.elevation.elevation_m - exact
-    finite = np.isfinite(error)
-    values = error[finite]
+    is_finite = np.isfinite(error)
+    values = error[is_finite]
     if values.size < 4:
         return {}
-    design = np.column_stack([local[finite], np.ones(values.size)])
-    near = np.abs(values - np.median(values)) <= 5.0 * _deviation(values)
-    level = values - design @ np.linalg.lstsq(design[near], values[near], rcond=None)[0]
-    noise = _deviation(level)
-    slope_errors = (at.slope_rad - truth.footprints.slope_rad)[at.known]
-    some = slope_errors.size > 0
+    design = np.column_stack([local[is_finite], np.ones(values.size)])
+    is_inlier = np.abs(values - np.median(values)) <= 5.0 * _robust_deviation(values)
+    residuals = values - design @ np.linalg.lstsq(design[is_inlier], values[is_inlier], rcond=None)[0]
+    noise = _robust_deviation(residuals)
+    slope_errors = (sampled.slope_rad - truth.footprints.slope_rad)[sampled.valid]
+    has_slopes = slope_errors.size > 0
     return {
         "elevation_bias_m": float(values.mean()),
         "elevation_rms_m": float(np.sqrt(np.mean(values**2))),
         "elevation_median_error_m": float(np.median(np.abs(values))),
         "elevation_noise_m": noise,
-        "elevation_outliers": float(np.mean(np.abs(level) > 5.0 * noise)),
-        "slope_error_bias_deg": float(np.degrees(slope_errors.mean())) if some else float("nan"),
-        "slope_error_rms_deg": float(np.degrees(np.sqrt(np.mean(slope_errors**2)))) if some else float("nan"),
+        "elevation_outliers": float(np.mean(np.abs(residuals) > 5.0 * noise)),
+        "slope_error_bias_deg": float(np.degrees(slope_errors.mean())) if has_slopes else float("nan"),
+        "slope_error_rms_deg": float(np.degrees(np.sqrt(np.mean(slope_errors**2)))) if has_slopes else float("nan"),
     }
 
 
-def _deviation(values: Float[np.ndarray, "n"]) -> float:
-    """Robust standard deviation, at least 1e-12: positive also where more than half of the values are equal."""
+def _robust_deviation(values: Float[np.ndarray, "n"]) -> float:
+    """Compute a robust standard deviation, at least 1e-12 in case more than half of the values are equal."""
     return max(1.4826 * float(np.median(np.abs(values - np.median(values)))), 1e-12)

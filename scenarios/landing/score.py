@@ -1,4 +1,4 @@
-"""Columns and products of a flight: motion, maps, site and landing against the truth; conditions; figure arrays."""
+"""Result columns and products of a landing case: errors of motion, map, site and landing; conditions; figure data."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.algorithms.hda import STAGES, Fate, HdaDetails, hda_products
+from marsyard.algorithms.hda import STAGES, HdaDetails, MatchStatus, hda_products
 from marsyard.algorithms.hda.motion import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.conditions import sun_columns
@@ -15,7 +15,7 @@ from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.helicopter import horizontal_distance_m, land
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, stuck_range_m
-from marsyard.scenarios.landing.pictures import GroundTruth, Pair, RenderedFlight, SampledMap, hazard_counts, map_errors
+from marsyard.scenarios.landing.pictures import GroundTruth, Pair, RenderedFlight, SampledMap, count_hazards, map_errors
 from marsyard.sim.dynamics.rotorcraft import GroundPatch
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor import height_above_ground
@@ -23,15 +23,15 @@ from marsyard.sim.sensor.ranging import RangingUnit
 from marsyard.sim.streams import Streams
 
 NAN = float("nan")
-#: Maximum distance of a correct track from the true pixel.
-CORRECT_PX = 1.0
-#: Distance from the border within which features are not expected to be tracked.
+#: Maximum distance of a correct track from the true pixel, px.
+MAX_TRACK_ERROR_PX = 1.0
+#: Width of the border in which features need not be tracked, px.
 BORDER_PX = 12.0
-#: Minimum fraction of the features in both pictures to be tracked correctly.
-WELL_TRACKED = 0.9
-#: Reasons for dropped matches.
-DROPPED = (Fate.DISSIMILAR, Fate.OUT_OF_BOUNDS, Fate.NOT_RETURNED)
-#: Changes between pictures that tracking tolerates (section II.A): about the optical axis, about the others, of height.
+#: Minimum fraction of correct tracks, among the features in both pictures, of a well-tracked pair.
+MIN_TRACKED_FRACTION = 0.9
+#: Match statuses that are counted: reasons for dropped matches.
+DROP_STATUSES = (MatchStatus.DISSIMILAR, MatchStatus.OUT_OF_BOUNDS, MatchStatus.NOT_RETURNED)
+#: Maximum changes for tracking (section II.A): rotation about the optical axis, about other axes, relative height.
 MAX_ROLL_DEG, MAX_TILT_DEG, MAX_CLIMB = 10.0, 20.0, 0.2
 #: Columns of tracks, motion, structure and map.
 MOTION_COLUMNS = (
@@ -41,8 +41,8 @@ MOTION_COLUMNS = (
     "motion_residual_px", "points", "matched_fraction", "map_rows", "map_columns", "cell_m",
     "matches_dissimilar", "matches_out_of_bounds", "matches_not_returned",
 )  # fmt: skip
-#: Columns of the ground under a lander, after the name of the position.
-PLACE_COLUMNS = ("east_m", "north_m", "slope_deg", "roughness_m", "hazard_distance_m")
+#: Columns of the true ground under a lander; the name of the position is their prefix.
+GROUND_COLUMNS = ("east_m", "north_m", "slope_deg", "roughness_m", "hazard_distance_m")
 TOUCHDOWN_COLUMNS = (
     "touchdown_error_gps_m", "touchdown_error_estimated_m", "touchdown_error_m", "gps_deviation_north_m",
     "gps_deviation_east_m", "gps_solutions", "landing_turns", "landing_moved_m", "landing_after_s",
@@ -51,7 +51,7 @@ TOUCHDOWN_COLUMNS = (
 
 
 def outcome_row(estimate: SiteEstimate) -> dict[str, Scalar]:
-    """The outcome as populations of requirements; omitted for a crashed algorithm, whose case fails in each."""
+    """Compute the outcome columns of requirement populations; a crashed algorithm has none and fails in all."""
     return {
         "converged": estimate.outcome.converged,
         "site_reported": estimate.outcome is SiteOutcome.SAFE_SITE,
@@ -60,86 +60,86 @@ def outcome_row(estimate: SiteEstimate) -> dict[str, Scalar]:
 
 
 def site_populations(truth: GroundTruth) -> dict[str, Scalar]:
-    """Populations by the true ground: no safe site, safe sites without margin only, or sites with a margin.
+    """Classify the flight by the true ground: no safe site, only safe sites without margin, or sites with a margin.
 
-    A site with margin (`wide_site_exists`) has safe positions all around up to a lander's radius. Every flight is in
-    one of `no_safe_site_exists`, `narrow_site_exists` and `wide_site_exists`.
+    The surroundings of a site with margin (`wide_site_exists`) are safe up to a lander's radius. Every flight is in one
+    of `no_safe_site_exists`, `narrow_site_exists` and `wide_site_exists`.
     """
-    safe, margin = bool(np.any(truth.safe)), bool(np.any(truth.safe_with_margin))
+    has_safe_site, has_margin = bool(np.any(truth.safe)), bool(np.any(truth.safe_with_margin))
     return {
-        "safe_site_exists": safe,
-        "no_safe_site_exists": not safe,
-        "narrow_site_exists": safe and not margin,
-        "wide_site_exists": margin,
+        "safe_site_exists": has_safe_site,
+        "no_safe_site_exists": not has_safe_site,
+        "narrow_site_exists": has_safe_site and not has_margin,
+        "wide_site_exists": has_margin,
     }
 
 
 def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict[str, Scalar]:
-    """The reported site against the truth.
+    """Compare the reported site with the ground truth.
 
-    The true site is the reported one minus the navigation error at the first picture. Only SAFE_SITE reports a safe
-    site: where the algorithm did not converge the a-priori site is scored.
+    The true site is the reported site minus the navigation error at the first picture. Only the outcome SAFE_SITE
+    reports a safe site. If the algorithm did not converge, the a-priori site is scored.
     """
     row = _ground_row("site", _true_site(estimate, flight), truth)
-    safe_reported = estimate.outcome is SiteOutcome.SAFE_SITE and bool(row["site_safe"])
-    return {**row, "safe_or_no_site_reported": safe_reported or estimate.outcome is SiteOutcome.NO_SAFE_SITE}
+    reports_safe_site = estimate.outcome is SiteOutcome.SAFE_SITE and bool(row["site_safe"])
+    return {**row, "safe_or_no_site_reported": reports_safe_site or estimate.outcome is SiteOutcome.NO_SAFE_SITE}
 
 
 def _true_site(estimate: SiteEstimate, flight: Flight) -> np.ndarray | None:
-    """True x, y of the reported coordinates; None without a site."""
+    """Compute the true x, y of the reported site; None without a site."""
     return None if estimate.site_world is None else (estimate.site_world - flight.position_error_m)[:2]
 
 
 def _ground_row(name: str, position: np.ndarray | None, truth: GroundTruth) -> dict[str, Scalar]:
-    """The true ground under a lander at a position (x, y)."""
-    columns = [f"{name}_{column}" for column in PLACE_COLUMNS]
-    under = None if position is None else truth.under(position)
-    if position is None or under is None:
+    """Compute the columns of the true ground under a lander at a position (x, y)."""
+    columns = [f"{name}_{column}" for column in GROUND_COLUMNS]
+    footprint = None if position is None else truth.footprint_at(position)
+    if position is None or footprint is None:
         return {f"{name}_safe": False, **dict.fromkeys(columns, NAN)}
-    slope_deg, roughness_m = float(np.degrees(under.slope_rad[0])), float(under.roughness_m[0])
+    slope_deg, roughness_m = float(np.degrees(footprint.slope_rad[0])), float(footprint.roughness_m[0])
     values = (*map(float, position), slope_deg, roughness_m, truth.distance_to_hazard_m(position))
-    return {f"{name}_safe": bool(under.safe[0]), **dict(zip(columns, values, strict=True))}
+    return {f"{name}_safe": bool(footprint.safe[0]), **dict(zip(columns, values, strict=True))}
 
 
 def landing_row(
     p: LandingScenarioParameters, estimate: SiteEstimate, flight: Flight, truth: GroundTruth, streams: Streams
 ) -> dict[str, Scalar]:
-    """The helicopter's touchdown, and the ground there.
+    """Simulate the helicopter's landing; compute the columns of the touchdown and of the ground under it.
 
-    `touchdown_error_gps_m` is the distance of the receiver's averaged solutions from the site's coordinates, as the
-    paper measured it; `touchdown_error_m` that of the true touchdown from the true site, with the navigation error at
-    the first picture taken off; `touchdown_safe` whether it stands safely; `touchdown_sink_m_s` and
-    `touchdown_drift_m_s` are its vertical and horizontal speed. Without a site or a helicopter there is no landing:
-    numbers are NaN, and `touchdown_safe` is absent.
+    `touchdown_error_gps_m` is the distance from the receiver's averaged solutions to the site's coordinates, as
+    measured in the paper. `touchdown_error_m` is the distance from the true touchdown to the true site, which excludes
+    the navigation error at the first picture. `touchdown_safe` is true if the ground under the helicopter is safe.
+    `touchdown_sink_m_s` and `touchdown_drift_m_s` are its vertical and horizontal speed. Without a site or a helicopter
+    there is no landing: numbers are NaN, and `touchdown_safe` is missing.
     """
-    site, relief, landed = estimate.site_world, truth.relief, None
+    site, relief, touchdown = estimate.site_world, truth.relief, None
     if flight.transit is not None and site is not None:
         ground = GroundPatch(np.array([relief.west_m, relief.south_m]), relief.spacing_m, relief.heights_m)
         unit = RangingUnit.draw(p.laser, streams.generator("laser"))
-        landed = land(flight.transit, site, ground, unit, streams, stuck_range_m(p.faults, p.height_m))
-    if landed is None or site is None:
-        columns = (*(f"touchdown_{column}" for column in PLACE_COLUMNS), *TOUCHDOWN_COLUMNS)
+        touchdown = land(flight.transit, site, ground, unit, streams, stuck_range_m(p.faults, p.height_m))
+    if touchdown is None or site is None:
+        columns = (*(f"touchdown_{column}" for column in GROUND_COLUMNS), *TOUCHDOWN_COLUMNS)
         return {"landed": False, **dict.fromkeys(columns, NAN)}
-    position, velocity = landed.state.position_m, landed.state.velocity_m_s
+    position, velocity = touchdown.state.position_m, touchdown.state.velocity_m_s
     numbers = (
-        horizontal_distance_m(landed.gps_m, site),
-        horizontal_distance_m(landed.believed_m, site),
+        horizontal_distance_m(touchdown.gps_m, site),
+        horizontal_distance_m(touchdown.estimated_m, site),
         horizontal_distance_m(position, site - flight.position_error_m),
-        float(landed.gps_deviation_m[1]),
-        float(landed.gps_deviation_m[0]),
-        landed.gps_solutions,
-        landed.iterations,
-        landed.change_m,
-        landed.time_s - flight.states[1].time_s,
+        float(touchdown.gps_deviation_m[1]),
+        float(touchdown.gps_deviation_m[0]),
+        touchdown.gps_solutions,
+        touchdown.iterations,
+        touchdown.change_m,
+        touchdown.time_s - flight.states[1].time_s,
         -float(velocity[2]),
         float(np.hypot(*velocity[:2])),
     )
-    below = _ground_row("touchdown", position[:2], truth)
-    return {"landed": True, **below, **dict(zip(TOUCHDOWN_COLUMNS, numbers, strict=True))}
+    ground_row = _ground_row("touchdown", position[:2], truth)
+    return {"landed": True, **ground_row, **dict(zip(TOUCHDOWN_COLUMNS, numbers, strict=True))}
 
 
 def true_motion(flight: Flight, pair: Pair) -> RigidTransform:
-    """The true motion from the first to the second camera's frame."""
+    """Compute the true motion from the first to the second camera's frame."""
     first, second = (
         state.world_from_body * camera_pose(image.camera)
         for state, image in zip(flight.states, pair.images, strict=True)
@@ -148,7 +148,7 @@ def true_motion(flight: Flight, pair: Pair) -> RigidTransform:
 
 
 def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]:
-    """Tracks, and the motion against the true one; NaN for stages that were not reached."""
+    """Compute the columns of tracks and motion errors; NaN for stages that were not reached."""
     row: dict[str, Scalar] = dict.fromkeys(MOTION_COLUMNS, NAN)
     row["tracked_well"] = False
     if not isinstance(details, HdaDetails):
@@ -157,44 +157,47 @@ def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]
         row["features"] = 0
     elif details.tracks is not None:
         tracks = details.tracks
-        column, line = np.rint(tracks.first).astype(np.int64).T
-        points = pair.frames[0].points_world()[line * pair.images[0].calibration.rows_summed, column]
+        column, row_index = np.rint(tracks.first).astype(np.int64).T
+        points = pair.frames[0].points_world()[row_index * pair.images[0].calibration.rows_summed, column]
         camera = pair.images[1].camera.transform(flight.states[1].world_from_body)
-        pixels, ahead = camera.project(points)
+        pixels, in_front = camera.project(points)
         with np.errstate(invalid="ignore"):
-            inside = np.all((pixels >= BORDER_PX) & (pixels <= np.array(camera.size) - 1.0 - BORDER_PX), axis=1) & ahead
-            right = tracks.accepted & inside & (np.hypot(*(tracks.second - pixels).T) <= CORRECT_PX)
+            in_view = np.all((pixels >= BORDER_PX) & (pixels <= np.array(camera.size) - 1.0 - BORDER_PX), axis=1)
+            in_view &= in_front
+            is_correct = tracks.accepted & in_view & (np.hypot(*(tracks.second - pixels).T) <= MAX_TRACK_ERROR_PX)
         accepted = int(tracks.accepted.sum())
         row |= {
             "features": len(tracks.first),
             "tracks": accepted,
-            "features_in_view": int(inside.sum()),
-            "tracks_correct": int(right.sum()),
-            "tracked_fraction": float(right.sum() / inside.sum()) if np.any(inside) else NAN,
-            "tracked_well": bool(np.any(inside) and right.sum() >= WELL_TRACKED * inside.sum()),
-            "tracks_outlier_fraction": float(np.mean(~right[tracks.accepted])) if accepted else NAN,
+            "features_in_view": int(in_view.sum()),
+            "tracks_correct": int(is_correct.sum()),
+            "tracked_fraction": float(is_correct.sum() / in_view.sum()) if np.any(in_view) else NAN,
+            "tracked_well": bool(np.any(in_view) and is_correct.sum() >= MIN_TRACKED_FRACTION * in_view.sum()),
+            "tracks_outlier_fraction": float(np.mean(~is_correct[tracks.accepted])) if accepted else NAN,
         }
     if details.motion is not None:
         row |= motion_errors(details.motion.second_from_first, true_motion(flight, pair))
-    return row | solved_row(details)
+    return row | stage_row(details)
 
 
-def motion_errors(found: RigidTransform, true: RigidTransform) -> dict[str, Scalar]:
-    """Errors of a motion from the first to the second camera's frame."""
-    (a, length), (b, true_length) = (
-        (np.array(motion.translation), float(np.linalg.norm(motion.translation))) for motion in (found, true)
+def motion_errors(estimated: RigidTransform, true: RigidTransform) -> dict[str, Scalar]:
+    """Compute the errors of an estimated motion from the first to the second camera's frame."""
+    (translation, length), (true_translation, true_length) = (
+        (np.array(motion.translation), float(np.linalg.norm(motion.translation))) for motion in (estimated, true)
     )
-    direction = float(np.linalg.norm(a / length - b / true_length)) if length and true_length else NAN
+    is_defined = length and true_length
+    chord = float(np.linalg.norm(translation / length - true_translation / true_length)) if is_defined else NAN
+    error = float(np.linalg.norm(translation - true_translation))
     return {
-        "rotation_error_deg": float(np.degrees((found.rotation * true.rotation.inv()).magnitude())),
-        "direction_error_deg": float(np.degrees(2.0 * np.arcsin(min(direction / 2.0, 1.0)))),
+        "rotation_error_deg": float(np.degrees((estimated.rotation * true.rotation.inv()).magnitude())),
+        "direction_error_deg": float(np.degrees(2.0 * np.arcsin(min(chord / 2.0, 1.0)))),
         "length_error_m": length - true_length,
-        "baseline_error_fraction": float(np.linalg.norm(a - b)) / true_length if true_length > 0.0 else NAN,
+        "baseline_error_fraction": error / true_length if true_length > 0.0 else NAN,
     }
 
 
-def solved_row(details: HdaDetails) -> dict[str, Scalar]:
-    """Inliers, matches and map size; without columns of stages that were not reached."""
+def stage_row(details: HdaDetails) -> dict[str, Scalar]:
+    """Compute the columns of inliers, matches and map size; only for stages that were reached."""
     row: dict[str, Scalar] = {}
     if details.motion is not None:
         row |= {
@@ -205,7 +208,7 @@ def solved_row(details: HdaDetails) -> dict[str, Scalar]:
     if details.matches is not None:
         matches = details.matches
         row |= {"points": len(matches.points), "matched_fraction": float(matches.accepted.mean())}
-        row |= {f"matches_{fate.name.lower()}": int(np.sum(matches.fates == fate)) for fate in DROPPED}
+        row |= {f"matches_{status.name.lower()}": int(np.sum(matches.statuses == status)) for status in DROP_STATUSES}
     if details.ground is not None:
         rows, columns = details.ground.elevation.elevation_m.shape
         row |= {"map_rows": rows, "map_columns": columns, "cell_m": details.ground.elevation.cell_m}
@@ -213,7 +216,7 @@ def solved_row(details: HdaDetails) -> dict[str, Scalar]:
 
 
 def times_row(details: object) -> dict[str, Scalar]:
-    """Processor time of the stages of Table I; NaN for stages that were not reached."""
+    """Compute the columns of processor times of the stages in Table I; NaN for stages that were not reached."""
     stage_times_s = details.times_s if isinstance(details, HdaDetails) else {}
     return {f"{stage}_time_s": stage_times_s.get(stage, NAN) for stage in STAGES}
 
@@ -221,16 +224,16 @@ def times_row(details: object) -> dict[str, Scalar]:
 def map_row(
     p: LandingScenarioParameters, estimate: SiteEstimate, flight: Flight, truth: GroundTruth
 ) -> dict[str, Scalar]:
-    """The maps against the truth; empty without a map."""
+    """Compute the columns of map errors and hazard counts; empty without a map."""
     if not isinstance(estimate.details, HdaDetails) or estimate.details.ground is None:
         return {}
     ground = estimate.details.ground
-    at = SampledMap.of(ground, flight, truth, (p.hda.max_slope_rad, p.hda.max_roughness_m))
-    return {**map_errors(ground, flight, at, truth), **hazard_counts(ground, at, truth)}
+    sampled_map = SampledMap.sample(ground, flight, truth, (p.hda.max_slope_rad, p.hda.max_roughness_m))
+    return {**map_errors(ground, flight, sampled_map, truth), **count_hazards(ground, sampled_map, truth)}
 
 
 def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[str, Scalar]:
-    """Conditions of the case, read from the simulated objects."""
+    """Compute the columns of a case's conditions from the simulated objects."""
     p, pair, truth = case.p, case.pair, case.truth
     covered = truth.covered
     slopes = truth.footprints.slope_rad[covered]
@@ -241,7 +244,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     motion = second.position_m - first.position_m
     positions = np.stack([first.position_m, second.position_m])
     height = float(height_above_ground(case.world.ground.surface, positions)[0])
-    upright = first.attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
+    up = first.attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
     rotation_deg = (first.attitude.inv() * second.attitude).as_rotvec(degrees=True)
     within_limits = (
         roll < MAX_ROLL_DEG + 0.5
@@ -261,7 +264,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
         "baseline_fraction": float(np.hypot(*motion[:2]) / height),
         "pair_rotation_deg": float(np.linalg.norm(rotation_deg)),
         **{f"{axis}_deg": float(angle) for axis, angle in zip(("pitch", "yaw", "roll"), rotation_deg, strict=True)},
-        "off_nadir_deg": float(np.degrees(np.arccos(np.clip(upright[2], -1.0, 1.0)))),
+        "off_nadir_deg": float(np.degrees(np.arccos(np.clip(up[2], -1.0, 1.0)))),
         "exposure_s": pair.images[0].calibration.exposure_s,
         "picture_median_dn": float(np.median(pair.counts[0])),
         "range_m": pair.axis_range_m,
@@ -286,11 +289,11 @@ def _navigation_errors(flight: Flight, measurements: LandingMeasurements) -> dic
         (pose.world_from_body.rotation * state.attitude.inv()).as_rotvec()
         for pose, state in zip(poses, states, strict=True)
     )
-    upright = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
-    level = float(np.arccos(np.clip(upright @ measurements.up_body, -1.0, 1.0)))
+    up = states[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0]))
+    level_error = float(np.arccos(np.clip(up @ measurements.up_body, -1.0, 1.0)))
     motion_error = np.array(poses[1].world_from_body.translation) - states[1].position_m - flight.position_error_m
     return {
-        "level_error_deg": float(np.degrees(level)),
+        "level_error_deg": float(np.degrees(level_error)),
         "pose_position_error_m": float(np.linalg.norm(flight.position_error_m)),
         "pose_motion_error_m": float(np.linalg.norm(motion_error)),
         "pose_tilt_error_deg": float(np.degrees(np.hypot(*first[:2]))),
@@ -300,27 +303,27 @@ def _navigation_errors(flight: Flight, measurements: LandingMeasurements) -> dic
 
 
 def products(case: RenderedFlight, estimate: SiteEstimate) -> dict[str, Any]:
-    """Arrays for the case's figures.
+    """Return the arrays for the case's figures.
 
-    Those of `marsyard.algorithms.hda.hda_products` (Figs. 1-5 and 7), and
+    They are those of `marsyard.algorithms.hda.hda_products` (Figs. 1-5 and 7), and
 
     - `image_1`, `image_2`: the pictures;
-    - `true_rotation`, `true_translation`: of the second from the first camera;
-    - `true_places`, `true_slope`, `true_roughness`, `true_safe`, `true_covered`: the truth's lattice, world axes;
+    - `true_rotation`, `true_translation`: true motion from the first to the second camera's frame;
+    - `true_places`, `true_slope`, `true_roughness`, `true_safe`, `true_covered`: the truth's sampling grid, world axes;
     - `true_heights`, `true_corner`, `true_spacing`: exact heights, world axes (row i at y = corner[1] + i spacing);
-    - `camera_true`, `camera_believed`: poses of the body at the first picture (4 x 4), true and on board;
+    - `camera_true`, `camera_believed`: body poses at the first picture (4 x 4), true and estimated on board;
     - `limits`: the algorithm's limits of slope (radians) and roughness (metres), and the lander's diameter;
     - `site_true`: true x, y of the reported site (see `site_row`).
     """
     p, flight, pair, truth = case.p, case.flight, case.pair, case.truth
-    kept: dict[str, Any] = {"image_1": pair.counts[0], "image_2": pair.counts[1]}
+    arrays: dict[str, Any] = {"image_1": pair.counts[0], "image_2": pair.counts[1]}
     if isinstance(estimate.details, HdaDetails):
-        kept |= hda_products(estimate.details)
+        arrays |= hda_products(estimate.details)
     true = true_motion(flight, pair)
-    kept |= {
+    arrays |= {
         "true_rotation": true.rotation.as_matrix(),
         "true_translation": np.array(true.translation),
-        "true_places": truth.places,
+        "true_places": truth.positions,
         "true_slope": truth.footprints.slope_rad,
         "true_roughness": truth.footprints.roughness_m,
         "true_safe": truth.footprints.safe,
@@ -333,4 +336,4 @@ def products(case: RenderedFlight, estimate: SiteEstimate) -> dict[str, Any]:
         "limits": np.array([p.hda.max_slope_rad, p.hda.max_roughness_m, truth.limits.diameter_m]),
     }
     site = _true_site(estimate, flight)
-    return kept if site is None else {**kept, "site_true": site}
+    return arrays if site is None else {**arrays, "site_true": site}

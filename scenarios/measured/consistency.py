@@ -1,10 +1,10 @@
-"""Compare pictures with measured poses by feature matches and their distance from the epipolar lines.
+"""Compare pictures with measured poses: match features, and measure their distance from the epipolar lines.
 
-SIFT features (Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 60, 2004) are matched by the
-ratio test and a cross check. Matches that no rigid motion explains (essential matrix by RANSAC, independent of the
-poses) are outliers and left out. By the poses, a feature of the earlier picture lies on an epipolar curve of the later
-one, from the direction of the earlier camera to the feature's own direction at infinity. The offset is the distance of
-the match from the nearest point of that curve, which is a single point for pictures from one position.
+SIFT features (Lowe, "Distinctive Image Features from Scale-Invariant Keypoints", IJCV 60, 2004) are matched with the
+ratio test and a cross check. Matches that no rigid motion explains (essential matrix with RANSAC, independent of the
+poses) are outliers and ignored. According to the poses, a feature of the earlier picture is on an epipolar curve of the
+later picture: from the direction of the earlier camera to the feature's direction at infinity. The offset is the
+distance of the match from the nearest point of that curve, which is a single point for pictures from one position.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from marsyard.scenarios.interface import Scalar
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import DetectorImage
 
-#: Maximum number of features of a picture; the ratio of Lowe's Fig. 11.
+#: Maximum number of features of a picture; maximum distance ratio (Lowe, Fig. 11).
 _MAX_FEATURES, _RATIO = 4000, 0.8
 #: RANSAC: maximum distance of an inlier from its epipolar line, pixels, and probability of a clean sample.
 _MAX_DISTANCE_PX, _CONFIDENCE = 2.0, 0.9999
 #: Minimum number of matches: an essential matrix passes through any five.
 MIN_MATCHES = 15
-#: Distance of a point at infinity, m.
-_FAR_M = 1e7
+#: Distance that represents infinity, m.
+_INFINITY_M = 1e7
 #: Quantiles of the counts that become black and white.
 _STRETCH = (0.005, 0.995)
 
@@ -48,9 +48,9 @@ class PairMatches:
 
 @dataclass(frozen=True, eq=False)
 class PairAgreement:
-    """The matches of two pictures, and their offsets from the positions that poses predict.
+    """Matches of two pictures, and their offsets from the positions that the poses predict.
 
-    The offsets are in pixels of the later picture; NaN where its camera cannot see the predicted point.
+    The offsets are in pixels of the later picture; NaN if its camera cannot see the predicted point.
     """
 
     matches: PairMatches
@@ -66,7 +66,7 @@ class PairAgreement:
 
 
 def match_images(images: Sequence[DetectorImage]) -> list[PairMatches]:
-    """Match the features of each picture with those of the next."""
+    """Match the features of each picture with those of the next picture."""
     features = [_detect_features(image) for image in images]
     return list(map(_match_pair, itertools.pairwise(images), itertools.pairwise(features)))
 
@@ -77,13 +77,13 @@ def compare_with_poses(
     """Compare the matches of a case's pictures with the body's pose at each picture."""
     cameras = [image.camera.transform(pose) for image, pose in zip(images, poses, strict=True)]
     return [
-        PairAgreement(one, offsets_px(before, after, one.pixels[0], one.pixels[1]))
-        for one, (before, after) in zip(pairs, itertools.pairwise(cameras), strict=True)
+        PairAgreement(pair, epipolar_offsets_px(earlier, later, pair.pixels[0], pair.pixels[1]))
+        for pair, (earlier, later) in zip(pairs, itertools.pairwise(cameras), strict=True)
     ]
 
 
 def agreement_row(pairs: Sequence[PairAgreement]) -> dict[str, Scalar]:
-    """Return the columns of a case: matches, residuals of all pairs, and the worst pair's median; NaN without any."""
+    """Return the columns of a case: matches, residuals of all pairs, worst pair's median; NaN without matches."""
     nan = float("nan")
     residuals = np.concatenate([pair.residuals_px for pair in pairs])
     inliers = np.concatenate([pair.matches.inliers for pair in pairs])
@@ -112,23 +112,23 @@ def agreement_products(images: Sequence[DetectorImage], pairs: Sequence[PairAgre
 
 
 def _detect_features(image: DetectorImage) -> _Features:
-    """Detect SIFT features on about square pixels, without the flat field; return pixels as delivered, descriptors."""
+    """Detect SIFT features on nearly square pixels, without the flat field; return delivered pixels and descriptors."""
     fu, fv = image.camera.focal_lengths
     rows, columns = image.counts.shape
-    across, down = _binning(fu / fv, columns), _binning(fv / fu, rows)
+    column_bin, row_bin = _binning(fu / fv, columns), _binning(fv / fu, rows)
     signal = (image.counts - image.calibration.offset_dn) / image.calibration.flat_field
-    square = signal.reshape(rows // down, down, columns // across, across).mean(axis=(1, 3))
-    black, white = np.quantile(square, _STRETCH)
-    grey = np.clip((square - black) / max(white - black, 1e-9) * 255.0, 0.0, 255.0).astype(np.uint8)
+    binned = signal.reshape(rows // row_bin, row_bin, columns // column_bin, column_bin).mean(axis=(1, 3))
+    black, white = np.quantile(binned, _STRETCH)
+    grey = np.clip((binned - black) / max(white - black, 1e-9) * 255.0, 0.0, 255.0).astype(np.uint8)
     points, descriptors = cv2.SIFT.create(nfeatures=_MAX_FEATURES).detectAndCompute(grey, None)
     if descriptors is None:
         return np.empty((0, 2)), np.empty((0, 128), dtype=np.float32)
-    binned = np.array([point.pt for point in points], dtype=np.float64)
-    return (binned + 0.5) * np.array([across, down]) - 0.5, descriptors
+    binned_points = np.array([point.pt for point in points], dtype=np.float64)
+    return (binned_points + 0.5) * np.array([column_bin, row_bin]) - 0.5, descriptors
 
 
 def _binning(ratio: float, extent: int) -> int:
-    """Return the number of pixels to average along a side whose sampling is finer than the other's by `ratio`."""
+    """Return the number of pixels to average along a side that is sampled more finely than the other by `ratio`."""
     factor = max(round(ratio), 1)
     return factor if extent % factor == 0 else 1
 
@@ -142,22 +142,22 @@ def _match_pair(images: tuple[DetectorImage, DetectorImage], features: tuple[_Fe
     matches: dict[tuple[float, ...], tuple[int, int]] = {}
     if len(earlier) >= 2 and len(later) >= 2:
         matcher = cv2.BFMatcher(cv2.NORM_L2)
-        back = {one.queryIdx: one.trainIdx for (one,) in matcher.knnMatch(later_descriptors, descriptors, k=1)}
-        # one feature of several orientations is one match
+        reverse = {match.queryIdx: match.trainIdx for (match,) in matcher.knnMatch(later_descriptors, descriptors, k=1)}
+        # several orientations of one feature are one match
         matches = {
             tuple(earlier[best.queryIdx].tolist()): (best.queryIdx, best.trainIdx)
             for best, next_best in matcher.knnMatch(descriptors, later_descriptors, k=2)
-            if best.distance < _RATIO * next_best.distance and back.get(best.trainIdx) == best.queryIdx
+            if best.distance < _RATIO * next_best.distance and reverse.get(best.trainIdx) == best.queryIdx
         }
     indices = np.array(list(matches.values()), dtype=np.intp).reshape(-1, 2)
     pixels = np.stack([earlier[indices[:, 0]], later[indices[:, 1]]])
     inliers = np.zeros(len(indices), dtype=np.bool_)
     if len(indices) >= MIN_MATCHES:
         points = []
-        for image, some in zip(images, pixels, strict=True):
-            # normalised image coordinates: the rays' intersections with the plane at unit distance
+        for image, image_pixels in zip(images, pixels, strict=True):
+            # normalised image coordinates: intersections of the rays with the plane at unit distance
             axes = np.stack([image.camera.right, image.camera.down, image.camera.a])
-            x, y, z = (image.camera.rays(some)[1] @ axes.T).T
+            x, y, z = (image.camera.rays(image_pixels)[1] @ axes.T).T
             points.append(np.stack([x, y], axis=1) / np.maximum(z, 1e-3)[:, None])
         focal = 0.5 * sum(float(np.sqrt(np.prod(image.camera.focal_lengths))) for image in images)
         limit = _MAX_DISTANCE_PX / focal
@@ -168,7 +168,7 @@ def _match_pair(images: tuple[DetectorImage, DetectorImage], features: tuple[_Fe
     return PairMatches(pixels, inliers)
 
 
-def offsets_px(
+def epipolar_offsets_px(
     first: CameraModel,
     second: CameraModel,
     pixels: Float64[np.ndarray, "n 2"],
@@ -176,10 +176,10 @@ def offsets_px(
 ) -> Float64[np.ndarray, "n 2"]:
     """Return the offsets of matches from the nearest points of their epipolar curves in the second picture, pixels.
 
-    The cameras are in one frame. NaN where the second camera cannot see the point. From the second camera, a ray of the
-    first spans the arc from the direction of the first camera, `baseline`, to the ray's own direction. The nearest
-    point, in angle, is where the second camera's ray, projected onto the plane of the arc, meets the first's: p with
-    ``p x (baseline + s direction) = 0``.
+    The cameras are in one frame. NaN if the second camera cannot see the point. From the second camera, a ray of the
+    first camera spans the arc from the direction of the first camera, `baseline`, to the direction of the ray. The
+    nearest point p, in angle, is the intersection of the first ray with the second camera's ray, projected onto the
+    plane of the arc: ``p x (baseline + s direction) = 0``.
     """
     origins, directions = first.rays(pixels)
     later_origins, later_directions = second.rays(later_pixels)
@@ -188,13 +188,13 @@ def offsets_px(
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0.0)
     projected = later_directions - np.sum(later_directions * normals, axis=1, keepdims=True) * normals
-    from_first, along = np.cross(projected, baselines), np.cross(projected, directions)
-    scale = np.sum(along * along, axis=1)
+    from_first, from_direction = np.cross(projected, baselines), np.cross(projected, directions)
+    scale = np.sum(from_direction * from_direction, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        distances = -np.sum(from_first * along, axis=1) / scale
-    ahead = np.sum((baselines + distances[:, None] * directions) * projected, axis=1) > 0.0
-    reached = np.isfinite(distances) & (distances > 0.0) & ahead & (lengths[:, 0] > 0.0)
-    # outside the arc the end at infinity is taken: no ground lies in front of the first camera's lens
-    distances = np.where(reached, np.minimum(distances, _FAR_M), _FAR_M)
+        distances = -np.sum(from_first * from_direction, axis=1) / scale
+    is_in_front = np.sum((baselines + distances[:, None] * directions) * projected, axis=1) > 0.0
+    is_inside_arc = np.isfinite(distances) & (distances > 0.0) & is_in_front & (lengths[:, 0] > 0.0)
+    # outside the arc, use the end at infinity: no ground is in front of the first camera's lens
+    distances = np.where(is_inside_arc, np.minimum(distances, _INFINITY_M), _INFINITY_M)
     predicted, _ = second.project(origins + distances[:, None] * directions)
     return np.asarray(later_pixels - predicted)

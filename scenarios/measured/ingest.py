@@ -1,4 +1,4 @@
-"""Convert a folder of recorded pictures into cases on disk and the campaign over them: `marsyard ingest`."""
+"""Convert a folder of recorded pictures into stored cases and their campaign: `marsyard ingest`."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from marsyard.sim.frames import SITE_FROM_WORLD
 
 _POSITION = ("x_m", "y_m", "z_m")
 #: Maximum number of rows that a detector sums, and the tolerance of the ratio of a camera's scales relative to a whole
-#: number. Calibrated focal lengths are better than 1 %; the next whole number after 8 is 12 % away.
+#: number. Calibrated focal lengths are accurate to 1 %; the next whole number after 8 differs by 12 %.
 _MAX_SUMMED_ROWS, _RATIO_TOLERANCE = 64, 0.05
 _DESCRIPTIONS = {
     "velocity": "Real descents: horizontal velocity from three pictures.",
@@ -49,22 +49,22 @@ _DESCRIPTIONS = {
 
 
 def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
-    """Write the cases of a folder, and return the campaign over them.
+    """Write the cases of a folder, and return their campaign.
 
-    - source: A folder with `ingest.toml`, `pictures.csv` and pictures (docs/real-pictures.md)
-    - target, final: the folder that the cases are written to, and the folder that they are moved to afterwards
+    - source: folder with `ingest.toml`, `pictures.csv` and pictures (docs/real-pictures.md)
+    - target, final: folder that the cases are written to, and folder that they are moved to afterwards
 
-    Raises ValueError where the folder cannot be used: the message names the file, and the line or key. Raises OSError
-    where the cases cannot be written.
+    Raises ValueError if the folder is invalid: the message contains the file, and the line or key. Raises OSError if
+    the cases cannot be written.
     """
     path, stored = ingest(source, target)
     rows_summed, note, binned_size = stored.detector.rows_summed, "", None
     if rows_summed > 1 and read_ingest_file(source).detector.rows_summed is None:
         note = (
-            f"rows_summed = {rows_summed}: taken from the camera, whose pixels are longer than wide by "
-            f"that factor; rows_summed under [detector] of {INGEST_FILE} says otherwise"
+            f"rows_summed = {rows_summed}: computed from the camera, whose pixels are longer than wide by "
+            f"that factor; rows_summed under [detector] of {INGEST_FILE} overrides it"
         )
-    if stored.task == VELOCITY:  # DIMES bins the delivered pictures, whose rows are summed already
+    if stored.task == VELOCITY:  # DIMES bins the delivered pictures, whose rows are already summed
         columns, rows = stored.cases[0].pictures[0].size
         binned_size = binned_size_for(columns, rows * rows_summed)
         binned_size = binned_size if rows % binned_size[1] == 0 else (columns, rows)
@@ -84,8 +84,8 @@ def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
 def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
     """Write the cases of a folder into an existing folder; return the path of `cases.json` and its contents.
 
-    Raises IngestError where the folder cannot be used: the message names the file, and the line or key. Raises OSError
-    where the cases cannot be written.
+    Raises IngestError if the folder is invalid: the message contains the file, and the line or key. Raises OSError if
+    the cases cannot be written.
     """
     file, table = read_ingest_file(source), source / TABLE_FILE
     reader = _FolderReader(source, file, target)
@@ -118,7 +118,7 @@ def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
 def infer_summed_rows(camera: CameraModel) -> int:
     """Infer the number of detector rows in a delivered row from the ratio of the focal lengths.
 
-    Returns 1 where the ratio is near no whole number: the pixels are not sums of square ones.
+    Returns 1 if the ratio is not near a whole number: then the pixels are not sums of square pixels.
     """
     ratio = camera.focal_lengths[0] / camera.focal_lengths[1]
     divisor = round(ratio)
@@ -140,7 +140,7 @@ class _Picture:
 
 @dataclass
 class _FolderReader:
-    """Reads the cases of `source` and writes them to `target`; cameras and flat fields are written once each."""
+    """Reads the cases of `source` and writes them to `target`; each camera and flat field is written once."""
 
     source: Path
     file: IngestFile
@@ -151,14 +151,14 @@ class _FolderReader:
     def store_case(self, number: int, name: str, rows: Sequence[PictureRow]) -> store.StoredCase:
         """Read and check one case, and write its pictures."""
         pictures = [self._read_picture(row) for row in rows]
-        for before, after in itertools.pairwise(pictures):
-            if after.time_s <= before.time_s:
-                raise after.row.error(f"time goes from {before.time_s:g} to {after.time_s:g} s; allowed: onwards")
-        stored = [self._store_picture(f"{number:06d}-{index}", one) for index, one in enumerate(pictures, start=1)]
-        measured: dict[str, Any] = {}
+        for earlier, later in itertools.pairwise(pictures):
+            if later.time_s <= earlier.time_s:
+                raise later.row.error(f"time goes from {earlier.time_s:g} to {later.time_s:g} s; it must increase")
+        stored = [self._store_picture(f"{number:06d}-{index}", item) for index, item in enumerate(pictures, start=1)]
+        measurements: dict[str, Any] = {}
         truth = self._read_truth(pictures)
         if self.file.task == VELOCITY:
-            measured["interval_velocities_m_s"] = tuple(map(self._mean_velocity, pictures, pictures[1:]))
+            measurements["interval_velocities_m_s"] = tuple(map(self._mean_velocity, pictures, pictures[1:]))
             angles, sun = rows[0].vector("sun_azimuth_deg", "sun_elevation_deg"), self.file.sun
             if angles is not None:
                 azimuth, elevation = angles.tolist()
@@ -167,39 +167,39 @@ class _FolderReader:
                 sun = SunTable.model_construct(azimuth_deg=azimuth, elevation_deg=elevation)
             if sun is None:
                 raise rows[0].error(f"no sun: neither sun_azimuth_deg and sun_elevation_deg nor {INGEST_FILE}'s [sun]")
-            measured["sun_direction"] = _vector(sun.direction)
+            measurements["sun_direction"] = _vector(sun.direction)
         elif self.file.task == LANDING:
-            measured["slant_range_m"] = rows[0].numbers.get("slant_range_m")
-            measured["site_m"] = self._apriori_site(pictures[0], measured["slant_range_m"])
-        elif len({one.position_m is None for one in pictures}) > 1:
+            measurements["slant_range_m"] = rows[0].numbers.get("slant_range_m")
+            measurements["site_m"] = self._apriori_site(pictures[0], measurements["slant_range_m"])
+        elif len({picture.position_m is None for picture in pictures}) > 1:
             raise rows[0].error(f"case '{name}': some pictures have a position and some have none")
-        return store.StoredCase(name=name, pictures=tuple(stored), truth=truth, **measured)
+        return store.StoredCase(name=name, pictures=tuple(stored), truth=truth, **measurements)
 
     def _read_picture(self, row: PictureRow) -> _Picture:
-        """Read a row's picture and its camera in the body frame; a PDS3 label supplies what the row leaves out."""
+        """Read a row's picture and its camera in the body frame; a PDS3 label supplies missing values of the row."""
         path, table = self.source / row.texts["file"], self.file.camera
         is_product = is_pds3(file_head(path))
-        named = row.texts.get("camera", table.file)
-        if named is None and not is_product:
-            raise row.error(f"no camera: neither the column camera nor {INGEST_FILE}'s camera.file names one")
-        camera_file = path if named is None else self.source / named
+        camera_name = row.texts.get("camera", table.file)
+        if camera_name is None and not is_product:
+            raise row.error(f"no camera: the column camera and camera.file of {INGEST_FILE} are both empty")
+        camera_file = path if camera_name is None else self.source / camera_name
         cameras = read_cameras(str(camera_file), subframe_folded_in=table.subframe_folded_in)
         if table.number >= len(cameras):
-            raise row.error(f"{camera_file}: holds {len(cameras)} cameras; camera.number is {table.number}")
+            raise row.error(f"{camera_file}: contains {len(cameras)} cameras; camera.number is {table.number}")
         camera, rotation = cameras[table.number], row.rotation()
-        if not table.placed and rotation is not None:  # the row's attitude is that of a camera that looks down
+        if not table.placed and rotation is not None:  # the row's attitude is that of a camera looking down
             camera = mount_looking_down(camera)
         product = read_pds3_product(path) if is_product else None
         counts = read_counts(path, camera.size) if product is None else product.counts
-        allowed = (1 << self.file.detector.bits) - 1
-        if counts.max() > allowed:
+        max_count = (1 << self.file.detector.bits) - 1
+        if counts.max() > max_count:
             raise row.error(
-                f"{path}: holds counts up to {counts.max()}; detector.bits = {self.file.detector.bits} allows {allowed}"
+                f"{path}: has counts up to {counts.max()}; detector.bits = {self.file.detector.bits} allows {max_count}"
             )
         if rotation is not None:
             attitude, position = self._body_pose(row, rotation, row.vector(*_POSITION))
         elif product is None or product.site_from_rover is None:
-            raise row.error("qx to qw are empty, and no label states them")
+            raise row.error("qx to qw are empty, and no label contains them")
         else:  # the label's body is the rover
             world, pose = SITE_FROM_WORLD.inv(), product.site_from_rover
             attitude, position = world * pose.rotation, np.asarray(world.apply(pose.translation))
@@ -208,11 +208,11 @@ class _FolderReader:
             elevation = np.degrees(np.arcsin(np.clip(up, -1.0, 1.0)))
             raise row.error(
                 f"the camera looks up, {elevation:.1f} deg above the horizon; allowed: down ({INGEST_FILE}: "
-                "poses.axes, attitude_of and mounting say whose axes are meant)"
+                "poses.axes, attitude_of and mounting define the axes)"
             )
         time_s = row.numbers.get("time_s", None if product is None else product.time_s)
         if time_s is None:
-            raise row.error("time_s is empty, and no label states it")
+            raise row.error("time_s is empty, and no label contains it")
         return _Picture(row, counts, camera, time_s, attitude, position)
 
     def _body_pose(
@@ -220,15 +220,15 @@ class _FolderReader:
     ) -> tuple[Rotation, Float64[np.ndarray, "3"] | None]:
         poses = self.file.poses
         if poses is None:
-            raise row.error(f"quaternions are given, but {INGEST_FILE} has no [poses] that says in which axes")
+            raise row.error(f"quaternions need [poses] in {INGEST_FILE}, which defines their axes")
         vehicle = poses.world * rotation
         if position is None:
-            return poses.bodies(vehicle), None
-        return poses.bodies(vehicle), np.asarray(poses.world.apply(position) + poses.levers(vehicle))
+            return poses.body_attitudes(vehicle), None
+        return poses.body_attitudes(vehicle), np.asarray(poses.world.apply(position) + poses.lever_arms(vehicle))
 
     def _to_world(self, row: PictureRow, vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
         if self.file.poses is None:
-            raise row.error(f"vectors are given, but {INGEST_FILE} has no [poses] that says in which axes")
+            raise row.error(f"vectors need [poses] in {INGEST_FILE}, which defines their axes")
         return np.asarray(self.file.poses.world.apply(vector))
 
     def _store_picture(self, name: str, picture: _Picture) -> store.StoredPicture:
@@ -237,9 +237,9 @@ class _FolderReader:
             self.cameras[camera] = store.write_camera(self.target, len(self.cameras), camera)
         if self.file.task == LANDING and picture.position_m is None:
             raise row.error("x_m, y_m, z_m are empty; landing needs them")
-        flat_field, named = None, row.texts.get("flat_field", self.file.detector.flat_field)
-        if named is not None:
-            path = self.source / named
+        flat_field, flat_field_name = None, row.texts.get("flat_field", self.file.detector.flat_field)
+        if flat_field_name is not None:
+            path = self.source / flat_field_name
             if path not in self.flat_fields:
                 response, file = read_flat_field(path), f"{len(self.flat_fields):06d}.npy"
                 flat_field = store.write_file(
@@ -248,7 +248,7 @@ class _FolderReader:
                 self.flat_fields[path] = flat_field, response.shape
             flat_field, shape = self.flat_fields[path]
             if shape != counts.shape:
-                raise row.error(f"{path}: has {shape[1]} x {shape[0]} pixels; {row.texts['file']} has others")
+                raise row.error(f"{path}: has {shape[1]} x {shape[0]} pixels, unlike {row.texts['file']}")
         return store.StoredPicture(
             source=row.texts["file"],
             size=camera.size,
@@ -263,38 +263,38 @@ class _FolderReader:
             altitude_time_s=row.numbers.get("altitude_time_s"),
         )
 
-    def _mean_velocity(self, before: _Picture, after: _Picture) -> store.Vector:
-        """Return the mean velocity between two pictures: the inertial unit's, or by the measured positions."""
-        stated = after.row.vector("vx_m_s", "vy_m_s", "vz_m_s")
-        if stated is not None:
-            return _vector(self._to_world(after.row, stated))
-        if before.position_m is None or after.position_m is None:
-            raise after.row.error("neither vx_m_s to vz_m_s nor positions are given; velocity needs them")
-        return _vector((after.position_m - before.position_m) / (after.time_s - before.time_s))
+    def _mean_velocity(self, earlier: _Picture, later: _Picture) -> store.Vector:
+        """Return the mean velocity between two pictures: the inertial velocity, or computed from measured positions."""
+        inertial = later.row.vector("vx_m_s", "vy_m_s", "vz_m_s")
+        if inertial is not None:
+            return _vector(self._to_world(later.row, inertial))
+        if earlier.position_m is None or later.position_m is None:
+            raise later.row.error("vx_m_s to vz_m_s and the positions are empty; velocity needs one of them")
+        return _vector((later.position_m - earlier.position_m) / (later.time_s - earlier.time_s))
 
     def _apriori_site(self, picture: _Picture, slant_range_m: float | None) -> store.Vector:
-        """Return the a-priori site: as stated, or the ground on the first picture's optical axis."""
-        stated = picture.row.vector("site_x_m", "site_y_m", "site_z_m")
-        if stated is not None:
-            return _vector(self._to_world(picture.row, stated))
+        """Return the a-priori site: as recorded, or the ground on the first picture's optical axis."""
+        site = picture.row.vector("site_x_m", "site_y_m", "site_z_m")
+        if site is not None:
+            return _vector(self._to_world(picture.row, site))
         if slant_range_m is None or picture.position_m is None:
-            raise picture.row.error("neither slant_range_m nor site_x_m to site_z_m are given; landing needs one")
+            raise picture.row.error("slant_range_m and site_x_m to site_z_m are empty; landing needs one of them")
         ground = picture.camera.c + slant_range_m * picture.camera.a
         return _vector(picture.position_m + picture.attitude.apply(ground))
 
     def _read_truth(self, pictures: Sequence[_Picture]) -> store.StoredTruth:
-        """Read true poses and, of a descent, the true mean velocity from the second to the third picture."""
-        rows = [one.row for one in pictures]
+        """Read true poses and, for a descent, the true mean velocity from the second to the third picture."""
+        rows = [picture.row for picture in pictures]
         poses = [self._true_pose(row) for row in rows]
         last, velocity = pictures[-1], None
         if self.file.task == VELOCITY:
-            stated = last.row.vector("true_vx_m_s", "true_vy_m_s")
-            before, after = poses[-2:]
+            components = last.row.vector("true_vx_m_s", "true_vy_m_s")
+            earlier, later = poses[-2:]
             mean = None
-            if stated is not None:
-                mean = self._to_world(last.row, np.array([*stated, 0.0]))
-            elif before is not None and after is not None:
-                mean = (after[1] - before[1]) / (last.time_s - pictures[-2].time_s)
+            if components is not None:
+                mean = self._to_world(last.row, np.array([*components, 0.0]))
+            elif earlier is not None and later is not None:
+                mean = (later[1] - earlier[1]) / (last.time_s - pictures[-2].time_s)
             velocity = None if mean is None else (float(mean[0]), float(mean[1]))
         has_pose = [
             row.rotation("true_") is not None and pose is not None for row, pose in zip(rows, poses, strict=True)
@@ -303,18 +303,18 @@ class _FolderReader:
             return store.StoredTruth(velocity_m_s=velocity)
         if not all(has_pose):
             raise rows[0].error("some pictures have a true pose and some have none")
-        known = tuple((_vector(position), _quaternion(attitude)) for attitude, position in filter(None, poses))
-        return store.StoredTruth(velocity_m_s=velocity, poses=known)
+        true_poses = tuple((_vector(position), _quaternion(attitude)) for attitude, position in filter(None, poses))
+        return store.StoredTruth(velocity_m_s=velocity, poses=true_poses)
 
     def _true_pose(self, row: PictureRow) -> tuple[Rotation, Float64[np.ndarray, "3"]] | None:
-        """Return the body's true attitude (by default the measured one) and position; None without a position."""
-        recorded = row.vector(*(f"true_{name}" for name in _POSITION))
-        if recorded is None:
+        """Return the body's true attitude (by default the measured attitude) and position; None without a position."""
+        true_position = row.vector(*(f"true_{name}" for name in _POSITION))
+        if true_position is None:
             return None
         rotation = row.rotation("true_") or row.rotation()
         if rotation is None:
-            raise row.error("a true position is given without an attitude, measured or true")
-        attitude, position = self._body_pose(row, rotation, recorded)
+            raise row.error("a true position needs an attitude, measured or true")
+        attitude, position = self._body_pose(row, rotation, true_position)
         return None if position is None else (attitude, position)
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Float64, UInt16
 from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.user_files import RecordedAxes, check_together, finite_number, format_problems, parse_table
+from marsyard.scenarios.user_files import RecordedAxes, check_column_groups, finite_number, format_problems, parse_table
 from marsyard.sim.files import check_regular, npy_header, open_regular
 from marsyard.sim.frames import direction
 from marsyard.sim.parameters import Parameters, bounded_field
@@ -36,21 +36,21 @@ PICTURES = {VELOCITY: (3, 3), LANDING: (2, 2), MATCHING: (2, 50)}
 
 
 class IngestError(ValueError):
-    """A folder that cannot be used; the message names the file, the line or key, and what is allowed."""
+    """An invalid folder; the message contains the file, the line or key, and the allowed values."""
 
 
 class CameraTable(Parameters):
-    """The camera of the pictures whose rows name none."""
+    """Default camera of the pictures."""
 
     file: Annotated[
-        str | None, Field(description="camera file; not needed for PDS3 products, whose labels hold the camera")
+        str | None, Field(description="camera file; not needed for PDS3 products, whose labels contain the camera")
     ] = None
-    number: Annotated[int, Field(ge=0, description="which of a file's cameras, from 0")] = 0
+    number: Annotated[int, Field(ge=0, description="index of the camera in the file, from 0")] = 0
     placed: Annotated[
         bool,
         Field(
-            description="true: the file's vectors place the camera in the body (`attitude_of` is then `body`); "
-            "false: it is mounted to look down, wherever the file puts it"
+            description="true: the file's vectors define the camera's pose in the body (`attitude_of` is then `body`); "
+            "false: the camera looks down, regardless of the pose in the file"
         ),
     ] = False
     subframe_folded_in: Annotated[
@@ -62,8 +62,8 @@ class DetectorTable(Parameters):
     """Settings of the detector."""
 
     bits: Annotated[int, Field(ge=1, le=16, description="of a count; the largest count is 2^bits - 1")]
-    offset_dn: Annotated[float, Field(ge=0.0, le=65535.0, description="counts delivered for no light")] = 0.0
-    exposure_s: Annotated[float, Field(ge=0.0, le=100.0, description="exposure time; 0: not known")] = 0.0
+    offset_dn: Annotated[float, Field(ge=0.0, le=65535.0, description="counts without light")] = 0.0
+    exposure_s: Annotated[float, Field(ge=0.0, le=100.0, description="exposure time; 0: unknown")] = 0.0
     transfer_row_s: Annotated[
         float, Field(ge=0.0, le=1.0, description="frame transfer: time under each row while shifted out; 0: none")
     ] = 0.0
@@ -72,19 +72,19 @@ class DetectorTable(Parameters):
     ] = 0.0
     rows_summed: Annotated[
         int | None,
-        Field(ge=1, le=64, description="physical rows in a delivered one; by default the camera's ratio of scales"),
+        Field(ge=1, le=64, description="detector rows in a delivered row; by default the camera's ratio of scales"),
     ] = None
     flat_field: Annotated[
         str | None,
         Field(
-            description="relative response of each pixel: `.npy` of numbers about 1 at the brightest, or a picture, "
-            "over its largest count"
+            description="relative response of each pixel: `.npy` of numbers, about 1 at the maximum, or a picture, "
+            "divided by its largest count"
         ),
     ] = None
 
 
 class SunTable(Parameters):
-    """Direction to the sun for the cases whose rows do not state it."""
+    """Default direction to the sun."""
 
     azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")]
     elevation_deg: Annotated[float, Field(gt=0.0, le=90.0, description="above the horizon")]
@@ -103,40 +103,40 @@ class IngestFile(Parameters):
         TaskName, Field(description="velocity: three pictures of a descent; landing: two; matching: two or more")
     ]
     description: Annotated[str, Field(description="in the report")] = ""
-    poses: Annotated[RecordedAxes | None, Field(description="not needed where PDS3 labels state all poses")] = None
+    poses: Annotated[RecordedAxes | None, Field(description="not needed if PDS3 labels contain all poses")] = None
     camera: CameraTable = CameraTable()
     detector: DetectorTable
     sun: SunTable | None = None
 
 
 def read_ingest_file(folder: Path) -> IngestFile:
-    """Read the folder's `ingest.toml`. Raises IngestError, which lists all problems by key."""
+    """Read the folder's `ingest.toml`. Raises IngestError with all problems by key."""
     path = folder / INGEST_FILE
     try:
         check_regular(path)
-        stated = tomllib.loads(path.read_text(encoding="utf-8"))
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise IngestError(f"{path}: cannot be read: {error.strerror or error}") from error
     except ValueError as error:
         raise IngestError(f"{path}: not valid TOML: {error}") from error
     try:
-        file = IngestFile.model_validate(stated)
+        file = IngestFile.model_validate(values)
     except ValidationError as error:
         kinds = {"missing": "required, but missing", "extra_forbidden": "unknown key; see docs/real-pictures.md"}
         problems = []
-        for one in error.errors(include_url=False):
-            message = f"{one['msg'].removeprefix('Value error, ')}, got {one['input']!r}"
-            problems.append(f"{path}: {'.'.join(map(str, one['loc']))}: {kinds.get(one['type'], message)}")
+        for detail in error.errors(include_url=False):
+            message = f"{detail['msg'].removeprefix('Value error, ')}, got {detail['input']!r}"
+            problems.append(f"{path}: {'.'.join(map(str, detail['loc']))}: {kinds.get(detail['type'], message)}")
         raise IngestError("\n".join(problems)) from error
     if file.camera.placed and file.poses is not None and file.poses.attitude_of != "body":
         raise IngestError(
-            f'{path}: camera.placed: the file places the camera in the body, so poses.attitude_of must be "body"'
+            f'{path}: camera.placed: the file contains the pose in the body: poses.attitude_of must be "body"'
         )
     return file
 
 
 class Column(NamedTuple):
-    """A column of `pictures.csv` as `pictures.toml` states it."""
+    """A column of `pictures.csv` as described in `pictures.toml`."""
 
     name: str
     tasks: tuple[str, ...]
@@ -152,7 +152,7 @@ COLUMNS = tuple(
 )
 _TEXT_COLUMNS = ("case", "file", "camera", "flat_field")
 _POSITIVE_COLUMNS = ("altitude_m", "slant_range_m")
-#: Columns of which all or none are filled in a row.
+#: Groups of columns: in a row, all of a group are filled, or none.
 _COLUMN_GROUPS = (
     ("qx", "qy", "qz", "qw"),
     ("x_m", "y_m", "z_m"),
@@ -163,15 +163,15 @@ _COLUMN_GROUPS = (
     ("true_x_m", "true_y_m", "true_z_m"),
     ("true_qx", "true_qy", "true_qz", "true_qw"),
 )
-#: Largest deviation of a quaternion's length from 1: quaternions may be written with three digits.
+#: Maximum deviation of a quaternion's length from 1: quaternions may be written with three digits.
 _QUATERNION_TOLERANCE = 5e-3
-#: More rows would take days to match.
+#: Maximum number of rows; more would take days to match.
 _MAX_ROWS = 200_000
-#: Bytes that hold the header of a PGM file with comments.
+#: Bytes that contain the header of a PGM file with comments.
 _HEADER_BYTES = 4096
 #: Maximum number of pixels along a side of a flat field.
 _MAX_SIDE = 16384
-#: Maximum relative response: noise makes that of the brightest pixel a little more than 1.
+#: Maximum relative response: noise raises the response of the brightest pixel slightly above 1.
 _MAX_RESPONSE = 1.5
 _PGM = re.compile(rb"\AP[25]\s+(?:#[^\n]*\n\s*)*(\d+)\s+(?:#[^\n]*\n\s*)*(\d+)\s")
 _ALLOWED = "allowed: PNG, PGM or TIFF of one band with 8 or 16 bits, or a PDS3 product"
@@ -186,15 +186,15 @@ class PictureRow:
     numbers: Mapping[str, float]
 
     def error(self, message: str) -> IngestError:
-        """Return an error that names the row's line."""
+        """Return an error with the row's line."""
         return IngestError(f"line {self.line}: {message}")
 
     def vector(self, *names: str) -> Float64[np.ndarray, "n"] | None:
-        """Return the numbers of columns that are filled together; None where they are empty."""
+        """Return the numbers of columns that are filled together; None if they are empty."""
         return np.array([self.numbers[name] for name in names]) if names[0] in self.numbers else None
 
     def rotation(self, prefix: str = "") -> Rotation | None:
-        """Return the rotation of the columns `qx` to `qw`; None where they are empty."""
+        """Return the rotation of the columns `qx` to `qw`; None if they are empty."""
         quaternion = self.vector(*(f"{prefix}q{axis}" for axis in "xyzw"))
         return None if quaternion is None else Rotation.from_quat(quaternion)
 
@@ -202,7 +202,7 @@ class PictureRow:
 def read_table(path: Path, task: str) -> dict[str, list[PictureRow]]:
     """Read the rows of `pictures.csv` by case, in the order of the cases' first rows.
 
-    Raises IngestError, which lists all problems by line.
+    Raises IngestError with all problems by line.
     """
     allowed = [column.name for column in COLUMNS if task in column.tasks]
     required = [column.name for column in COLUMNS if task in column.tasks and column.required == "every"]
@@ -222,11 +222,11 @@ def read_table(path: Path, task: str) -> dict[str, list[PictureRow]]:
                 problems.append(
                     f"line {rows[0].line}: case '{name}' has {len(rows)} pictures; allowed for {task}: {number}"
                 )
-            for before, row in itertools.pairwise(rows):
-                first, second = before.numbers.get("time_s"), row.numbers.get("time_s")
+            for previous, row in itertools.pairwise(rows):
+                first, second = previous.numbers.get("time_s"), row.numbers.get("time_s")
                 if first is not None and second is not None and second <= first:
                     problems.append(
-                        f"line {row.line}: time goes from {first:g} to {second:g} s; allowed: times that increase"
+                        f"line {row.line}: time goes from {first:g} to {second:g} s; allowed: increasing times"
                     )
             problems += [
                 f"line {row.line}: {column} is empty"
@@ -235,7 +235,7 @@ def read_table(path: Path, task: str) -> dict[str, list[PictureRow]]:
                 if column not in row.texts and column not in row.numbers
             ]
         if not cases:
-            problems = ["it has no rows; at least one case is needed"]
+            problems = ["it has no rows; allowed: at least one case"]
     if problems:
         raise IngestError(format_problems(path, problems))
     return cases
@@ -251,7 +251,7 @@ def _parse_row(line: int, cells: Mapping[str, str]) -> PictureRow:
     for name in ("case", "file"):
         if name not in filled:
             raise ValueError(f"{name} is empty")
-    check_together(_COLUMN_GROUPS, numbers)
+    check_column_groups(_COLUMN_GROUPS, numbers)
     for prefix in ("", "true_"):
         quaternion = row.vector(*(f"{prefix}q{axis}" for axis in "xyzw"))
         length = 1.0 if quaternion is None else float(np.linalg.norm(quaternion))
@@ -264,7 +264,7 @@ def _parse_row(line: int, cells: Mapping[str, str]) -> PictureRow:
 
 
 def file_head(path: Path) -> bytes:
-    """Read the file's first bytes. Raises IngestError where the file is missing, empty or unreadable."""
+    """Read the file's first bytes. Raises IngestError if the file is missing, empty or unreadable."""
     try:
         with open_regular(path) as file:
             head = file.read(_HEADER_BYTES)
@@ -278,7 +278,7 @@ def file_head(path: Path) -> bytes:
 def read_counts(path: Path, size: tuple[int, int]) -> UInt16[np.ndarray, "rows columns"]:
     """Decode a picture after its header has confirmed the size (columns, rows).
 
-    Raises IngestError where the file is unreadable, or of another format or size.
+    Raises IngestError if the file is unreadable, or of another format or size.
     """
     columns, rows = picture_size(path)
     if (columns, rows) != size:
@@ -317,26 +317,26 @@ def picture_size(path: Path) -> tuple[int, int]:
         except (OSError, struct.error) as error:
             raise IngestError(f"{path}: is a damaged TIFF: {error}") from error
         if len(extents) != 2:
-            raise IngestError(f"{path}: is a damaged TIFF: its first directory states no size")
+            raise IngestError(f"{path}: is a damaged TIFF: its first directory contains no size")
         return extents[256], extents[257]
-    raise IngestError(f"{path}: is no picture that is read; {_ALLOWED}")
+    raise IngestError(f"{path}: is not a supported picture; {_ALLOWED}")
 
 
 def read_flat_field(path: Path) -> Float64[np.ndarray, "rows columns"]:
-    """Read a relative response: an array as it is, a picture divided by its largest count. Raises IngestError."""
+    """Read a relative response: an array unchanged, a picture divided by its largest count. Raises IngestError."""
     head = file_head(path)
     try:
         if head.startswith(b"\x93NUMPY"):
             with path.open("rb") as file:
                 shape, kind = npy_header(file)
             if len(shape) != 2 or max(shape) > _MAX_SIDE or kind.kind not in "iuf":
-                raise ValueError(f"holds an array of shape {shape} and type {kind}")
+                raise ValueError(f"contains an array of shape {shape} and type {kind}")
             response = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
         else:
             counts = read_counts(path, picture_size(path))
             response = counts / max(int(counts.max()), 1)
     except (ValueError, EOFError) as error:
-        raise IngestError(f"{path}: is no flat field: {error}") from error
+        raise IngestError(f"{path}: is not a valid flat field: {error}") from error
     if not np.all(np.isfinite(response)) or response.min() <= 0.0 or response.max() > _MAX_RESPONSE:
-        raise IngestError(f"{path}: is no flat field; allowed: two dimensions, numbers above 0, about 1 at the largest")
+        raise IngestError(f"{path}: is not a valid flat field; allowed: two dimensions, above 0, maximum about 1")
     return response

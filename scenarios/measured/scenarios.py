@@ -1,4 +1,4 @@
-"""The scenarios of recorded pictures: velocity estimators, estimators of landing sites, and measured poses alone."""
+"""Scenarios of recorded pictures: velocity estimators, estimators of landing sites, and measured poses alone."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from marsyard.scenarios.conditions import hash_images
 from marsyard.scenarios.descent.parameters import check_binning
 from marsyard.scenarios.estimators import LANDING, VELOCITY
 from marsyard.scenarios.interface import CaseResult, Scalar, record_conditions
-from marsyard.scenarios.landing.score import motion_errors, solved_row
+from marsyard.scenarios.landing.score import motion_errors, stage_row
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
 from marsyard.scenarios.measured.layout import TaskName
-from marsyard.scenarios.parts.named import SCORE, Kind
+from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import CustomScores, ScoredSite, ScoredVelocity, compute_scores
 from marsyard.scenarios.velocity import check_last_interval, consistency_row, velocity_products, velocity_row
 from marsyard.sim.frames import rigid
@@ -44,18 +44,18 @@ MATCHED, TOO_FEW = "MATCHED", "TOO_FEW_MATCHES"
 
 
 class MeasuredParameters(Parameters):
-    """Parameters of all tasks; subclasses state the task that `cases.json` must have."""
+    """Parameters of all tasks; subclasses define the task that `cases.json` must have."""
 
     task_name: ClassVar[TaskName]
 
     cases: Annotated[store.CasesFile, Field(description="`cases.json` of `marsyard ingest`")]
-    number: Annotated[int, Field(ge=0, description="of the case in it; a grid over all")] = 0
+    number: Annotated[int, Field(ge=0, description="number of the case in the file; usually a grid over all cases")] = 0
 
     @model_validator(mode="after")
     def _check_case_and_task(self) -> MeasuredParameters:
         stored = self.cases.stored
         if self.number >= len(stored.cases):
-            raise ValueError(f"number is {self.number}; {self.cases.file} holds 0 to {len(stored.cases) - 1}")
+            raise ValueError(f"number is {self.number}; {self.cases.file} contains 0 to {len(stored.cases) - 1}")
         if stored.task != self.task_name:
             raise ValueError(
                 f"{self.cases.file}: its task is {stored.task}; the scenario measured-{stored.task} runs it"
@@ -141,7 +141,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
     parameters_type = MeasuredVelocityParameters
     task = VELOCITY
     algorithm_table = ()
-    part_keys: Mapping[str, Kind] = {"scores": SCORE}
+    part_keys: Mapping[str, PartKind] = {"scores": SCORE}
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Run one descent."""
@@ -155,49 +155,47 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
         ]
         conditions: dict[str, Scalar] = {
             **_case_row(p, images),
-            **{f"altitude_{number}_m": one.altitude_m for number, one in enumerate(measurements.altitudes, start=1)},
+            **{f"altitude_{number}_m": item.altitude_m for number, item in enumerate(measurements.altitudes, start=1)},
             "off_nadir_max_deg": max(float(np.degrees(np.arccos(np.clip(-axis[2], -1.0, 1.0)))) for axis in axes),
             "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(measurements.sun_direction[2], -1.0, 1.0)))),
             "truth_known": p.case.truth.velocity_m_s is not None,
         }
         record_conditions(conditions)
-        attempts = _run_algorithms(
+        runs = _run_algorithms(
             p, p.dimes, measurements, lambda answer: check_last_interval(answer, measurements), streams.case
         )
         true_velocity = p.case.truth.velocity_m_s
         truth = np.array(true_velocity or (np.nan, np.nan), dtype=np.float64)
 
         def evaluate(algorithm: str) -> CaseResult:
-            attempt = attempts[algorithm]
-            velocity = _velocity(attempt.answer)
+            run = runs[algorithm]
+            velocity = _velocity(run.answer)
             pairs = compare_with_poses(images, matches, _descent_poses(p.case, measurements, velocity))
-            details = None if attempt.answer is None else attempt.answer.details
-            chosen = details.chosen if isinstance(details, DimesDetails) else None
+            details = None if run.answer is None else run.answer.details
+            velocity_pair = details.chosen if isinstance(details, DimesDetails) else None
             reported = np.full(2, np.nan) if velocity is None else velocity
             row: dict[str, Scalar] = {
                 "velocity_estimated_x_m_s": float(reported[0]),
                 "velocity_estimated_y_m_s": float(reported[1]),
                 # contains the unknown error of the inertial velocity
                 "inertial_difference_m_s": _distance(velocity, measurements.interval_velocities_m_s[1, :2]),
-                # does not: the change of velocity from the first pair to the second against the inertial unit's
-                "pair_discrepancy_m_s": NAN if chosen is None else chosen.discrepancy_m_s,
+                # without that error: change of velocity between the two pairs, compared with the inertial unit's change
+                "pair_discrepancy_m_s": NAN if velocity_pair is None else velocity_pair.discrepancy_m_s,
             }
             if true_velocity is not None:
-                row |= {**velocity_row("velocity", velocity, truth), **consistency_row(attempt.answer, truth)}
+                row |= {**velocity_row("velocity", velocity, truth), **consistency_row(run.answer, truth)}
             if algorithm != p.algorithm:
-                row["difference_m_s"] = _distance(velocity, _velocity(attempts[p.algorithm].answer))
-            row |= {**agreement_row(pairs), **attempt.row}
-            if attempt.answer is not None:
+                row["difference_m_s"] = _distance(velocity, _velocity(runs[p.algorithm].answer))
+            row |= {**agreement_row(pairs), **run.row}
+            if run.answer is not None:
                 case = ScoredVelocity(
                     measurements=measurements,
-                    answer=attempt.answer,
+                    answer=run.answer,
                     true_velocity_m_s=None if true_velocity is None else truth,
                 )
                 row |= compute_scores(p.scores, case, {*row, *conditions})
-            products = velocity_products([image.counts for image in images], attempt.answer, truth)
-            return algorithm_result(
-                attempt, velocity is not None, row, {**products, **agreement_products(images, pairs)}
-            )
+            products = velocity_products([image.counts for image in images], run.answer, truth)
+            return algorithm_result(run, velocity is not None, row, {**products, **agreement_products(images, pairs)})
 
         return case_result(p.algorithms, evaluate, conditions)
 
@@ -209,7 +207,7 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
     parameters_type = MeasuredLandingParameters
     task = LANDING
     algorithm_table = ()
-    part_keys: Mapping[str, Kind] = {"scores": SCORE}
+    part_keys: Mapping[str, PartKind] = {"scores": SCORE}
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Run one flight."""
@@ -228,21 +226,21 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
             **agreement_row(pairs),
         }
         record_conditions(conditions)
-        attempts = _run_algorithms(p, p.hda, measurements, check_site, streams.case)
+        runs = _run_algorithms(p, p.hda, measurements, check_site, streams.case)
 
         def evaluate(algorithm: str) -> CaseResult:
-            attempt = attempts[algorithm]
-            details = None if attempt.answer is None else attempt.answer.details
-            row = _site_answer_row(attempt.answer, measurements, true_poses)
+            run = runs[algorithm]
+            details = None if run.answer is None else run.answer.details
+            row = _site_answer_row(run.answer, measurements, true_poses)
             if algorithm != p.algorithm:
-                row["difference_m"] = _distance(_site(attempt.answer), _site(attempts[p.algorithm].answer))
-            row |= attempt.row
-            if attempt.answer is not None:
-                case = ScoredSite(measurements=measurements, answer=attempt.answer, true_poses=true_poses)
+                row["difference_m"] = _distance(_site(run.answer), _site(runs[p.algorithm].answer))
+            row |= run.row
+            if run.answer is not None:
+                case = ScoredSite(measurements=measurements, answer=run.answer, true_poses=true_poses)
                 row |= compute_scores(p.scores, case, {*row, *conditions})
             products = hda_products(details) if isinstance(details, HdaDetails) else {}
-            converged = attempt.answer is not None and attempt.answer.outcome.converged
-            return algorithm_result(attempt, converged, row, {**products, **agreement_products(images, pairs)})
+            converged = run.answer is not None and run.answer.outcome.converged
+            return algorithm_result(run, converged, row, {**products, **agreement_products(images, pairs)})
 
         return case_result(p.algorithms, evaluate, conditions)
 
@@ -250,16 +248,16 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
 def _run_algorithms(
     p: AlgorithmSelection, options: Any, measurements: Any, check: Callable[[object], Answer], case: int
 ) -> Mapping[str, AlgorithmRun[Answer]]:
-    def estimate(spec: str, given: Any) -> Any:
-        return p.task.make(spec, options, p.executable, case).estimate(given)
+    def estimate(spec: str, inputs: Any) -> Any:
+        return p.task.make(spec, options, p.executable, case).estimate(inputs)
 
     return {spec: run_algorithm_on_copy(partial(estimate, spec), check, measurements) for spec in p.algorithms}
 
 
 def _case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[str, Scalar]:
-    """Return the columns of the case: name, pictures, and the largest motion of the camera between two pictures."""
+    """Return the columns of the case: name, pictures, and the maximum motion of the camera between two pictures."""
     poses = [picture.pose * camera_pose(image.camera) for picture, image in zip(p.case.pictures, images, strict=True)]
-    steps = [before.inv() * after for before, after in itertools.pairwise(poses)]
+    steps = [earlier.inv() * later for earlier, later in itertools.pairwise(poses)]
     has_positions = all(picture.position_m is not None for picture in p.case.pictures)
     return {
         "measured_case": p.case.name,
@@ -272,7 +270,7 @@ def _case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[st
 
 
 def _distance(first: Float[np.ndarray, "n"] | None, second: Float[np.ndarray, "n"] | None) -> float:
-    """Return the distance between two answers; NaN where one is missing."""
+    """Return the distance between two answers; NaN if one is missing."""
     return NAN if first is None or second is None else float(np.linalg.norm(first - second))
 
 
@@ -281,28 +279,28 @@ def _velocity(estimate: VelocityEstimate | None) -> Float64[np.ndarray, "2"] | N
 
 
 def _site(estimate: SiteEstimate | None) -> Float[np.ndarray, "3"] | None:
-    """Return the site; None where the algorithm reports no safe one."""
+    """Return the site; None if the algorithm reports no safe site."""
     return None if estimate is None or estimate.outcome is not SiteOutcome.SAFE_SITE else estimate.site_world
 
 
 def _descent_poses(
     case: store.StoredCase, measurements: DescentMeasurements, estimated: Float64[np.ndarray, "2"] | None
 ) -> list[RigidTransform]:
-    """Return the body's poses by measured positions; without these, by the inertial unit's velocities.
+    """Return the body's poses from measured positions or, without these, from the inertial unit's velocities.
 
-    The inertial velocities have an unknown constant error. It is removed with the estimate: the second interval's
-    horizontal velocity is the estimate, and the first one's follows by the inertial change. The agreement of pictures
-    and poses then depends on the estimate as well.
+    The inertial velocities have an unknown constant error. The estimate removes it: the horizontal velocity of the
+    second interval is the estimate, and that of the first interval follows from the inertial change. The agreement of
+    pictures and poses then depends on the estimate as well.
     """
     velocities = measurements.interval_velocities_m_s.copy()
     if estimated is not None:
         velocities[:, :2] += estimated - velocities[1, :2]
     times = np.array([image.time_s for image in measurements.images])
     positions = np.concatenate([np.zeros((1, 3)), np.cumsum(velocities * np.diff(times)[:, None], axis=0)])
-    measured = [picture.position_m for picture in case.pictures]
-    if None not in measured:
-        positions = np.array(measured, dtype=np.float64)
-    rotations = [one.world_from_body for one in measurements.attitudes]
+    positions_m = [picture.position_m for picture in case.pictures]
+    if None not in positions_m:
+        positions = np.array(positions_m, dtype=np.float64)
+    rotations = [attitude.world_from_body for attitude in measurements.attitudes]
     return [rigid(rotation, position) for rotation, position in zip(rotations, positions, strict=True)]
 
 
@@ -313,7 +311,7 @@ def _site_answer_row(
 ) -> dict[str, Scalar]:
     """Return the columns of an answer: site, and motion compared with the measured and the true poses.
 
-    The safety of the site is not scored: it needs the true ground, which no folder of pictures holds.
+    The safety of the site is not scored: it needs the true ground, which a folder of pictures does not contain.
     """
     site = _site(estimate)
     position = np.full(3, np.nan) if site is None else site
@@ -326,16 +324,16 @@ def _site_answer_row(
     details = None if estimate is None else estimate.details
     if not isinstance(details, HdaDetails):
         return row
-    row |= solved_row(details)
+    row |= stage_row(details)
     if details.motion is None:
         return row
 
-    def errors(poses: Sequence[RigidTransform]) -> dict[str, Scalar]:
+    def compare_motion(poses: Sequence[RigidTransform]) -> dict[str, Scalar]:
         """Compare the estimated motion from the first to the second camera's frame with poses of the body."""
         cameras = [body * camera_pose(image.camera) for body, image in zip(poses, measurements.images, strict=True)]
         return motion_errors(motion.second_from_first, cameras[1].inv() * cameras[0])
 
     motion = details.motion
-    measured = errors([one.world_from_body for one in measurements.poses])
-    row |= {name.replace("_error_", "_pose_difference_"): value for name, value in measured.items()}
-    return row if true_poses is None else {**row, **errors(true_poses)}
+    differences = compare_motion([pose.world_from_body for pose in measurements.poses])
+    row |= {name.replace("_error_", "_pose_difference_"): value for name, value in differences.items()}
+    return row if true_poses is None else {**row, **compare_motion(true_poses)}

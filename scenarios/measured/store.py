@@ -1,6 +1,6 @@
-"""Store ingested cases: `cases.json` and the pictures, cameras and flat fields that it names with their hashes.
+"""Store ingested cases: `cases.json`, and its pictures, cameras and flat fields with their hashes.
 
-World axes are east, north, up; attitudes are the body's.
+World axes are east, north, up; attitudes are those of the body.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class StoredPicture(Parameters):
 
     @property
     def pose(self) -> RigidTransform:
-        """The body's measured pose; at the origin where no position was measured."""
+        """The body's measured pose; at the origin if no position was measured."""
         return body_pose(self.position_m or (0.0, 0.0, 0.0), self.world_from_body_xyzw)
 
 
@@ -141,8 +141,8 @@ def _read(file: str, _changed_ns: int, _size: int) -> tuple[StoredCases, str]:
         raise ValueError(f"{file}: {error.strerror or error}") from error
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise ValueError(f"{file}: is not what marsyard ingest wrote: {where}: {first['msg']}") from error
+        location = ".".join(str(part) for part in first["loc"])
+        raise ValueError(f"{file}: is not a valid cases.json of marsyard ingest: {location}: {first['msg']}") from error
     if stored.schema_version != SCHEMA:
         raise ValueError(f"{file}: has schema {stored.schema_version}; this version of Marsyard reads {SCHEMA}")
     return stored, hashlib.sha256(contents).hexdigest()
@@ -165,26 +165,26 @@ def write_file(folder: Path, kind: str, name: str, write: Callable[[Path], objec
 
 
 def write_camera(folder: Path, number: int, camera: CameraModel) -> StoredFile:
-    """Write a camera next to `cases.json`; its file states the body frame."""
+    """Write a camera next to `cases.json`; its file contains the body frame."""
     return write_file(
         folder, "cameras", f"{number:06d}.cahvor", lambda path: write_cahvor(camera, path, frame=BODY_FRAME)
     )
 
 
-def _check_unchanged(folder: Path, named: StoredFile) -> Path:
-    """Return the file's path. Raises ValueError where the file is missing or has changed."""
-    path = folder / named.file
+def _check_unchanged(folder: Path, stored: StoredFile) -> Path:
+    """Return the file's path. Raises ValueError if the file is missing or has changed."""
+    path = folder / stored.file
     try:
         sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror or error}; ingest again") from error
-    if sha256 != named.sha256:
+    if sha256 != stored.sha256:
         raise ValueError(f"{path}: has changed since it was ingested")
     return path
 
 
 def load_images(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]:
-    """Load the pictures of a case with their cameras in the body frame. Raises ValueError where a file has changed."""
+    """Load the pictures of a case with their cameras in the body frame. Raises ValueError if a file has changed."""
     folder, images = Path(cases.file).parent, []
     for picture in case.pictures:
         counts = read_picture(_check_unchanged(folder, picture.counts))
@@ -204,10 +204,10 @@ def load_images(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]
 def descent_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) -> DescentMeasurements:
     """Return the inputs of a velocity estimator."""
     attitudes, altitudes = [], []
-    for one in case.pictures:
-        attitudes.append(AttitudeMeasurement(Rotation.from_quat(np.array(one.world_from_body_xyzw)), one.time_s))
-        time_s = one.time_s if one.altitude_time_s is None else one.altitude_time_s
-        altitudes.append(AltitudeMeasurement(math.nan if one.altitude_m is None else one.altitude_m, time_s))
+    for item in case.pictures:
+        attitudes.append(AttitudeMeasurement(Rotation.from_quat(np.array(item.world_from_body_xyzw)), item.time_s))
+        time_s = item.time_s if item.altitude_time_s is None else item.altitude_time_s
+        altitudes.append(AltitudeMeasurement(math.nan if item.altitude_m is None else item.altitude_m, time_s))
     return DescentMeasurements(
         images=images,
         attitudes=tuple(attitudes),
@@ -224,7 +224,7 @@ def body_pose(position_m: Vector, xyzw: Quaternion) -> RigidTransform:
 
 def landing_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) -> LandingMeasurements:
     """Return the inputs of an estimator of landing sites."""
-    first, second = (PoseMeasurement(one.pose, one.time_s) for one in case.pictures)
+    first, second = (PoseMeasurement(picture.pose, picture.time_s) for picture in case.pictures)
     attitude = Rotation.from_quat(np.array(case.pictures[0].world_from_body_xyzw))
     return LandingMeasurements(
         images=(images[0], images[1]),

@@ -1,6 +1,6 @@
-"""Parts of a case that a user supplies: the motion of a descent, an instrument, a score.
+"""User-defined parts of a case: the motion of a descent, an instrument, a score.
 
-`named` finds a part by its name and constructs it; `motions`, `instruments` and `scores` define inputs and outputs.
+`named` imports and constructs a part by its name; `motions`, `instruments` and `scores` define inputs and outputs.
 """
 
 from marsyard.scenarios.parts.instruments import InstrumentReadings, InstrumentTruth

@@ -31,14 +31,14 @@ QUANTITIES: Mapping[str, tuple[int, ...]] = {"altitude": (), "attitude": (4,)}
 
 @dataclass(frozen=True)
 class InstrumentTruth:
-    """Truth at an instrument. World axes are east, north, up; the camera looks along the body's -z, columns along x.
+    """Truth for an instrument. World axes are east, north, up; the optical axis is the body's -z, columns along x.
 
-    - times_s: requested times: true picture times for altitudes, pictures' time tags for attitudes; an instrument
-      that measures at other times returns their tags
+    - times_s: requested times: true picture times for altitudes, time tags of the pictures for attitudes; an instrument
+      that measures at other times returns the tags of those times
     - motion: true motion; `motion.state(time_s)` has pose, velocity, body rate, specific force within `motion.span_s`
-    - ground_height: height of the ground by world x and y, metres
-    - nearest_ground: distance to the nearest ground in a cone, metres, infinite without ground, by the cone's apex and
-      axis (world), half-width (radians), and maximum range (metres)
+    - ground_height: height of the ground at world x and y, metres
+    - nearest_ground: distance to the nearest ground in a cone, infinite without ground, metres. Arguments: apex and
+      axis of the cone (world), half-width (radians), and maximum range (metres)
     """
 
     times_s: Float64[np.ndarray, "n"]
@@ -47,15 +47,15 @@ class InstrumentTruth:
     nearest_ground: Callable[[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float, float], float]
 
     def altitude_m(self, time_s: float) -> float:
-        """True height above the ground straight below."""
+        """True height above the ground directly below."""
         position = self.motion.state(time_s).position_m
         return float(position[2]) - self.ground_height(float(position[0]), float(position[1]))
 
-    def first_return_m(self, time_s: float, half_width_deg: float, farthest_m: float) -> float:
+    def first_return_m(self, time_s: float, half_width_deg: float, max_range_m: float) -> float:
         """True distance to the nearest ground in a beam along the body's -z; infinite without ground."""
         state = self.motion.state(time_s)
         axis = np.asarray(state.attitude.apply(DOWN.copy()))
-        return self.nearest_ground(state.position_m, axis, float(np.radians(half_width_deg)), farthest_m)
+        return self.nearest_ground(state.position_m, axis, float(np.radians(half_width_deg)), max_range_m)
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class InstrumentReadings:
     """Readings of an instrument, one for each requested time.
 
     - times_s: the instrument's time tags
-    - values: altitudes, metres, NaN for no reading; or quaternions x, y, z, w from body to world axes
-    - columns: further columns of the row, as `altimeter_NAME` or `attitude_source_NAME`, such as drawn constant errors
+    - values: altitudes, metres, NaN without a reading; or quaternions x, y, z, w from body to world axes
+    - columns: further columns of the row, as `altimeter_NAME` or `attitude_source_NAME`, such as sampled errors
     """
 
     times_s: Float[np.ndarray, "n"]
@@ -74,16 +74,16 @@ class InstrumentReadings:
 
 class _CustomInstrument(CustomPart):
     kind = INSTRUMENT
-    named_by = "instrument"
+    name_key = "instrument"
     quantity: ClassVar[str]
 
     instrument: Annotated[str, Field(description="custom instrument's class: module:Class, or an entry point's name")]
 
     @model_validator(mode="after")
     def _check_quantity(self) -> _CustomInstrument:
-        measured = self.create().quantity
-        if measured != self.quantity:
-            raise ValueError(f"'{self.spec}' measures {measured!r}; allowed here: {self.quantity!r}")
+        quantity = self.create().quantity
+        if quantity != self.quantity:
+            raise ValueError(f"'{self.spec}' measures {quantity!r}; allowed here: {self.quantity!r}")
         return self
 
     def read(self, truth: InstrumentTruth, rng: np.random.Generator) -> InstrumentReadings:
@@ -104,20 +104,20 @@ class CustomAttitudeSource(_CustomInstrument):
 
 
 def check_readings(spec: str, readings: object, quantity: str, count: int) -> InstrumentReadings:
-    """An instrument's readings as 64-bit arrays. Raises ValueError for invalid readings."""
+    """Return an instrument's readings as 64-bit arrays. Raises ValueError for invalid readings."""
     if not isinstance(readings, InstrumentReadings):
         raise ValueError(
-            f"'{spec}' reads a {type(readings).__name__}; allowed: marsyard.scenarios.parts.InstrumentReadings"
+            f"'{spec}' returns a {type(readings).__name__}; allowed: marsyard.scenarios.parts.InstrumentReadings"
         )
-    times, values = (np.array(one, dtype=np.float64) for one in (readings.times_s, readings.values))
+    times, values = (np.array(item, dtype=np.float64) for item in (readings.times_s, readings.values))
     for name, array, shape in (("times_s", times, (count,)), ("values", values, (count, *QUANTITIES[quantity]))):
         if array.shape != shape:
-            raise ValueError(f"'{spec}' gives {name} of shape {array.shape}; allowed: {shape}")
+            raise ValueError(f"'{spec}' returns {name} of shape {array.shape}; allowed: {shape}")
     if not np.all(np.isfinite(times)):
-        raise ValueError(f"'{spec}' gives times_s that are not finite")
+        raise ValueError(f"'{spec}' returns times_s that are not finite")
     if quantity == "altitude" and np.any(np.isinf(values)):
-        raise ValueError(f"'{spec}' gives an infinite altitude; allowed: metres, or NaN where there is none")
+        raise ValueError(f"'{spec}' returns an infinite altitude; allowed: metres, or NaN for a missing altitude")
     lengths = np.linalg.norm(values, axis=-1) if quantity == "attitude" else np.ones(count)
     if not np.all(np.abs(lengths - 1.0) <= UNIT_TOLERANCE):
-        raise ValueError(f"'{spec}' gives quaternions of length {lengths.tolist()}; allowed: 1")
+        raise ValueError(f"'{spec}' returns quaternions of length {lengths.tolist()}; allowed: 1")
     return InstrumentReadings(times, values, readings.columns)

@@ -27,7 +27,7 @@ from marsyard.scenarios.user_files import RecordedAxes
 from marsyard.sim.dynamics.recorded import RecordedMotion
 from marsyard.sim.parameters import bounded_field
 
-#: Tolerated deviation of a quaternion's length from 1.
+#: Tolerance of a quaternion's length.
 UNIT_TOLERANCE = 1e-6
 
 
@@ -35,10 +35,10 @@ UNIT_TOLERANCE = 1e-6
 class DescentPlace:
     """A case as the input of a motion.
 
-    - ground_height: height of the ground above that at the place, by metres east and north of it
+    - ground_height: height of the ground relative to the origin of the place, by metres east and north of it
     - pictures_s: times of the pictures, the first at 0
-    - from_s, until_s: span that the poses must cover; a motion that ends above the firing height fires at its end
-    - firing_height_m: height of the thrusters' firing above the ground
+    - from_s, until_s: interval that the poses must cover; a motion that ends above the firing height fires at its end
+    - firing_height_m: height above the ground at which the thrusters fire
     """
 
     ground_height: Callable[[float, float], float]
@@ -51,12 +51,12 @@ class DescentPlace:
 
 @dataclass(frozen=True)
 class Poses:
-    """A motion by its poses, close enough for a cubic spline.
+    """A motion as a sequence of poses, sampled densely enough for a cubic spline.
 
     - times_s: increasing times, at least four; the first picture is at 0
     - positions_m: relative to the ground at the place, in the world axes of the campaign, by default east, north, up
     - quaternions_xyzw: rotations to those axes from the campaign's camera or body axes; of length 1, scalar last
-    - columns: further columns of the row, as `flight_NAME`, such as drawn values
+    - columns: further columns of the row, as `flight_NAME`, such as sampled values
     """
 
     times_s: Float[np.ndarray, "n"]
@@ -68,11 +68,11 @@ class Poses:
 class CustomMotion(CustomPart, RecordedAxes):
     """A user-defined motion (see `marsyard.scenarios.parts.motions`).
 
-    Positions count from the ground at `place`; they are the camera's, or with `lever_m` the vehicle's.
+    Positions are relative to the ground at `place`; they are those of the camera or, with `lever_m`, of the vehicle.
     """
 
     kind = DYNAMICS
-    named_by = "motion"
+    name_key = "motion"
 
     motion: Annotated[str, Field(description="custom motion's class: module:Class, or an entry point's name")]
     axes: Annotated[Literal["enu", "ned"], Field(description="east, north, up; or north, east, down")] = "enu"
@@ -81,38 +81,38 @@ class CustomMotion(CustomPart, RecordedAxes):
     def compute(
         self, place: DescentPlace, ground_m: Float[np.ndarray, "3"], rng: np.random.Generator
     ) -> tuple[RecordedMotion, dict[str, Scalar]]:
-        """The motion of a case in the terrain's world, and its columns. Raises ValueError for invalid poses."""
+        """Return the motion of a case in the terrain's world, and its columns. Raises ValueError for invalid poses."""
         poses = check_poses(self.spec, self.create().fly(place, rng), place)
         recorded = self.world * Rotation.from_quat(poses.quaternions_xyzw)
-        positions = self.world.apply(poses.positions_m) + self.levers(recorded) + ground_m
+        positions = self.world.apply(poses.positions_m) + self.lever_arms(recorded) + ground_m
         try:
-            motion = RecordedMotion(poses.times_s, positions, self.bodies(recorded), place.gravity_m_s2)
+            motion = RecordedMotion(poses.times_s, positions, self.body_attitudes(recorded), place.gravity_m_s2)
         except ValueError as error:
             raise ValueError(f"the motion of '{self.spec}' {error}") from error
         return motion, self.columns("flight", poses.columns)
 
 
 def check_poses(spec: str, poses: object, place: DescentPlace) -> Poses:
-    """A motion's poses as 64-bit arrays. Raises ValueError for invalid poses."""
+    """Return a motion's poses as 64-bit arrays. Raises ValueError for invalid poses."""
     if not isinstance(poses, Poses):
-        raise ValueError(f"'{spec}' flies a {type(poses).__name__}; allowed: marsyard.scenarios.parts.Poses")
+        raise ValueError(f"'{spec}' returns a {type(poses).__name__}; allowed: marsyard.scenarios.parts.Poses")
     names = ("times_s", "positions_m", "quaternions_xyzw")
     times, positions, quaternions = (np.array(getattr(poses, name), dtype=np.float64) for name in names)
     shapes = ((times.size,), (times.size, 3), (times.size, 4))
     for name, array, shape in zip(names, (times, positions, quaternions), shapes, strict=True):
         if array.shape != shape:
-            raise ValueError(f"'{spec}' gives {name} of shape {array.shape}; allowed: {shape}")
+            raise ValueError(f"'{spec}' returns {name} of shape {array.shape}; allowed: {shape}")
         if not np.all(np.isfinite(array)):
-            raise ValueError(f"'{spec}' gives {name} that are not finite")
+            raise ValueError(f"'{spec}' returns {name} that are not finite")
     if times.size == 0 or times[0] > place.from_s or times[-1] < place.until_s:
-        known = f"{times[0]:.6g} to {times[-1]:.6g} s" if times.size else "no time at all"
+        interval = f"{times[0]:.6g} to {times[-1]:.6g} s" if times.size else "no times"
         raise ValueError(
-            f"'{spec}' flies {known}; allowed: from {place.from_s:.6g} s or before to {place.until_s:.6g} s or after"
+            f"'{spec}' covers {interval}; allowed: from at most {place.from_s:.6g} s to at least {place.until_s:.6g} s"
         )
     lengths = np.linalg.norm(quaternions, axis=1)
-    wrong = np.flatnonzero(np.abs(lengths - 1.0) > UNIT_TOLERANCE)
-    if wrong.size:
+    invalid = np.flatnonzero(np.abs(lengths - 1.0) > UNIT_TOLERANCE)
+    if invalid.size:
         raise ValueError(
-            f"'{spec}' gives a quaternion of length {lengths[wrong[0]]:.6g} (pose {wrong[0] + 1}); allowed: 1"
+            f"'{spec}' returns a quaternion of length {lengths[invalid[0]]:.6g} (pose {invalid[0] + 1}); allowed: 1"
         )
     return Poses(times, positions, quaternions, poses.columns)

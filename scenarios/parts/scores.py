@@ -1,12 +1,12 @@
 """User-defined scores: `scores` of a campaign.
 
-A score is a function ``score(case) -> Mapping[str, float | bool]``, with the same names in every case; NaN: no number.
-Its values become columns prefixed with the function's name: `lateral_j` of `energy` becomes `energy_lateral_j`.
-Requirements use them as metrics, or truth values as populations. Each algorithm's answer is scored, except after a
+A score is a function ``score(case) -> Mapping[str, float | bool]``, with the same names in every case; NaN means no
+number. Its values become columns prefixed with the function's name: `lateral_j` of `energy` becomes `energy_lateral_j`.
+Requirements use them as metrics, or booleans as populations. The answer of each algorithm is scored, except after a
 crash of the algorithm.
 
-The annotation of the argument states the accepted kinds of cases, one or a union of several; without annotation the
-score must accept all. A kind includes its subclasses: `ScoredVelocity` accepts `ScoredFlight` and `ScoredDescent`.
+The annotation of the argument defines the accepted kinds of cases, one or a union of several; without annotation, the
+score must accept all kinds. A kind includes its subclasses: `ScoredVelocity` includes `ScoredFlight`.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class ScoredVelocity:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredFlight(ScoredVelocity):
-    """The same with known true motion and states at the pictures: simulated descent, or field test helicopter."""
+    """`ScoredVelocity` with known true motion and states at the pictures: simulated descent, or field test flight."""
 
     states: tuple[State, ...]
     motion: Trajectory
@@ -60,8 +60,8 @@ class ScoredFlight(ScoredVelocity):
 class ScoredDescent(ScoredFlight):
     """A simulated descent down to the ground.
 
-    - at_firing: true state at the thrusters' firing
-    - touchdown_m_s: true horizontal touchdown velocity, east and north, with the answer used
+    - at_firing: true state at the firing of the thrusters
+    - touchdown_m_s: true horizontal touchdown velocity, east and north, if the answer is used
     """
 
     at_firing: State
@@ -74,7 +74,7 @@ class ScoredSite:
 
     - measurements: the estimator's input
     - answer: its output; `answer.site_world` is None without a site
-    - true_poses: of the body at the two pictures, in the world; None if unknown
+    - true_poses: true poses of the body at the two pictures, in the world; None if unknown
     """
 
     measurements: LandingMeasurements
@@ -114,27 +114,27 @@ SCORED: tuple[type[Any], ...] = (ScoredVelocity, ScoredFlight, ScoredDescent, Sc
 
 
 def accepted_cases(score: Any) -> tuple[type[Any], ...]:
-    """Kinds of cases that a score accepts by its annotation, with their subclasses; all without an annotation."""
+    """Return the kinds of cases that a score's annotation accepts, with subclasses; all kinds without an annotation."""
     annotations = inspect.get_annotations(score if inspect.isroutine(score) else type(score).__call__)
-    stated = [str(kind) for name, kind in annotations.items() if name != "return"]
-    named = tuple(one for one in SCORED if any(one.__name__ in kind for kind in stated))
-    return tuple(one for one in SCORED if issubclass(one, named)) if stated else SCORED
+    annotated = [str(kind) for name, kind in annotations.items() if name != "return"]
+    classes = tuple(item for item in SCORED if any(item.__name__ in kind for kind in annotated))
+    return tuple(item for item in SCORED if issubclass(item, classes)) if annotated else SCORED
 
 
 def load_score(spec: str, kind: type[Any] | None = None) -> Any:
-    """Import a score. Raises ValueError if it does not exist, is no function, or does not accept a kind of case."""
+    """Import a score. Raises ValueError if it does not exist, is not a function, or does not accept a kind of case."""
     score = SCORE.load(spec)
     if isinstance(score, type) or not callable(score):
         kind_name = "class" if isinstance(score, type) else type(score).__name__
-        raise ValueError(f"'{spec}' is no score: it is a {kind_name}, not a function")
+        raise ValueError(f"'{spec}' is not a valid score: it is a {kind_name}, not a function")
     try:
         inspect.signature(score).bind(None)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"'{spec}' is no score: it does not take one argument, the case ({error})") from error
+        raise ValueError(f"'{spec}' is not a valid score: it must accept one argument, the case ({error})") from error
     accepted = accepted_cases(score)
     if kind is not None and kind not in accepted:
-        names = ", ".join(one.__name__ for one in accepted) or "no case"
-        raise ValueError(f"'{spec}' scores {names}; allowed here: {kind.__name__}")
+        names = ", ".join(item.__name__ for item in accepted) or "no case"
+        raise ValueError(f"'{spec}' accepts {names}; allowed here: {kind.__name__}")
     return score
 
 
@@ -151,17 +151,17 @@ class CustomScores(Parameters):
         for index, spec in enumerate(specs):
             load_score(spec, cls.scored)
             if spec in specs[:index]:
-                raise ValueError(f"the score '{spec}' is named twice")
+                raise ValueError(f"the score '{spec}' is listed twice")
         return specs
 
 
-def compute_scores(specs: Sequence[str], case: ScoredCase, taken: Collection[str]) -> dict[str, Scalar]:
-    """Columns of all scores of a case. Raises ValueError for an invalid column, or one that the row has already."""
+def compute_scores(specs: Sequence[str], case: ScoredCase, existing: Collection[str]) -> dict[str, Scalar]:
+    """Return the columns of all scores of a case. Raises ValueError for an invalid or an existing column."""
     row: dict[str, Scalar] = {}
     for spec, label in zip(specs, labels(specs), strict=True):
         for name, value in check_columns(spec, load_score(spec)(case), texts=False).items():
             column = f"{label}_{name}"
-            if column in row or column in taken:
-                raise ValueError(f"'{spec}' gives the column {column}, which the row has already")
+            if column in row or column in existing:
+                raise ValueError(f"'{spec}' returns the column {column}, which the row already contains")
             row[column] = value
     return row

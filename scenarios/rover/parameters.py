@@ -1,4 +1,4 @@
-"""Parameters of the rover scenario, all of which a campaign may set or disperse."""
+"""Parameters of the rover scenario."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios.algorithm_run import AlgorithmSelection
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.parts.scores import CustomScores, ScoredRun
-from marsyard.scenarios.terrain_files import check_site
+from marsyard.scenarios.terrain_files import site_validator
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import SlipParameters
 from marsyard.sim.frames import direction
@@ -36,48 +36,46 @@ from marsyard.sim.sensor import (
 )
 from marsyard.sim.terrain import site
 
-#: Angles in degrees: relative, and azimuths.
-Turn = Annotated[float, Field(ge=-180.0, le=180.0)]
+#: Angles in degrees: relative angles, and azimuths.
+RelativeAngle = Annotated[float, Field(ge=-180.0, le=180.0)]
 Azimuth = Annotated[float, Field(ge=-360.0, le=720.0)]
 
 
 class InclineParameters(Parameters):
-    """An even slope about the target that climbs to the east, and the direction of the route on it."""
+    """An even slope around the target that rises to the east, and the direction of the route on it."""
 
-    name: Annotated[str, Field(min_length=1, description="its name in the report")] = "flat ground"
-    slope_deg: Annotated[float, Field(ge=0.0, le=40.0, description="0 for none")] = 0.0
-    oblique_deg: Turn = Field(default=0.0, description="rotation of the start about the target, added to its bearing")
+    name: Annotated[str, Field(min_length=1, description="name in the report")] = "flat ground"
+    slope_deg: Annotated[float, Field(ge=0.0, le=40.0, description="0: no slope")] = 0.0
+    oblique_deg: RelativeAngle = Field(default=0.0, description="angle added to the bearing of the start")
 
 
 class WorldParameters(Parameters):
-    """One terrain of a site's bank, cleared of rocks on the route."""
+    """One terrain of a site's terrain bank, with large rocks removed from the route."""
 
     site: Annotated[
-        str, check_site("a rover", "ground"), Field(description="preset of terrain, rocks, texture and light")
+        str, site_validator("a rover", "ground"), Field(description="preset of terrain, rocks, texture and light")
     ] = "mars-yard"
-    bank: Annotated[int, Field(ge=1, le=100000, description="terrains in the bank")] = 8
+    bank: Annotated[int, Field(ge=1, le=100000, description="number of terrains in the terrain bank")] = 8
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
-    terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
-    samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, 2.5 cm apart")] = 2048
+    terrain: Annotated[int, Field(ge=0, description="index of the terrain in the bank")] = 0
+    samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, every 2.5 cm")] = 2048
     incline: InclineParameters = InclineParameters()
-    rms_slope_deg: Annotated[float | None, bounded_field(0.0, 30.0, "of rough ground; default: the site's")] = None
-    rock_abundance: Annotated[float | None, bounded_field(0.0, 0.4, "ground under rocks; default: the site's")] = None
-    largest_near_m: Annotated[NonNegative, Field(description="largest rock left on the route")] = 0.08
-    east_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
-    north_m: float = Field(default=8.0, description="of the target's rock, on the periodic terrain")
-    rocks_underfoot: bool = Field(default=False, description="whether wheels feel rocks, or the ground alone")
-    background_half_deg: Annotated[Positive, Field(le=180.0, description="half angle behind the target with rocks")] = (
-        50.0
-    )
+    rms_slope_deg: Annotated[float | None, bounded_field(0.0, 30.0, "of the ground; default: the site's")] = None
+    rock_abundance: Annotated[float | None, bounded_field(0.0, 0.4, "area fraction; default: the site's")] = None
+    largest_near_m: Annotated[NonNegative, Field(description="maximum diameter of rocks on the route")] = 0.08
+    east_m: float = Field(default=8.0, description="position of the target's rock, periodic terrain")
+    north_m: float = Field(default=8.0, description="position of the target's rock, periodic terrain")
+    rocks_underfoot: bool = Field(default=False, description="whether wheels roll over rocks, or only the ground")
+    background_half_deg: Annotated[Positive, Field(le=180.0, description="half angle of rocks behind target")] = 50.0
 
     @model_validator(mode="after")
     def _check_terrain(self) -> WorldParameters:
         if self.terrain >= self.bank:
             raise ValueError(f"terrain {self.terrain} is not in the bank; allowed: 0 to {self.bank - 1}")
         if self.samples & (self.samples - 1):
-            raise ValueError(f"samples is {self.samples}; a power of two is needed")
+            raise ValueError(f"samples is {self.samples}; allowed: powers of two")
         if self.incline.slope_deg and site(self.site).terrain("ground").ramp is not None:
-            raise ValueError(f"site {self.site} has a slope of its own")
+            raise ValueError(f"world.incline.slope_deg cannot be set: site {self.site} already has a slope")
         return self
 
 
@@ -85,59 +83,59 @@ class ObstacleParameters(Parameters):
     """A rock on or next to the route, positioned relative to the target."""
 
     towards_start_m: Annotated[float, Field(description="distance from the target towards the start, m")] = 4.0
-    right_m: Annotated[float, Field(description="to the right of that line, seen from the start, m")] = 0.0
+    right_m: Annotated[float, Field(description="offset to the right of that line, seen from the start, m")] = 0.0
     diameter_m: Annotated[float, Field(gt=0.0, le=5.0)] = 0.3
-    height_m: Annotated[Positive | None, Field(description="by default half the diameter")] = None
+    height_m: Annotated[Positive | None, Field(description="default: half the diameter")] = None
 
 
 class TargetParameters(Parameters):
     """The target's rock, the designated point on it, and the kind of designation (section 3).
 
-    The point is picked as seen from the start: `across` from the rock's left (-1) to its right (1) outline at `up`,
-    from its foot (0) to its top (1).
+    The point is picked in the view from the start: `across` is its horizontal position from the left (-1) to the right
+    (1) outline of the rock, `up` its vertical position from the foot (0) to the top (1).
     """
 
-    diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="of the rock")] = 0.8
-    height_m: Annotated[Positive | None, Field(description="of the rock; by default half the diameter")] = None
-    shape: Annotated[int | None, Field(ge=0, le=31, description="see PlacedRock; by default drawn")] = None
-    yaw_deg: Annotated[float | None, Field(description="by default drawn")] = None
-    across: Annotated[float, Field(ge=-1.0, le=1.0, description="position of the point across the rock")] = 0.0
-    up: Annotated[float, Field(ge=0.0, le=1.0, description="position of the point up the rock")] = 0.5
+    diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="diameter of the rock")] = 0.8
+    height_m: Annotated[Positive | None, Field(description="height of the rock; default: half the diameter")] = None
+    shape: Annotated[int | None, Field(ge=0, le=31, description="see PlacedRock; default: drawn")] = None
+    yaw_deg: Annotated[float | None, Field(description="azimuth of the rock; default: drawn")] = None
+    across: Annotated[float, Field(ge=-1.0, le=1.0, description="horizontal position of the point")] = 0.0
+    up: Annotated[float, Field(ge=0.0, le=1.0, description="vertical position of the point")] = 0.5
     designation: Literal["pixel", "rover", "site"] = Field(default="pixel", description="kind of designation")
 
 
 class StartParameters(Parameters):
     """The rover's start, relative to the target."""
 
-    distance_m: float = Field(default=10.0, gt=1.0, le=40.0, description="horizontally, mast to designated point")
+    distance_m: float = Field(default=10.0, gt=1.0, le=40.0, description="horizontal, from mast to designated point")
     bearing_deg: Azimuth = Field(default=270.0, description="from the target to the rover, clockwise from north")
-    target_azimuth_deg: Turn = Field(default=0.0, description="of the target, to the right of straight ahead")
+    target_azimuth_deg: RelativeAngle = Field(default=0.0, description="direction of the target, to the right of ahead")
 
 
 class LegParameters(Parameters):
-    """A part of a run; the target is tracked after each of its steps.
+    """A leg of a run; the target is tracked after each step.
 
     ========== ========================================================================================================
     stay       does not move for `steps` updates
-    approach   drives at the target's latest estimate until it is `goal_m` away
-    back-off   drives backwards, away from the target, until it is `goal_m` away
-    straight   drives `steps` times `step_m` along its heading (backwards where negative)
-    turn       turns in place `steps` times by `step_deg` (to the right where positive)
+    approach   drives towards the target's latest estimate until its distance is `goal_m`
+    back-off   drives backwards, away from the target, until its distance is `goal_m`
+    straight   drives `steps` times `step_m` along its heading (backwards if negative)
+    turn       turns in place `steps` times by `step_deg` (to the right if positive)
     circle     crabs around the target's latest estimate, facing it, `steps` times by `step_deg` (clockwise from above)
     ========== ========================================================================================================
     """
 
     motion: Literal["stay", "approach", "back-off", "straight", "turn", "circle"] = "approach"
     steps: Annotated[int, bounded_field(1, 200, "number of steps; the maximum of an approach or back-off")] = 60
-    step_fraction: float = Field(default=0.1, gt=0.0, le=0.9, description="step length over the camera's distance")
-    step_m: Annotated[float | None, Field(description="length of a step instead; needed for straight")] = None
-    step_deg: Annotated[Turn, Field(description="of a turn or circle")] = 5.0
+    step_fraction: float = Field(default=0.1, gt=0.0, le=0.9, description="step length / the camera's distance")
+    step_m: Annotated[float | None, Field(description="fixed step length instead; needed for straight")] = None
+    step_deg: Annotated[RelativeAngle, Field(description="step of a turn or circle")] = 5.0
     goal_m: Positive = Field(default=2.0, description="final horizontal distance of the rover's origin from the target")
-    ends_with_steps: bool = Field(default=False, description="whether it may end short of goal_m, its steps done")
+    ends_with_steps: bool = Field(default=False, description="whether it may end before goal_m after all steps")
     offset_right_m: float = Field(default=0.0, description="offset of the goal to the right of the target's direction")
-    shuffle_m: NonNegative = Field(default=0.0, description="drive of a step with a stuck motor, and back at the next")
+    shuffle_m: NonNegative = Field(default=0.0, description="drive of a step with a stuck motor, reversed in the next")
     visual_odometry: Annotated[bool, Field(description="whether the pose is corrected by visual odometry")] = False
-    visual_odometry_step_m: Positive = Field(default=0.75, description="longest drive between pictures (60 % overlap)")
+    visual_odometry_step_m: Positive = Field(default=0.75, description="maximum drive between pictures (60 % overlap)")
     autonav: bool = Field(default=False, description="whether the navigator avoids rocks in its map")
     maps_first: Annotated[bool, Field(description="whether the navigator maps before the first step")] = False
     map_by: Annotated[Literal["body", "mast"], Field(description="cameras that map for the navigator")] = "mast"
@@ -149,7 +147,7 @@ class LegParameters(Parameters):
         if self.motion == "straight" and self.step_m is None:
             raise ValueError("a straight leg needs step_m")
         if self.autonav and self.motion != "approach":
-            raise ValueError(f"the navigator drives to the target, not a leg of {self.motion}")
+            raise ValueError(f"autonav needs a leg of motion 'approach', not '{self.motion}'")
         return self
 
 
@@ -158,14 +156,14 @@ class SunParameters(Parameters):
 
     azimuth_deg: Annotated[Azimuth, Field(description="clockwise from north")] = 225.0
     elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="above the horizon")] = 45.0
-    hour_angle_deg_min: Annotated[float, bounded_field(-1.0, 1.0, "about the pole: 16 deg in 66 min (Table IV)")] = (
+    hour_angle_deg_min: Annotated[float, bounded_field(-1.0, 1.0, "rotation rate: 16 deg in 66 min (Table IV)")] = (
         16.0 / 66.0
     )
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0, description="elevation of the pole")] = -2.0
-    held_s: Annotated[Positive, Field(description="interval over which pictures share one sun")] = 120.0
+    held_s: Annotated[Positive, Field(description="interval in which all pictures have the same sun")] = 120.0
 
     def direction(self, time_s: float) -> Float64[np.ndarray, "3"]:
-        """Unit vector to the sun, world axes; it rotates westwards about the pole."""
+        """Compute the unit vector to the sun, world axes; the sun rotates westwards about the pole."""
         first = direction(np.radians(self.azimuth_deg), np.radians(self.elevation_deg))
         pole = direction(0.0, np.radians(self.latitude_deg))
         angle = -np.radians(self.hour_angle_deg_min * time_s / 60.0)
@@ -173,9 +171,9 @@ class SunParameters(Parameters):
         rotated = cosine * first + sine * np.cross(pole, first) + (1.0 - cosine) * (pole @ first) * pole
         return np.asarray(rotated / np.linalg.norm(rotated))
 
-    def in_interval(self, number: int, angular_radius_rad: float) -> Sun:
-        """The sun in the middle of an interval of `held_s`, which all its pictures share."""
-        return Sun(self.direction((number + 0.5) * self.held_s), angular_radius_rad)
+    def sun_in_interval(self, index: int, angular_radius_rad: float) -> Sun:
+        """Return the sun at the centre of an interval of `held_s`; all pictures of the interval use it."""
+        return Sun(self.direction((index + 0.5) * self.held_s), angular_radius_rad)
 
 
 class TimingParameters(Parameters):
@@ -198,19 +196,19 @@ class CustomPair(Parameters):
     """A custom stereo pair on the mast's head; the positions in the camera files are ignored."""
 
     left: Annotated[CustomCameraChoice, Field(description="camera file: a path, or a table with file")]
-    right: Annotated[CustomCameraChoice | None, Field(description="likewise; by default as the left one")] = None
-    baseline_m: Annotated[float, Field(gt=0.0, le=5.0, description="distance of the two, m")]
-    toe_in_deg: Annotated[float, Field(ge=-30.0, le=30.0, description="turn of each towards the other")] = 0.0
+    right: Annotated[CustomCameraChoice | None, Field(description="right camera file; default: as left")] = None
+    baseline_m: Annotated[float, Field(gt=0.0, le=5.0, description="distance between the cameras, m")]
+    toe_in_deg: Annotated[float, Field(ge=-30.0, le=30.0, description="inward rotation of each camera")] = 0.0
 
     @model_validator(mode="after")
     def _check_sizes(self) -> CustomPair:
         if self.right is not None and self.right.size != self.left.size:
             left, right = (f"{columns} x {rows}" for columns, rows in (self.left.size, self.right.size))
-            raise ValueError(f"the left camera has {left} pixels, the right one {right}; allowed: as many")
+            raise ValueError(f"the left camera has {left} pixels, the right one {right}; allowed: equal sizes")
         return self
 
     def cameras(self) -> tuple[CameraModel, CameraModel]:
-        """The left and the right camera in the head's frame."""
+        """Create the left and the right camera in the head's frame."""
         right = self.left if self.right is None else self.right
         return mount_on_head(self.left.camera(), right.camera(), self.baseline_m, self.toe_in_deg)
 
@@ -220,14 +218,14 @@ class CameraParameters(Parameters):
 
     preset: str = Field(default="mer-navcam", description="key of `marsyard.sim.sensor.mast.MASTS`: pair, mast, rover")
     custom: Annotated[CustomPair | None, Field(description="a custom pair on the preset's mast")] = None
-    detector: DetectorChoice | None = Field(default=None, description="of both cameras; by default the preset's")
+    detector: DetectorChoice | None = Field(default=None, description="both detectors; default: preset")
     detector_noise: Annotated[bool, Field(description="whether pictures have detector noise and response")] = True
 
     @field_validator("preset")
     @classmethod
     def _check_preset(cls, name: str) -> str:
         if name not in MASTS:
-            raise ValueError(f"no mast carries cameras called '{name}'; allowed: {', '.join(MASTS)}")
+            raise ValueError(f"no mast has the camera preset '{name}'; allowed: {', '.join(MASTS)}")
         return name
 
     @field_validator("detector")
@@ -239,11 +237,11 @@ class CameraParameters(Parameters):
 
     @property
     def name(self) -> str:
-        """The preset, or the file of the left camera."""
+        """Name of the preset, or file of the left camera."""
         return self.preset if self.custom is None else self.custom.left.file or "custom"
 
     def mast(self) -> MastCalibration:
-        """The design of the mast and its pair."""
+        """Return the design of the mast and its stereo pair."""
         design = stereo_mast(self.preset)
         if self.custom is None:
             return design
@@ -251,15 +249,15 @@ class CameraParameters(Parameters):
         return replace(design, left=left, right=right)
 
     def settings(self) -> DetectorParameters:
-        """The parameters of both detectors."""
+        """Return the parameters of both detectors."""
         return preset(self.preset).detector if self.detector is None else self.detector
 
 
 class ScoreParameters(Parameters):
-    """Criterion for a tracked target, and columns per update."""
+    """Criterion for a tracked target, and number of updates with columns."""
 
     tracked_px: Positive = Field(default=10.0, description="maximum distance of a tracked target from the true pixel")
-    stored_updates: int = Field(default=0, ge=0, le=100, description="first updates with figures as columns")
+    stored_updates: int = Field(default=0, ge=0, le=100, description="number of first updates with columns")
 
 
 class RoverScenarioParameters(AlgorithmSelection, CustomScores):
@@ -272,7 +270,7 @@ class RoverScenarioParameters(AlgorithmSelection, CustomScores):
     target: TargetParameters = TargetParameters()
     obstacles: tuple[ObstacleParameters, ...] = ()
     start: StartParameters = StartParameters()
-    legs: Annotated[tuple[LegParameters, ...], Field(min_length=1, description="parts, in order")] = (LegParameters(),)
+    legs: Annotated[tuple[LegParameters, ...], Field(min_length=1, description="legs, in order")] = (LegParameters(),)
     slip: SlipParameters = SlipParameters()
     odometry: OdometryParameters = OdometryParameters()
     pointing: PointingParameters = PointingParameters()
@@ -284,9 +282,9 @@ class RoverScenarioParameters(AlgorithmSelection, CustomScores):
     rover_shadow: Annotated[bool, Field(description="whether the rover and its mast cast shadows")] = True
     timing: TimingParameters = TimingParameters()
     algorithm: str = Field(default="vtt", description="vtt, pure-ncc, lucas-kanade, or a custom 'module:Class'")
-    vtt: VttOptions = Field(default=VttOptions(), description="the tracker's; pure-ncc takes no scale and roll")
+    vtt: VttOptions = Field(default=VttOptions(), description="tracker options; pure-ncc ignores scale and roll")
     score: ScoreParameters = ScoreParameters()
-    backend: Backend = Field(default_factory=default_backend, description="library that provides OpenGL's context")
+    backend: Backend = Field(default_factory=default_backend, description="OpenGL context provider")
 
     @property
     def bearing_rad(self) -> float:

@@ -1,10 +1,10 @@
 """Rover scenarios: one run of the closed loop, or one target tracked over the pictures of a shared drive.
 
-A shared drive is open-loop tracking (paper, 5.1 to 5.3). The rover is driven by the true position of the point in the
-middle of all targets, and its mast points there. At every stop a part of both frames is taken that holds the rock and
-the search windows about it. A case then tracks one of the targets over every (skip + 1)-th stop: skipped pictures make
-larger steps. The tracker's answers do not move the rover. A drive is a function of the parameters, the campaign's seed
-and the run's number.
+A shared drive is open-loop tracking (paper, 5.1 to 5.3). The true position of the point at the centre of all targets
+guides the rover and its mast. At every stop, subframes of both cameras are taken that contain the rock and the search
+windows around it. A case then tracks one of the targets over every (skip + 1)-th stop: skipped pictures make larger
+steps. The tracker's answers do not move the rover. A drive depends only on the parameters, the campaign's seed and the
+run's index.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from marsyard.algorithms.interface import TrackingState
 from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm
 from marsyard.scenarios.base import LoadGround, TerrainScenario
-from marsyard.scenarios.conditions import picture_columns
+from marsyard.scenarios.conditions import image_columns
 from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.interface import CaseResult, Scalar
-from marsyard.scenarios.parts.named import SCORE, Kind
+from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import compute_scores
 from marsyard.scenarios.rover import score
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
@@ -40,33 +40,33 @@ from marsyard.sim.parameters import Parameters
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
-#: Terrains of a bank that are built before its runs; a larger bank's are built by the runs that need them.
-PREPARED_TERRAINS = 64
-#: Maximum number of grounds, shared drives with their pictures, and visibilities along drives that a process caches.
-CACHED_GROUNDS, CACHED_DRIVES, CACHED_VISIBILITIES = 4, 1, 128
+#: Maximum bank size whose terrains are built before the runs; terrains of larger banks are built by the runs.
+MAX_PREPARED_TERRAINS = 64
+#: Cache sizes of a process: grounds, shared drives with their pictures, and visibilities along drives.
+MAX_GROUNDS, MAX_DRIVES, MAX_VISIBILITIES = 4, 1, 128
 
 
 class VariantParameters(Parameters):
     """Rock, terrain and sun of one run."""
 
-    terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank")] = 0
-    diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="of the rock")] = 1.4
-    height_m: Annotated[float, Field(gt=0.01, le=5.0, description="of the rock")] = 0.8
-    shape: Annotated[int, Field(ge=0, le=31, description="its shape, see PlacedRock")] = 0
-    yaw_deg: Annotated[float, Field(description="its turn")] = 0.0
+    terrain: Annotated[int, Field(ge=0, description="index of the terrain in the bank")] = 0
+    diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="diameter of the rock")] = 1.4
+    height_m: Annotated[float, Field(gt=0.01, le=5.0, description="height of the rock")] = 0.8
+    shape: Annotated[int, Field(ge=0, le=31, description="shape of the rock, see PlacedRock")] = 0
+    yaw_deg: Annotated[float, Field(description="azimuth of the rock")] = 0.0
     sun_azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="clockwise from north")] = 225.0
     sun_elevation_deg: Annotated[float, Field(gt=3.0, le=90.0)] = 45.0
 
 
 class PointParameters(Parameters):
-    """A target on the rock's face, as `TargetParameters`; of a circle as seen from its middle."""
+    """A target on the rock's face, as in `TargetParameters`; on a circle, as seen from the middle of the circle."""
 
     across: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
     up: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
 
 
 class BandParameters(Parameters):
-    """A range of steps: a boolean column of this name, by which requirements choose their cases."""
+    """A range of steps; requirements select cases by a boolean column with this name."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z]\w*$")]
     min: float = 0.0
@@ -74,30 +74,30 @@ class BandParameters(Parameters):
 
 
 class SharedDriveParameters(Parameters):
-    """Drives whose pictures many cases share; `run`, `target`, `skip`, `drive.algorithm`, `drive.vtt` make a case."""
+    """Drives whose pictures many cases use; `run`, `target`, `skip`, `drive.algorithm`, `drive.vtt` define a case."""
 
-    drive: Annotated[RoverScenarioParameters, Field(description="the drive at its finest steps, and the tracker")]
+    drive: Annotated[RoverScenarioParameters, Field(description="drive with its smallest steps, and the tracker")]
     variants: Annotated[tuple[VariantParameters, ...], Field(min_length=1, description="the runs")]
     targets: Annotated[tuple[PointParameters, ...], Field(min_length=1, description="points on every run's rock")]
-    run: Annotated[int, Field(ge=0, description="number of the run")] = 0
-    target: Annotated[int, Field(ge=0, description="number of the target")] = 0
-    skip: Annotated[int, Field(ge=0, le=100, description="stops left out between two updates")] = 0
-    margin_px: Annotated[float, Field(gt=0.0, description="margin about the rock in the pictures")] = 110.0
+    run: Annotated[int, Field(ge=0, description="index of the run")] = 0
+    target: Annotated[int, Field(ge=0, description="index of the target")] = 0
+    skip: Annotated[int, Field(ge=0, le=100, description="stops skipped between two updates")] = 0
+    margin_px: Annotated[float, Field(gt=0.0, description="margin around the rock in the pictures")] = 110.0
     bands: Annotated[tuple[BandParameters, ...], Field(description="ranges of steps")] = ()
     face_deg: float | None = Field(default=None, gt=0.0, le=90.0, description="maximum obliquity of a target `on_face`")
 
     @model_validator(mode="after")
     def _check_numbers(self) -> SharedDriveParameters:
-        for name, number, count in (("run", self.run, len(self.variants)), ("target", self.target, len(self.targets))):
-            if number >= count:
-                raise ValueError(f"{name} is {number}; allowed: 0 to {count - 1}")
+        for name, index, count in (("run", self.run, len(self.variants)), ("target", self.target, len(self.targets))):
+            if index >= count:
+                raise ValueError(f"{name} is {index}; allowed: 0 to {count - 1}")
         if len(self.drive.legs) != 1:
-            raise ValueError(f"a shared drive has one leg, not {len(self.drive.legs)}")
+            raise ValueError(f"a shared drive must have one leg, not {len(self.drive.legs)}")
         return self
 
     @property
     def step(self) -> float:
-        """The step between two updates: a fraction of the distance, or degrees of a turn or circle."""
+        """Step between two updates: a fraction of the distance, or degrees of a turn or circle."""
         leg = self.drive.legs[0]
         if leg.motion in ("turn", "circle"):
             return abs(leg.step_deg) * (self.skip + 1)
@@ -106,7 +106,7 @@ class SharedDriveParameters(Parameters):
 
 @dataclass(frozen=True)
 class DriveKey:
-    """Everything that the pictures of a drive depend on: the drive of a run without its tracker, and its seed."""
+    """All inputs of a drive's pictures: the drive of a run without its tracker, and its seed."""
 
     drive: RoverScenarioParameters
     margin_px: float
@@ -115,16 +115,16 @@ class DriveKey:
     run: int
 
     @classmethod
-    def of(cls, p: SharedDriveParameters, streams: Streams) -> DriveKey:
-        """The key of a case's drive."""
+    def from_parameters(cls, p: SharedDriveParameters, streams: Streams) -> DriveKey:
+        """Create the key of a case's drive."""
         variant, drive = p.variants[p.run], p.drive
-        # the drive is about the middle of its targets
-        middle = {name: float(np.mean([getattr(one, name) for one in p.targets])) for name in ("across", "up")}
+        # the drive is guided by the centre of its targets
+        centre = {name: float(np.mean([getattr(point, name) for point in p.targets])) for name in ("across", "up")}
         rock = variant.model_dump(include={"diameter_m", "height_m", "shape", "yaw_deg"})
         sun = {"azimuth_deg": variant.sun_azimuth_deg, "elevation_deg": variant.sun_elevation_deg}
         changes = {
             "world": drive.world.model_copy(update={"terrain": variant.terrain}),
-            "target": drive.target.model_copy(update=rock | middle),
+            "target": drive.target.model_copy(update=rock | centre),
             "sun": drive.sun.model_copy(update=sun),
             "algorithm": "vtt",
             "compared": (),
@@ -137,8 +137,8 @@ class DriveKey:
 class SharedDrive:
     """A drive and its pictures; targets on its rock are picked from `eye`.
 
-    The paper selected the targets of its circle on the one face that is seen from both of its ends: `eye` is the left
-    camera at the start, or in the middle of a circle.
+    The paper selected the targets of its circle on the face that is visible from both ends of the circle. `eye` is
+    the left camera at the start, or in the middle of a circle.
     """
 
     run: Run
@@ -147,38 +147,39 @@ class SharedDrive:
 
 
 def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) -> SharedDrive:
-    """Drive a run and take its pictures; its streams are named by the run and belong to no case."""
+    """Drive a run and take its pictures; its random streams depend on the run, not on a case."""
     p, streams = key.drive, Streams(key.seed, f"{key.campaign}: run {key.run}", 0)
-    setup = Setup.of(p, streams, load_ground)
+    setup = Setup.draw(p, streams, load_ground)
     world, rig, leg = setup.world, setup.rig, p.legs[0]
     half_circle_rad = np.radians(0.5 * leg.steps * leg.step_deg) if leg.motion == "circle" else 0.0
     sine, cosine = np.sin(half_circle_rad), np.cos(half_circle_rad)
 
-    def picking_eye(world_from_head: RigidTransform) -> Float64[np.ndarray, "3"]:
+    def compute_eye(world_from_head: RigidTransform) -> Float64[np.ndarray, "3"]:
         rock = world.rocks.position_m[world.target_number]
         east, north, up = rig.eyes(world_from_head)[0] - rock
         return np.asarray(rock + np.array([cosine * east + sine * north, cosine * north - sine * east, up]))
 
     mast = setup.vehicle.stance.world_from_rover * rig.calibrated.geometry.rover_from_head(0.0, 0.0)
     position = p.target.across, p.target.up
-    run = Run.at(setup, pick_target(world, rig, mast, (0.0, 0.0), position, p.vtt, picking_eye(mast)))
+    run = Run.from_setup(setup, pick_target(world, rig, mast, (0.0, 0.0), position, p.vtt, compute_eye(mast)))
     guide = TruthGuide(key.margin_px)
     drive_legs(p, run, guide)
-    return SharedDrive(run, tuple(guide.views), picking_eye(guide.views[0].world_from_head))
+    return SharedDrive(run, tuple(guide.views), compute_eye(guide.views[0].world_from_head))
 
 
 def prepare_shared_run(p: SharedDriveParameters, drive: SharedDrive) -> Run:
-    """Create a run over the drive's pictures, its target chosen, before the tracker is called."""
+    """Create a run over the drive's pictures: choose the target; do not call the tracker."""
     first, run, point = drive.views[0], drive.run, p.targets[p.target]
     position, head = (point.across, point.up), first.world_from_head
-    return Run.at(run, pick_target(run.world, run.rig, head, first.angles_rad, position, p.drive.vtt, drive.eye))
+    target = pick_target(run.world, run.rig, head, first.angles_rad, position, p.drive.vtt, drive.eye)
+    return Run.from_setup(run, target)
 
 
 def track_views(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | None = None) -> Run:
-    """Run a tracker over the drive's pictures for one of the targets; by default the tracker under test."""
+    """Run a tracker over the drive's pictures for one of the targets; default: the tracker under test."""
     run = prepare_shared_run(p, drive)
-    tracked = p.drive.model_copy(update={"algorithm": algorithm or p.drive.algorithm})
-    guide = TrackerGuide(tracked, run, drive.views[0].estimated)
+    parameters = p.drive.model_copy(update={"algorithm": algorithm or p.drive.algorithm})
+    guide = TrackerGuide(parameters, run, drive.views[0].estimated)
     for view in drive.views[:: p.skip + 1]:
         guide.observe(run, view)
         if run.stops[-1].update.state is TrackingState.FAILURE:
@@ -190,7 +191,7 @@ def track_views(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | N
     return run
 
 
-def visibility_along(drive: SharedDrive, point: PointParameters, options: VttOptions) -> Visibility:
+def evaluate_drive_visibility(drive: SharedDrive, point: PointParameters, options: VttOptions) -> Visibility:
     """Evaluate the visibility of a target along a drive."""
     world, rig, first = drive.run.world, drive.run.rig, drive.views[0]
     position = point.across, point.up
@@ -200,83 +201,83 @@ def visibility_along(drive: SharedDrive, point: PointParameters, options: VttOpt
 
 
 class RoverScenario(TerrainScenario[RoverScenarioParameters]):
-    """A rover drives to, around or away from what it sees, and tracks it at every stop."""
+    """A rover drives to, around or away from a target, and tracks it at every stop."""
 
     name = "rover"
     parameters_type = RoverScenarioParameters
     task = TRACKING
 
     def __init__(self) -> None:
-        super().__init__(CACHED_GROUNDS)
+        super().__init__(MAX_GROUNDS)
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Numbers of the bank's terrains; none of a large bank, whose terrains few runs share."""
+        """Return the indices of the bank's terrains; empty for a large bank, whose terrains few runs use."""
         bank = self.check_parameters(parameters).world.bank
-        return tuple(range(bank)) if bank <= PREPARED_TERRAINS else ()
+        return tuple(range(bank)) if bank <= MAX_PREPARED_TERRAINS else ()
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
-        """The run's terrain."""
+        """Return the index of the run's terrain."""
         return (self.check_parameters(parameters).world.terrain,)
 
     def input_terrain(self, p: RoverScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
-        """A terrain of the bank."""
+        """Return the terrain bank and the index of a terrain in it."""
         return TerrainBank(terrain_parameters(p.world), p.world.bank_seed), shared_input
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """Run the case for each algorithm, with the same draws."""
+        """Run the case with each algorithm and the same random draws."""
         p = self.check_parameters(parameters)
-        started = time.process_time()
+        start_s = time.process_time()
         first = prepare_run(p, streams, self.load_ground)
-        known = score.fixed_conditions(p, first)
+        shared = score.fixed_conditions(p, first)
 
         def evaluate(algorithm: str) -> CaseResult:
-            tested = algorithm == p.algorithm
+            is_tested = algorithm == p.algorithm
             candidate = p.model_copy(update={"algorithm": algorithm})
-            run_started = started if tested else time.process_time()
-            run = first if tested else prepare_run(candidate, streams, self.load_ground)
-            return _evaluate(p, lambda: track_target(candidate, run), known, tested, run_started)
+            run_start_s = start_s if is_tested else time.process_time()
+            run = first if is_tested else prepare_run(candidate, streams, self.load_ground)
+            return _evaluate(p, lambda: track_target(candidate, run), shared, is_tested, run_start_s)
 
-        return case_result(p.algorithms, evaluate, known)
+        return case_result(p.algorithms, evaluate, shared)
 
 
 class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
-    """Many targets tracked over the pictures of one drive."""
+    """Many targets are tracked over the pictures of one drive."""
 
     name = "rover-drive"
     parameters_type = SharedDriveParameters
     task = TRACKING
     algorithm_table = ("drive",)
-    part_keys: Mapping[str, Kind] = {"drive.scores": SCORE}
+    part_keys: Mapping[str, PartKind] = {"drive.scores": SCORE}
 
     def __init__(self) -> None:
-        super().__init__(CACHED_GROUNDS)
-        self._drive = lru_cache(maxsize=CACHED_DRIVES)(partial(render_drive, load_ground=self.load_ground))
-        self._visibility = lru_cache(maxsize=CACHED_VISIBILITIES)(
-            lambda key, point, options: visibility_along(self._drive(key), point, options)
+        super().__init__(MAX_GROUNDS)
+        self._drive = lru_cache(maxsize=MAX_DRIVES)(partial(render_drive, load_ground=self.load_ground))
+        self._visibility = lru_cache(maxsize=MAX_VISIBILITIES)(
+            lambda key, point, options: evaluate_drive_visibility(self._drive(key), point, options)
         )
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Numbers of the bank's terrains that runs use."""
-        return tuple(sorted({one.terrain for one in self.check_parameters(parameters).variants}))
+        """Return the indices of the terrains that runs use."""
+        return tuple(sorted({variant.terrain for variant in self.check_parameters(parameters).variants}))
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
-        """The terrain of the case's run."""
+        """Return the terrain of the case's run."""
         p = self.check_parameters(parameters)
         return (p.variants[p.run].terrain,)
 
     def input_terrain(self, p: SharedDriveParameters, shared_input: int) -> tuple[TerrainBank, int]:
-        """A terrain of the bank."""
+        """Return the terrain bank and the index of a terrain in it."""
         w = p.drive.world
         return TerrainBank(terrain_parameters(w), w.bank_seed), shared_input
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """Track one target of one run with one step; all algorithms see the same pictures."""
+        """Track one target of one run with one step size; all algorithms use the same pictures."""
         p = self.check_parameters(parameters)
-        key, point, algorithm = DriveKey.of(p, streams), p.targets[p.target], p.drive.algorithm
+        key, point, algorithm = DriveKey.from_parameters(p, streams), p.targets[p.target], p.drive.algorithm
         drive = self._drive(key)
         case = key.drive.model_copy(update={"algorithm": algorithm, "vtt": p.drive.vtt})
         visibility = self._visibility(key, point, p.drive.vtt)
-        known = {
+        shared = {
             **score.fixed_conditions(case, prepare_shared_run(p, drive)),
             "run": p.run,
             "target": p.target,
@@ -292,39 +293,38 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
         }
 
         def evaluate(name: str) -> CaseResult:
-            return _evaluate(case, lambda: track_views(p, drive, name), known, name == algorithm)
+            return _evaluate(case, lambda: track_views(p, drive, name), shared, name == algorithm)
 
-        return case_result(p.drive.algorithms, evaluate, known)
+        return case_result(p.drive.algorithms, evaluate, shared)
 
 
 def _evaluate(
     p: RoverScenarioParameters,
     track: Callable[[], Run],
-    known: Mapping[str, Scalar],
-    tested: bool,
-    started: float | None = None,
+    shared: Mapping[str, Scalar],
+    is_tested: bool,
+    start_s: float | None = None,
 ) -> CaseResult:
-    """Score a run; `tested` is the run of the algorithm under test, whose conditions and products are stored.
+    """Score a run; conditions and products are stored only for the algorithm under test (`is_tested`).
 
-    `started` is the processor time at the start of a run that takes its own pictures.
+    `start_s` is the processor time at the start of a run that takes its own pictures.
     """
 
     def track_and_score() -> tuple[Run, dict[str, Scalar]]:
         run = track()
-        return run, {**score.score(p, run), **score.tracking(run)}
+        return run, {**score.score_run(p, run), **score.tracking_row(run)}
 
-    attempt = run_algorithm(track_and_score, lambda answer: cast(tuple[Run, dict[str, Scalar]], answer))
-    if attempt.answer is None:
-        return CaseResult(attempt.outcome(str), False, attempt.row, failure=attempt.failure)
-    run, row = attempt.answer
-    if started is not None:
-        row["run_time_s"] = time.process_time() - started
-        row |= score.visibility_columns(p, run) if tested else {}
-    if tested:
+    algorithm_run = run_algorithm(track_and_score, lambda answer: cast(tuple[Run, dict[str, Scalar]], answer))
+    if algorithm_run.answer is None:
+        return CaseResult(algorithm_run.outcome(str), False, algorithm_run.row, failure=algorithm_run.failure)
+    run, row = algorithm_run.answer
+    if start_s is not None:
+        row["run_time_s"] = time.process_time() - start_s
+        row |= score.visibility_columns(p, run) if is_tested else {}
+    if is_tested:
         digest = hashlib.sha256(b"".join(stop.pictures.digest for stop in run.stops)).hexdigest()
-        row |= {**score.stored_updates(run, p.score.stored_updates), **score.run_conditions(p, run)}
-        row |= picture_columns(p.backend, digest)
-    row |= compute_scores(p.scores, score.scored_run(run), {*row, *known})
-    return CaseResult(
-        run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, score.products(p, run) if tested else {}
-    )
+        row |= {**score.update_columns(run, p.score.stored_updates), **score.run_conditions(p, run)}
+        row |= image_columns(p.backend, digest)
+    row |= compute_scores(p.scores, score.create_scored_run(run), {*row, *shared})
+    products = score.products(p, run) if is_tested else {}
+    return CaseResult(run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, products)

@@ -1,4 +1,4 @@
-"""Columns and products of a run: tracking errors, conditions read from the simulated objects, arrays for figures."""
+"""Columns and products of a run: tracking errors, conditions of the simulated objects, arrays for figures."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from marsyard.scenarios.rover.stops import RunOutcome, evaluate_visibility
 from marsyard.sim.measurements import RoverMeasurements
 
 NAN = float("nan")
-#: Figures of each update, in the order of the columns of stored updates.
-FIGURES = (
+#: Quantities of each update, in the order of the columns of stored updates.
+UPDATE_QUANTITIES = (
     "range_m", "azimuth_deg", "elevation_deg", "magnification", "roll_change_deg", "azimuth_change_deg",
     "match_score", "stereo_score", "correction_px", "error_px", "position_error_m", "leg", "time_s",
 )  # fmt: skip
-#: Columns of `tracking`: the figure and its reduction over the updates.
-EXTREMES: dict[str, tuple[str, Callable[[np.ndarray], float]]] = {
+#: Columns of `tracking_row`: a quantity and its reduction over the updates.
+REDUCTIONS: dict[str, tuple[str, Callable[[np.ndarray], float]]] = {
     "match_score_min": ("match_score", np.nanmin),
     "stereo_score_min": ("stereo_score", np.nanmin),
     "magnification_min": ("magnification", np.nanmin),
@@ -38,90 +38,90 @@ EXTREMES: dict[str, tuple[str, Callable[[np.ndarray], float]]] = {
 
 
 def errors_px(run: Run) -> Float64[np.ndarray, "stops 2"]:
-    """Tracked minus true pixel of the designated point at every stop, (u, v); NaN where it was not found."""
-    errors = [stop.found_px(run.rig.calibrated) - stop.point_px for stop in run.stops]
+    """Compute tracked minus true pixels (u, v) of the designated point at all stops; NaN if it was not found."""
+    errors = [stop.reported_px(run.rig.calibrated) - stop.point_px for stop in run.stops]
     return np.stack(errors) if errors else np.empty((0, 2))
 
 
-def score(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
-    """Tracking success and errors at the goal.
+def score_run(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
+    """Compute the columns of tracking success and errors at the goal.
 
     `tracked`: the run is completed and the last tracked pixel is within `tracked_px` of the true projection of the
-    designated point. `position_error_m`: the last reported position minus the designated point, in the rover frame; NaN
-    where the run was not completed. `false_updates`: updates that report the target further than `tracked_px` from the
-    true projection.
+    designated point. `position_error_m`: length of the last reported position minus the designated point, in the rover
+    frame; NaN if the run was not completed. `false_updates`: number of updates that report the target farther than
+    `tracked_px` from the true projection.
     """
     errors = errors_px(run)
     sizes = np.hypot(*errors.T)
-    completed = run.outcome is RunOutcome.COMPLETED
-    last, error, along, across = np.full(2, np.nan), np.full(3, np.nan), NAN, NAN
-    if completed:
-        # components along the line of sight (positive: too far) and across it
+    is_completed = run.outcome is RunOutcome.COMPLETED
+    last, error, range_error, cross_error = np.full(2, np.nan), np.full(3, np.nan), NAN, NAN
+    if is_completed:
+        # components along the line of sight (positive: too far) and perpendicular to it
         stop, last = run.stops[-1], errors[-1]
         error = stop.error_m()
         eye = stop.stance.world_from_rover.inv().apply(stop.world_from_head.apply(run.rig.left.c.copy()))
         sight = stop.point_rover - eye
-        along = float(error @ sight / np.linalg.norm(sight))
-        across = float(np.sqrt(np.maximum(float(error @ error) - along * along, 0.0)))
+        range_error = float(error @ sight / np.linalg.norm(sight))
+        cross_error = float(np.sqrt(np.maximum(float(error @ error) - range_error * range_error, 0.0)))
     false_updates = int(np.count_nonzero(sizes > p.score.tracked_px))
     drift = float(np.hypot(*last))
-    tracked = completed and drift <= p.score.tracked_px
-    losses = next((one.update.losses for one in run.stops if one.update.losses), ())
+    is_tracked = is_completed and drift <= p.score.tracked_px
+    losses = next((stop.update.losses for stop in run.stops if stop.update.losses), ())
     return {
-        "tracked": tracked,
-        "not_tracked": not tracked,
+        "tracked": is_tracked,
+        "not_tracked": not is_tracked,
         "true_track": false_updates == 0,
         "false_updates": false_updates,
         "position_error_m": float(np.linalg.norm(error)),
-        "range_error_m": along,
-        "cross_error_m": across,
+        "range_error_m": range_error,
+        "cross_error_m": cross_error,
         "drift_px": drift,
         "drift_u_px": float(last[0]),
         "drift_v_px": float(last[1]),
         "worst_error_px": _max(sizes),
         "losses": ", ".join(loss.name for loss in losses) or "none",
-        "lost_range_m": next((one.range_m for one in run.stops if not one.update.found), NAN),
+        "lost_range_m": next((stop.range_m for stop in run.stops if not stop.update.found), NAN),
         "handed_over": run.handed_over,
     }
 
 
 def _max(values: Float64[np.ndarray, "n"]) -> float:
-    """The maximum; NaN without finite values."""
+    """Return the maximum; NaN without finite values."""
     return float(np.nanmax(values)) if np.any(np.isfinite(values)) else NAN
 
 
-def tracking(run: Run) -> dict[str, Scalar]:
-    """Table III's figures at their extremes, and the tracker's corrections."""
-    figures = update_figures(run)
-    sighted = [one for one in run.stops if one.update.found]
+def tracking_row(run: Run) -> dict[str, Scalar]:
+    """Compute the columns of tracking: extremes of Table III's quantities, drift, and designation errors."""
+    quantities = update_quantities(run)
+    tracked_stops = [stop for stop in run.stops if stop.update.found]
     drift_m = seed_error = seed_3_sigma = NAN
-    if sighted:
-        seed, last = (
-            one.estimated.apply(np.asarray(one.update.position_rover).copy()) for one in (sighted[0], sighted[-1])
-        )
-        drift_m, seed_error = float(np.linalg.norm(last - seed)), float(np.linalg.norm(sighted[0].error_m()))
+    if tracked_stops:
+        first_stop, last_stop = tracked_stops[0], tracked_stops[-1]
+        ends = (first_stop, last_stop)
+        seed, last = (stop.estimated.apply(np.asarray(stop.update.position_rover).copy()) for stop in ends)
+        drift_m, seed_error = float(np.linalg.norm(last - seed)), float(np.linalg.norm(first_stop.error_m()))
         scale = disparity_px_m(run.rig.calibrated.left, run.rig.calibrated.right)
-        seed_3_sigma = stereo_range_error_m(sighted[0].range_m, scale, 1.0)
+        seed_3_sigma = stereo_range_error_m(first_stop.range_m, scale, 1.0)
     return {
         "updates": len(run.stops),
-        "lost_updates": len(run.stops) - len(sighted),
+        "lost_updates": len(run.stops) - len(tracked_stops),
         "visual_odometry_updates": run.visual_odometry_updates,
         "autonav_updates": run.autonav_updates,
         **{
-            column: float(reduce(figures[name])) if np.any(np.isfinite(figures[name])) else NAN
-            for column, (name, reduce) in EXTREMES.items()
+            column: float(reduce(quantities[name])) if np.any(np.isfinite(quantities[name])) else NAN
+            for column, (name, reduce) in REDUCTIONS.items()
         },
-        "roll_total_deg": float(np.nansum(figures["roll_change_deg"])),
-        "azimuth_total_deg": float(np.nansum(figures["azimuth_change_deg"])),
+        "roll_total_deg": float(np.nansum(quantities["roll_change_deg"])),
+        "azimuth_total_deg": float(np.nansum(quantities["azimuth_change_deg"])),
         "target_motion_m": drift_m,
         "designation_error_m": seed_error,
         "designation_3_sigma_m": seed_3_sigma,
-        "update_time_s": float(np.mean([one.track_time_s for one in run.stops])) if run.stops else NAN,
+        "update_time_s": float(np.mean([stop.track_time_s for stop in run.stops])) if run.stops else NAN,
     }
 
 
-def update_figures(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
-    """Figures of every update, one array each; NaN where a tracker reports no details, of a match also at the seed."""
+def update_quantities(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
+    """Collect the quantities of all updates in arrays; NaN if a tracker reports no details, or no match at the seed."""
     rows = []
     for stop, error in zip(run.stops, errors_px(run), strict=True):
         azimuth, elevation = np.degrees(stop.angles_rad)
@@ -147,20 +147,20 @@ def update_figures(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
             if details.predicted_pixel is not None:
                 row["correction_px"] = float(np.max(np.abs(details.match.pixel - details.predicted_pixel)))
         rows.append(row)
-    return {name: np.array([row.get(name, NAN) for row in rows], dtype=np.float64) for name in FIGURES}
+    return {name: np.array([row.get(name, NAN) for row in rows], dtype=np.float64) for name in UPDATE_QUANTITIES}
 
 
-def stored_updates(run: Run, count: int) -> dict[str, Scalar]:
-    """Figures of the first updates, a column each, NaN where there were fewer: for tables such as Table III."""
+def update_columns(run: Run, count: int) -> dict[str, Scalar]:
+    """Compute the columns of the first updates (as in Table III), NaN for missing updates."""
     return {
         f"update_{number + 1}_{name}": float(values[number]) if number < len(values) else NAN
         for number in range(count)
-        for name, values in update_figures(run).items()
+        for name, values in update_quantities(run).items()
     }
 
 
 def fixed_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
-    """Conditions that do not depend on the tracker, read from the simulated objects."""
+    """Compute the columns of conditions that do not depend on the tracker, from the simulated objects."""
     target, rocks, number = run.target, run.world.rocks, run.world.target_number
     azimuth_error, elevation_error = np.degrees(run.rig.mast.zeros_rad)
     return {
@@ -196,32 +196,32 @@ def fixed_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
 
 
 def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
-    """Conditions along the run that the tracker led to, read from the simulated objects."""
+    """Compute the columns of conditions that depend on the tracker's run, from the simulated objects."""
     stops, world = run.stops, run.world
-    drives = [drive for one in stops for drive in one.drives]
+    drives = [drive for stop in stops for drive in stop.drives]
     lengths = np.array([drive.command.length_m for drive in drives])
-    moving = lengths > 0.0
-    slips = np.array([drive.slip for drive in drives])[moving]
-    driven = float(lengths.sum())
+    is_moving = lengths > 0.0
+    slips = np.array([drive.slip for drive in drives])[is_moving]
+    distance = float(lengths.sum())
     ranges, times, pose_error = (NAN, NAN), (0.0, 0.0), NAN
     if stops:
         ranges, times = (stops[0].range_m, stops[-1].range_m), (stops[0].time_s, stops[-1].time_s)
         position_error = stops[-1].estimated.translation - stops[-1].stance.world_from_rover.translation
         pose_error = float(np.linalg.norm(position_error))
     sun = [world.sun.direction(time_s) for time_s in times]
-    exposures = np.array([one.pictures.exposure_s for one in stops], dtype=np.float64)
-    shadowed = _is_rover_shadow_on_target(p, run)
+    exposures = np.array([stop.pictures.exposure_s for stop in stops], dtype=np.float64)
+    is_shadowed = _is_rover_shadow_on_target(p, run)
     return {
-        "rover_shadow_on_target": shadowed,
-        "no_rover_shadow_on_target": not shadowed,
+        "rover_shadow_on_target": is_shadowed,
+        "no_rover_shadow_on_target": not is_shadowed,
         "range_start_m": ranges[0],
         "range_end_m": ranges[1],
-        "tilt_max_deg": float(np.degrees(_max(np.array([one.stance.tilt_rad for one in stops])))),
-        "distance_driven_m": driven,
-        "slip_mean": float(np.sum(slips * lengths[moving]) / driven) if driven > 0.0 else 0.0,
-        "slip_max": _max(slips) if np.any(moving) else 0.0,
+        "tilt_max_deg": float(np.degrees(_max(np.array([stop.stance.tilt_rad for stop in stops])))),
+        "distance_driven_m": distance,
+        "slip_mean": float(np.sum(slips * lengths[is_moving]) / distance) if distance > 0.0 else 0.0,
+        "slip_max": _max(slips) if np.any(is_moving) else 0.0,
         "pose_error_m": pose_error,
-        "pose_error_fraction": pose_error / driven if driven > 0.0 else NAN,
+        "pose_error_fraction": pose_error / distance if distance > 0.0 else NAN,
         "duration_min": times[1] / 60.0,
         **sun_columns(sun[0]),
         "sun_motion_deg": float(np.degrees(np.arccos(np.clip(sun[0] @ sun[1], -1.0, 1.0)))),
@@ -231,7 +231,7 @@ def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
 
 
 def visibility_columns(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
-    """Visibility of the designated point at the stops of a run."""
+    """Compute the columns of the designated point's visibility at the stops of a run."""
     if not run.stops:
         return {"point_in_view": False, "obliquity_start_deg": NAN, "obliquity_max_deg": NAN}
     heads = [stop.world_from_head for stop in run.stops]
@@ -240,14 +240,14 @@ def visibility_columns(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar
 
 
 def _is_rover_shadow_on_target(p: RoverScenarioParameters, run: Run) -> bool:
-    """Whether the rover's shadow lay on the template up to the first stop at which the point was lost or mistracked.
+    """Return whether the rover's shadow was on the template up to the first stop with a lost or falsely tracked point.
 
-    The path of the run after that is a consequence of the tracker's error.
+    Later stops are a consequence of the tracker's error.
     """
-    reach, mast = 0.5 * p.vtt.template_px * run.rig.pixel_rad, run.rig.calibrated.geometry
+    half_angle, mast = 0.5 * p.vtt.template_px * run.rig.pixel_rad, run.rig.calibrated.geometry
     for stop, error in zip(run.stops, np.hypot(*errors_px(run).T), strict=True):
         eye = run.rig.eyes(stop.world_from_head)[0]
-        patch = template_patch(eye, run.target.point_world, reach)
+        patch = template_patch(eye, run.target.point_world, half_angle)
         sun = run.world.sun.direction(stop.time_s)
         if p.rover_shadow and rover_shades_patch(run.vehicle.rover, stop.stance, mast, stop.angles_rad, patch, sun):
             return True
@@ -260,33 +260,33 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
     """Collect the arrays for a run's figures (Figs. 15, 16b and 17 of the paper).
 
     ================== ================================================================================================
-    stop_N_left        counts of the left subframe of stop N, from 1, and `stop_N_right` of the right one
-    stop_N_corners     (u, v) of their upper left pixels in the full frames, (2, 2)
-    stop_N_window      the search window in the left frame: (u, v) of its upper left pixel, columns, rows; NaN without
-    stop_N_found       (u, v) found in the left and the right frame, (2, 2); NaN where not
+    stop_N_left        counts of the left subframe of stop N (from 1); `stop_N_right`: those of the right subframe
+    stop_N_corners     full-frame (u, v) of the upper left pixels of both subframes, (2, 2)
+    stop_N_window      search window in the left frame: (u, v) of its upper left pixel, columns, rows; or NaN
+    stop_N_found       tracked (u, v) in the left and the right frame, (2, 2); NaN if not found
     stop_N_point       (u, v) of the designated point's true projection in the left frame
-    template_px        side of the template about `stop_N_found`
-    figures            arrays over the stops by name, as `update_figures`
+    template_px        side of the template around `stop_N_found`
+    figures            arrays over the stops by name, see `update_quantities`
     states             the tracker's state at each stop
-    rover_true_m       world positions of the rover's origin, (stops, 3); `rover_believed_m` as estimated
+    rover_true_m       world positions of the rover's origin, (stops, 3); `rover_believed_m`: estimated positions
     heading_deg        true azimuth of the rover at each stop, clockwise from north
-    target_m           designated point, world, (3,); `target_believed_m` as estimated at each stop in the world as
-                       believed, (stops, 3), NaN where not found
-    path_true_m        world positions of the rover's origin along its way, (points, 2)
+    target_m           designated point, world, (3,); `target_believed_m`: its estimated world position at each stop,
+                       (stops, 3), NaN if not found
+    path_true_m        world positions of the rover's origin along its path, (points, 2)
     rocks_m            east, north and diameter of the target's rock and the obstacles, (rocks, 3)
     ================== ================================================================================================
     """
-    stops, rocks, named = run.stops, run.world.rocks, list(run.world.rocks.names.values())
+    stops, rocks, rock_indices = run.stops, run.world.rocks, list(run.world.rocks.names.values())
     arrays: dict[str, object] = {}
     for number, stop in enumerate(stops, start=1):
         left, right, details = stop.pictures.left, stop.pictures.right, stop.details
         window, matched_px = np.full(4, np.nan), np.full((2, 2), np.nan)
         if details is not None and details.window is not None and details.window_corner is not None:
             window = np.array([*details.window_corner, *details.window.shape[::-1]], dtype=np.float64)
-        matched_px[0] = stop.found_px(run.rig.calibrated)
+        matched_px[0] = stop.reported_px(run.rig.calibrated)
         if details is not None and details.stereo is not None and stop.update.found:
             matched_px[1] = details.stereo.pixel
-        of_stop = {
+        stop_arrays = {
             "left": left.counts,
             "right": right.counts,
             "corners": np.array([left.corner, right.corner], dtype=np.float64),
@@ -294,17 +294,16 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
             "found": matched_px,
             "point": stop.point_px,
         }
-        arrays |= {f"stop_{number}_{name}": values for name, values in of_stop.items()}
+        arrays |= {f"stop_{number}_{name}": values for name, values in stop_arrays.items()}
     estimated = [
         np.full(3, np.nan) if stop.reported_rover is None else stop.estimated.apply(stop.reported_rover.copy())
         for stop in stops
     ]
-    path = [
-        stance.world_from_rover.translation[:2] for stop in stops for drive in stop.drives for stance in drive.stances
-    ]
+    stances = [stance for stop in stops for drive in stop.drives for stance in drive.stances]
+    path = [stance.world_from_rover.translation[:2] for stance in stances]
     arrays |= {
         "template_px": p.vtt.template_px,
-        "figures": update_figures(run),
+        "figures": update_quantities(run),
         "states": [stop.update.state.name for stop in stops],
         "rover_true_m": np.array([stop.stance.world_from_rover.translation for stop in stops]).reshape(-1, 3),
         "rover_believed_m": np.array([stop.estimated.translation for stop in stops]).reshape(-1, 3),
@@ -312,13 +311,13 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
         "target_m": run.target.point_world,
         "target_believed_m": np.array(estimated).reshape(-1, 3),
         "path_true_m": np.array(path).reshape(-1, 2),
-        "rocks_m": np.column_stack([rocks.position_m[named, :2], rocks.diameter_m[named]]),
+        "rocks_m": np.column_stack([rocks.position_m[rock_indices, :2], rocks.diameter_m[rock_indices]]),
     }
     return arrays
 
 
-def scored_run(run: Run) -> ScoredRun:
-    """The run as input of custom scores."""
+def create_scored_run(run: Run) -> ScoredRun:
+    """Create the input of custom scores."""
     mast = run.rig.calibrated
     return ScoredRun(
         outcome=run.outcome.name,

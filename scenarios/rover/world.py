@@ -1,4 +1,4 @@
-"""World of a rover run: a site's terrain with the target's rock and obstacles, the sun, the rover and its mast."""
+"""World of a rover run: terrain of a site with the target's rock and obstacles, sun, rover and mast."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from marsyard.sim.terrain.rocks.field import ROCK_ARRAYS
 
 #: Name of the target's rock.
 TARGET = "target"
-#: Height above the target's foot from which the scene's detail is chosen: that of a mast's head at the goal.
+#: Viewing height above the target's foot that determines the scene's detail: the mast head's height at the goal.
 EYE_HEIGHT_M = 1.2
-#: Distance behind the target to which ground and rocks are drawn.
+#: Distance behind the target up to which ground and rocks are rendered.
 BACKGROUND_M = 25.0
-#: Spacing of the ground's mesh about the target, and its growth from line to line: half of it changed 38 of 1.4 million
-#: pixels by a thousandth of their brightness (ADR 34).
+#: Mesh spacing of the ground around the target, and its growth from line to line. With half the spacing, 38 of 1.4
+#: million pixels change by a thousandth of their brightness (ADR 34).
 MESH_FINEST_M, MESH_GROWTH = 0.04, 0.012
-#: Length of an even slope as a fraction of the terrain's period; the landform centres it at a quarter of the period.
+#: Length of an even slope divided by the terrain's period; its centre is at a quarter of the period.
 RAMP_FRACTION = 0.4
-#: Distance beyond start and target within which the ground is cleared of rocks on the route.
-CLEARED_M = 2.0
-#: Minimum distance of the bank's rocks from the outline of a placed rock.
+#: Margin beyond start and target in which large rocks are removed.
+CLEARANCE_M = 2.0
+#: Minimum gap between the terrain's rocks and a placed rock, m.
 MIN_GAP_M = 0.05
-#: Maximum distance from the route of rocks that wheels roll over, metres.
+#: Margin beyond the start in which wheels roll over rocks, metres.
 ROUTE_MARGIN_M = 1.5
 
 
 def terrain_parameters(w: WorldParameters) -> TerrainParameters:
-    """The terrain of the site with the campaign's changes."""
+    """Return the site's terrain parameters with the campaign's changes."""
     changes: dict[str, object] = {"samples": w.samples}
     if w.rms_slope_deg is not None:
         changes["rms_slope_deg"] = w.rms_slope_deg
@@ -62,34 +62,36 @@ class RunWorld:
     """Terrain, scene and sun of a run."""
 
     ground: SiteGround
-    rocks: RockField  #: of the ground; the target's is named `TARGET`, obstacles `obstacle-1`, `obstacle-2`, ...
-    base: Scene  #: the scene at the start, without the rover
+    rocks: RockField  #: rocks of the ground; the target's rock has the name `TARGET`, obstacles `obstacle-1`, ...
+    base: Scene  #: scene at the start, without the rover
     sun: SunParameters
-    target_number: int  #: number of the target's rock
-    target_triangles: Float64[np.ndarray, "triangles 3 3"]  #: the target's rock as rendered, which is the truth
-    _latest: tuple[int, Scene] | None = field(default=None, repr=False)
+    target_number: int  #: index of the target's rock
+    target_triangles: Float64[np.ndarray, "triangles 3 3"]  #: rendered mesh of the target's rock, used as truth
+    _cached_scene: tuple[int, Scene] | None = field(default=None, repr=False)
 
     @classmethod
-    def of(cls, p: RoverScenarioParameters, pixel_rad: float, streams: Streams, load_ground: LoadGround) -> RunWorld:
+    def from_parameters(
+        cls, p: RoverScenarioParameters, pixel_rad: float, streams: Streams, load_ground: LoadGround
+    ) -> RunWorld:
         """Create the world of a run."""
         w = p.world
-        bare = load_ground(site(w.site), terrain_parameters(w), w.bank_seed, w.terrain)
-        ground, rocks = place_rocks(p, bare, streams.generator("placed rocks"))
-        reach = p.start.distance_m + BACKGROUND_M
-        middle, half = p.bearing_rad + np.pi, np.radians(w.background_half_deg)
-        eye = Eye(w.east_m, w.north_m, EYE_HEIGHT_M, pixel_rad, float(middle), float(half), reach)
+        site_ground = load_ground(site(w.site), terrain_parameters(w), w.bank_seed, w.terrain)
+        ground, rocks = place_rocks(p, site_ground, streams.generator("placed rocks"))
+        radius = p.start.distance_m + BACKGROUND_M
+        azimuth, half_angle = p.bearing_rad + np.pi, np.radians(w.background_half_deg)
+        eye = Eye(w.east_m, w.north_m, EYE_HEIGHT_M, pixel_rad, float(azimuth), float(half_angle), radius)
         clouds = None
         if p.clouds is not None:
-            level = float(ground.surface.height(w.east_m, w.north_m))
-            clouds = CloudLayer.draw(p.clouds, streams.generator("clouds"), ground_m=level)
+            height = float(ground.surface.height(w.east_m, w.north_m))
+            clouds = CloudLayer.draw(p.clouds, streams.generator("clouds"), ground_m=height)
         scene = replace(
-            site_scene(ground, eye, p.sun.in_interval(0, ground.site.environment.sun_radius_rad)),
+            site_scene(ground, eye, p.sun.sun_in_interval(0, ground.site.environment.sun_radius_rad)),
             mesh_finest_m=MESH_FINEST_M,
-            mesh_reach_m=reach,
-            mesh_lines=2 * int(np.ceil(np.arcsinh(reach / MESH_FINEST_M * np.sinh(MESH_GROWTH)) / MESH_GROWTH)) + 1,
+            mesh_reach_m=radius,
+            mesh_lines=2 * int(np.ceil(np.arcsinh(radius / MESH_FINEST_M * np.sinh(MESH_GROWTH)) / MESH_GROWTH)) + 1,
             clouds=clouds,
         )
-        # a periodic scene may hold copies of the target's rock: take the one nearest to its position
+        # a periodic scene may contain copies of the target's rock: use the copy nearest to its position
         number, objects = rocks.by_name(TARGET), scene.objects
         bodies = np.flatnonzero(objects.names == number)
         offsets = objects.spheres[bodies, :2] - rocks.position_m[number][:2]
@@ -98,75 +100,75 @@ class RunWorld:
         return cls(ground, rocks, scene, p.sun, number, objects.triangles[first:end])
 
     def face_m(self, p: RoverScenarioParameters) -> float:
-        """Distance of the designated point from the rock's middle along the horizontal line to the start, metres.
+        """Compute the horizontal distance of the designated point from the rock's centre towards the start, metres.
 
-        Picked from about the rover's start: at the start's distance, an eye's height above the rock's foot.
+        The point is picked from near the rover's start: at the start's distance, EYE_HEIGHT_M above the rock's foot.
         """
         bearing, foot = p.bearing_rad, self.rocks.position_m[self.target_number]
-        away = np.array([np.sin(bearing), np.cos(bearing), 0.0])
-        eye = foot + (p.start.distance_m + 0.5 * p.target.diameter_m) * away + np.array([0.0, 0.0, EYE_HEIGHT_M])
-        point = RockOutline.of(self.target_triangles, eye, float(foot[2])).point(p.target.across, p.target.up)
-        return float((point - foot) @ away)
+        to_start = np.array([np.sin(bearing), np.cos(bearing), 0.0])
+        eye = foot + (p.start.distance_m + 0.5 * p.target.diameter_m) * to_start + np.array([0.0, 0.0, EYE_HEIGHT_M])
+        outline = RockOutline.from_triangles(self.target_triangles, eye, float(foot[2]))
+        return float((outline.point(p.target.across, p.target.up) - foot) @ to_start)
 
     def scene(self, time_s: float) -> Scene:
-        """The scene at a time of the run, without the rover. The sun is held for `SunParameters.held_s`."""
+        """Return the scene at a time of the run, without the rover; the sun is constant for `SunParameters.held_s`."""
         interval = int(time_s // self.sun.held_s)
-        if self._latest is None or self._latest[0] != interval:
-            sun = self.sun.in_interval(interval, self.ground.site.environment.sun_radius_rad)
-            self._latest = (interval, self.base.in_light(sun, self.ground.photometry(sun)))
-        return self._latest[1]
+        if self._cached_scene is None or self._cached_scene[0] != interval:
+            sun = self.sun.sun_in_interval(interval, self.ground.site.environment.sun_radius_rad)
+            self._cached_scene = (interval, self.base.in_light(sun, self.ground.photometry(sun)))
+        return self._cached_scene[1]
 
     def brightness(self, time_s: float) -> float:
-        """Direct sunlight on the ground relative to 1 AU."""
+        """Compute the direct sunlight on the ground relative to 1 AU."""
         air = self.ground.site.environment
         elevation = float(np.arcsin(self.scene(time_s).sun.direction[2]))
         return air.direct_share(elevation) * air.solar_irradiance
 
 
-def place_rocks(p: RoverScenarioParameters, bare: SiteGround, rng: np.random.Generator) -> tuple[SiteGround, RockField]:
-    """Location the target's rock and the obstacles; remove the bank's rocks on them, and large ones near the route."""
+def place_rocks(p: RoverScenarioParameters, base: SiteGround, rng: np.random.Generator) -> tuple[SiteGround, RockField]:
+    """Place the target's rock and the obstacles; remove rocks that overlap them, and large rocks on the route."""
     bearing, centre = p.bearing_rad, np.array([p.world.east_m, p.world.north_m])
-    along, right = np.array([np.sin(bearing), np.cos(bearing)]), np.array([-np.cos(bearing), np.sin(bearing)])
+    to_start, right = np.array([np.sin(bearing), np.cos(bearing)]), np.array([-np.cos(bearing), np.sin(bearing)])
     shape = p.target.model_dump(include={"diameter_m", "height_m", "shape", "yaw_deg"})
-    placed = [PlacedRock(name=TARGET, east_m=p.world.east_m, north_m=p.world.north_m, **shape)]
-    for number, one in enumerate(p.obstacles, start=1):
-        east, north = centre + one.towards_start_m * along + one.right_m * right
-        size = one.model_dump(include={"diameter_m", "height_m"})
-        placed.append(PlacedRock(name=f"obstacle-{number}", east_m=float(east), north_m=float(north), **size))
-    rocks = RockField.on(bare.surface, RockParameters(abundance=0.0, placed=tuple(placed)), rng)
-    if bare.rocks is None:
-        return replace(bare, rocks=rocks), rocks
-    near = _distances(bare.rocks, centre) < p.start.distance_m + CLEARED_M
-    kept = ~near | (bare.rocks.diameter_m <= p.world.largest_near_m)
+    placed_rocks = [PlacedRock(name=TARGET, east_m=p.world.east_m, north_m=p.world.north_m, **shape)]
+    for number, obstacle in enumerate(p.obstacles, start=1):
+        east, north = centre + obstacle.towards_start_m * to_start + obstacle.right_m * right
+        size = obstacle.model_dump(include={"diameter_m", "height_m"})
+        placed_rocks.append(PlacedRock(name=f"obstacle-{number}", east_m=float(east), north_m=float(north), **size))
+    rocks = RockField.on(base.surface, RockParameters(abundance=0.0, placed=tuple(placed_rocks)), rng)
+    if base.rocks is None:
+        return replace(base, rocks=rocks), rocks
+    is_near = _distances(base.rocks, centre) < p.start.distance_m + CLEARANCE_M
+    is_kept = ~is_near | (base.rocks.diameter_m <= p.world.largest_near_m)
     for position, diameter in zip(rocks.position_m[:, :2], rocks.diameter_m, strict=True):
-        kept &= _distances(bare.rocks, position) - 0.6 * (bare.rocks.diameter_m + diameter) > MIN_GAP_M
+        is_kept &= _distances(base.rocks, position) - 0.6 * (base.rocks.diameter_m + diameter) > MIN_GAP_M
     arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(rocks, name), getattr(bare.rocks, name)[kept]]) for name in ROCK_ARRAYS
+        name: np.concatenate([getattr(rocks, name), getattr(base.rocks, name)[is_kept]]) for name in ROCK_ARRAYS
     }
     rocks = replace(rocks, **arrays)
-    return replace(bare, rocks=rocks), rocks
+    return replace(base, rocks=rocks), rocks
 
 
 def _distances(rocks: RockField, position: Float64[np.ndarray, "2"]) -> Float64[np.ndarray, "rocks"]:
-    away = rocks.position_m[:, :2] - position
-    away -= rocks.period_m * np.round(away / rocks.period_m)
-    return np.asarray(np.hypot(away[:, 0], away[:, 1]))
+    offsets = rocks.position_m[:, :2] - position
+    offsets -= rocks.period_m * np.round(offsets / rocks.period_m)
+    return np.asarray(np.hypot(offsets[:, 0], offsets[:, 1]))
 
 
 @dataclass
 class Rig:
-    """A mast and its stereo pair, with their errors."""
+    """A mast and its stereo pair with drawn errors."""
 
-    head: StereoHead  #: the pair, true and calibrated
-    calibrated: MastCalibration  #: the calibration that flight software is given
-    left: CameraModel  #: the true left camera in the head's frame
-    right: CameraModel  #: the true right camera in the head's frame
+    head: StereoHead  #: true and calibrated stereo pair
+    calibrated: MastCalibration  #: calibration known to the flight software
+    left: CameraModel  #: true left camera in the head's frame
+    right: CameraModel  #: true right camera in the head's frame
     mast: Mast
-    state: MastState  #: present angles
+    state: MastState  #: current angles
     motors: np.random.Generator  #: stream of the motors' stopping errors
 
     @classmethod
-    def of(cls, p: RoverScenarioParameters, streams: Streams) -> Rig:
+    def draw(cls, p: RoverScenarioParameters, streams: Streams) -> Rig:
         """Draw the errors of a run's mast and pair."""
         design = p.camera.mast()
         head = StereoHead.draw(design, p.stereo, streams.generator("stereo calibration"))
@@ -176,7 +178,7 @@ class Rig:
 
     @property
     def pixel_rad(self) -> float:
-        """Angle of a pixel in the middle of the frame."""
+        """Angle of a pixel at the image centre."""
         return 1.0 / self.left.focal_lengths[0]
 
     @property
@@ -185,24 +187,24 @@ class Rig:
         return self.mast.rover_from_head(self.state)
 
     def eyes(self, world_from_head: RigidTransform) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
-        """True positions of the left and the right camera, world, metres."""
+        """Compute the true positions of the left and the right camera, world, metres."""
         left, right = world_from_head.apply(np.stack([self.left.c, self.right.c]))
         return left, right
 
     def point(self, azimuth_rad: float, elevation_rad: float) -> None:
-        """Point the mast; it stays where its encoders read these angles already."""
+        """Point the mast; it does not move if its encoders already read these angles."""
         if self.state.readings_rad != (azimuth_rad, elevation_rad):
             self.state = self.mast.point(self.state, azimuth_rad, elevation_rad, self.motors)
 
     def range_m(self, position_rover: Float64[np.ndarray, "3"]) -> float:
-        """Estimated distance of a position from the left camera."""
+        """Compute the estimated distance of a position from the left camera."""
         camera = self.calibrated.left.transform(self.calibrated.geometry.rover_from_head(*self.state.readings_rad))
         return float(np.linalg.norm(position_rover - camera.c))
 
 
 @dataclass
 class Vehicle:
-    """A rover on its route: true stance, and pose estimate by odometry."""
+    """A rover on its route: true stance, and pose estimated by odometry."""
 
     rover: RoverParameters
     ground: Ground
@@ -215,25 +217,25 @@ class Vehicle:
 
     @classmethod
     def at_start(cls, p: RoverScenarioParameters, world: RunWorld, rig: Rig, streams: Streams) -> Vehicle:
-        """Settle the rover at its start, its pose known there."""
+        """Place the rover on the ground at its start; its pose is known at the start."""
         rover = MER if p.camera.preset.startswith("mer") else ROCKY_8
         bearing = p.bearing_rad
-        away = np.array([np.sin(bearing), np.cos(bearing)])
+        to_start = np.array([np.sin(bearing), np.cos(bearing)])
         azimuth = bearing + np.pi - np.radians(p.start.target_azimuth_deg)
         ahead = np.array([np.sin(azimuth), np.cos(azimuth)])
         left = np.array([-ahead[1], ahead[0]])
         base = rig.calibrated.geometry.base_m
         target = np.array([p.world.east_m, p.world.north_m])
-        position = target + (world.face_m(p) + p.start.distance_m) * away - base[0] * ahead - base[1] * left
+        position = target + (world.face_m(p) + p.start.distance_m) * to_start - base[0] * ahead - base[1] * left
         ground: Ground = world.ground.surface
         if p.world.rocks_underfoot:
-            half = p.start.distance_m + ROUTE_MARGIN_M
-            ground = RockyGround.of(ground, world.base.objects.triangles, (p.world.east_m, p.world.north_m), half)
+            half_side = p.start.distance_m + ROUTE_MARGIN_M
+            ground = RockyGround.of(ground, world.base.objects.triangles, (p.world.east_m, p.world.north_m), half_side)
         stance = settle(rover, ground, float(position[0]), float(position[1]), float(azimuth))
         odometer = Odometer.draw(p.odometry, stance.world_from_rover, streams.generator("odometry"))
         soil = Soil.draw(p.slip, streams.generator("soil"))
         generators = streams.generator("slip"), streams.generator("odometry noise")
-        return cls(rover, ground, soil, stance, odometer, odometer.first, *generators)
+        return cls(rover, ground, soil, stance, odometer, odometer.initial_estimate, *generators)
 
     @property
     def estimated(self) -> RigidTransform:
@@ -242,7 +244,7 @@ class Vehicle:
 
     def drive(self, command: DriveCommand, visual: bool) -> Drive:
         """Drive a command and update the estimate."""
-        driven = drive(self.rover, self.ground, self.soil, self.stance, command, self.slip_stream)
-        self.estimate = self.odometer.step(self.estimate, driven, self.odometry_stream, visual)
-        self.stance = driven.end
-        return driven
+        result = drive(self.rover, self.ground, self.soil, self.stance, command, self.slip_stream)
+        self.estimate = self.odometer.step(self.estimate, result, self.odometry_stream, visual)
+        self.stance = result.end
+        return result

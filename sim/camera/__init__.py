@@ -5,9 +5,15 @@ are immutable, accept arrays with any leading dimensions and share the interface
 column and row, with the centre of the upper left pixel at (0, 0).
 """
 
-from marsyard.sim.camera.assembly import CameraFileError
 from marsyard.sim.camera.base import CameraModel, mount_looking_down
-from marsyard.sim.camera.calibrations import Calibration, Residual, from_opencv, from_opencv_fisheye, read_calibrations
+from marsyard.sim.camera.calibrations import (
+    Calibration,
+    CameraFileError,
+    Residual,
+    from_opencv,
+    from_opencv_fisheye,
+    read_calibrations,
+)
 from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
 from marsyard.sim.camera.pds import Pds3Product, read_pds3, read_pds3_product, read_pds4
 from marsyard.sim.camera.text_files import BODY_FRAME, HEAD_FRAME, read_cahvor, read_camera, read_cameras, write_cahvor

@@ -24,8 +24,8 @@ import numpy as np
 from jaxtyping import UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.sim.camera.assembly import MAX_BYTES, MODELS, Source, create_camera, linearity_of_type
 from marsyard.sim.camera.base import CameraModel
+from marsyard.sim.camera.calibrations import MAX_BYTES, MODELS, Source, create_camera, linearity_of_type
 from marsyard.sim.files import check_regular
 from marsyard.sim.frames import rigid
 

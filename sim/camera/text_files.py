@@ -17,9 +17,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from marsyard.sim.camera.assembly import Source, create_camera, linearity_of_type
 from marsyard.sim.camera.base import CameraModel
-from marsyard.sim.camera.calibrations import is_calibration, read_calibrations
+from marsyard.sim.camera.calibrations import Source, create_camera, is_calibration, linearity_of_type, read_calibrations
 from marsyard.sim.camera.models import Cahvore
 from marsyard.sim.camera.pds import is_pds3, is_xml, read_pds3, read_pds4
 

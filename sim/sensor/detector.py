@@ -1,8 +1,8 @@
 """Frame-transfer CCD: radiance to counts, with noise, smear, defects, bursts and 8-bit companding; auto-exposure.
 
-Companding: a step of the square-root table grows with the square root of the count, as shot noise does. The table is
-``code = round(a (sqrt(count + b) - sqrt(b)))``, ``a = 2 sqrt(b)``: the steps begin with one count. The full scale has
-code 255, which sets b. Every code is used. A code is expanded to the middle of its counts.
+Companding: the step size of the table grows with the square root of the count, as shot noise does. The table is
+``code = round(a (sqrt(count + b) - sqrt(b)))`` with ``a = 2 sqrt(b)``: the smallest step is one count. b follows from
+code 255 at full scale. Every code is used. A code is expanded to the centre of its range of counts.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from scipy.optimize import brentq
 from marsyard.sim.measurements import DetectorCalibration
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive
 from marsyard.sim.sensor.optics import (
+    Image,
     ImageMotion,
     OpticsParameters,
-    Picture,
     apply_point_spread,
     dust_transmission,
     moving_exposure,
@@ -40,7 +40,7 @@ class DefectParameters(Parameters):
     hot_fraction: Annotated[Fraction, Field(description="fraction of hot pixels")] = 0.0
     hot_e_s: Annotated[NonNegative, Field(description="mean dark current of a hot pixel at 0 deg C, e/s")] = 20000.0
     dead_fraction: Annotated[Fraction, Field(description="fraction of pixels without response")] = 0.0
-    listed: Annotated[bool, Field(description="whether the camera fills them from neighbours by a list")] = False
+    listed: Annotated[bool, Field(description="whether the camera interpolates them by a list")] = False
 
 
 class BurstParameters(Parameters):
@@ -52,7 +52,7 @@ class BurstParameters(Parameters):
 
 
 class DetectorParameters(Parameters):
-    """An image detector without shutter. Defaults: the MER descent camera as flown.
+    """A frame-transfer detector without mechanical shutter. Defaults: the MER descent camera as flown.
 
     Full well, gain, read noise and readout rate: Maki et al. 2003. Responsivity and dark current are calibrated (see
     `marsyard.sim.sensor.optics`). The clearing time is assumed.
@@ -87,12 +87,12 @@ class DetectorParameters(Parameters):
 
     @property
     def sunlight(self) -> float:
-        """Sunlight at the stated distance, relative to 1 AU."""
+        """Solar irradiance at `sun_au`, relative to 1 AU."""
         return 1.0 / self.sun_au**2
 
     @property
     def full_scale_dn(self) -> int:
-        """The largest count."""
+        """Maximum count."""
         return int(2**self.bits - 1)
 
     @property
@@ -105,9 +105,9 @@ class AutoExposureParameters(Parameters):
     """Auto-exposure by a percentile of the counts, as on the MER rovers (Maki et al. 2003); the numbers are assumed."""
 
     percentile: Annotated[float, Field(gt=0.0, lt=100.0, description="controlled percentile of the counts")] = 98.0
-    target: Annotated[float, Field(gt=0.0, lt=1.0, description="target of the percentile over full scale")] = 0.75
-    tolerance: Annotated[float, Field(gt=0.0, le=0.5, description="accepted relative distance from the target")] = 0.05
-    pictures: Annotated[int, Field(ge=1, le=20, description="test pictures at most")] = 5
+    target: Annotated[float, Field(gt=0.0, lt=1.0, description="target of the percentile / full scale")] = 0.75
+    tolerance: Annotated[float, Field(gt=0.0, le=0.5, description="accepted relative deviation from the target")] = 0.05
+    pictures: Annotated[int, Field(ge=1, le=20, description="maximum number of test images")] = 5
     min_exposure_s: Annotated[float, Field(gt=0.0, le=10.0, description="shortest exposure, s")] = 1e-4
     max_exposure_s: Annotated[float, Field(gt=0.0, le=10.0, description="longest exposure, s")] = 1.0
 
@@ -115,30 +115,30 @@ class AutoExposureParameters(Parameters):
     def _check_limits(self) -> AutoExposureParameters:
         if self.min_exposure_s > self.max_exposure_s:
             raise ValueError(
-                f"the shortest exposure {self.min_exposure_s} s is longer than the longest {self.max_exposure_s} s"
+                f"min_exposure_s {self.min_exposure_s} is greater than max_exposure_s {self.max_exposure_s}"
             )
         return self
 
 
 @dataclass(frozen=True)
 class Detector:
-    """A detector behind a lens with a fixed response; its noise is new in every picture.
+    """A detector behind a lens with a fixed response; noise is drawn for each image.
 
-    - response: relative response of each physical pixel, including fall-off, dust and dead pixels
-    - calibration: the ground's calibration, without dust, dead pixels and dark current
+    - response: relative response of each physical pixel, including natural fall-off, dust and dead pixels
+    - calibration: ground calibration, without dust, dead pixels and dark current
     - hot_e_s: excess dark current of each physical pixel at 0 deg C, electrons per second; None without hot pixels
-    - listed: delivered pixels that are filled from their neighbours; None without a list of bad pixels
+    - listed: delivered pixels that are interpolated from neighbours; None without a list of bad pixels
     """
 
     parameters: DetectorParameters
-    response: Picture
+    response: Image
     calibration: DetectorCalibration
-    hot_e_s: Picture | None = None
+    hot_e_s: Image | None = None
     listed: Bool[np.ndarray, "delivered_rows columns"] | None = None
 
     @classmethod
-    def draw(cls, fall_off: Picture, parameters: DetectorParameters, rng: np.random.Generator) -> Detector:
-        """Draw pixel responses, defects and dust of a detector behind a lens with this fall-off."""
+    def draw(cls, fall_off: Image, parameters: DetectorParameters, rng: np.random.Generator) -> Detector:
+        """Draw pixel responses, defects and dust; `fall_off` is the natural fall-off of the lens."""
         p, rows = parameters, len(fall_off)
         if rows % p.rows_summed:
             raise ValueError(f"{rows} rows cannot be summed by {p.rows_summed}")
@@ -150,7 +150,7 @@ class Detector:
         calibration = DetectorCalibration(flat_field=measured.astype(np.float64), **settings)
         bad, hot = np.zeros(fall_off.shape, dtype=np.bool_), None
         if p.defects.hot_fraction > 0.0:
-            # exponentially distributed over the hot pixels
+            # the dark current of hot pixels is exponentially distributed
             is_hot = rng.random(fall_off.shape, dtype=np.float32) < p.defects.hot_fraction
             hot = np.zeros(fall_off.shape, dtype=np.float32)
             hot[is_hot] = p.defects.hot_e_s * rng.standard_exponential(int(is_hot.sum()), dtype=np.float32)
@@ -166,26 +166,26 @@ class Detector:
         return cls(p, response.astype(np.float32), calibration, hot, listed)
 
     def with_exposure(self, exposure_s: float) -> Detector:
-        """Return the same detector with another exposure time, also in its calibration."""
+        """Return the same detector with another exposure time; the calibration is updated."""
         parameters = DetectorParameters.model_validate(self.parameters.model_dump() | {"exposure_s": exposure_s})
         return replace(self, parameters=parameters, calibration=replace(self.calibration, exposure_s=exposure_s))
 
     def window(self, column: int, row: int, size: tuple[int, int]) -> Detector:
-        """Return the part of the detector read by a subframe: upper left pixel and size (columns, rows).
+        """Return the part of the detector that a subframe reads: upper left pixel and size (columns, rows).
 
-        Its pixels are those of the whole detector, except for noise. Packets gather smear under the part's own rows
-        only: a subframe lacks about ``row * transfer_row_s / exposure_s`` of the mean radiance of the rows before it,
-        column by column, and the same of the rows after it with `clear_row_s`. It is exact for a detector without
-        smear, such as the XC-55. Where smear matters, expose the whole picture and crop it. Raises ValueError if the
-        part is empty, leaves the detector or cuts through summed rows.
+        The pixel responses are those of the full detector. Smear comes from the rows of the subframe only: for each
+        column, about ``row * transfer_row_s / exposure_s`` of the mean radiance of the rows above the subframe is
+        missing, and the same of the rows below with `clear_row_s`. The result is exact for a detector without smear,
+        such as the XC-55. If smear is relevant, expose the full image and crop it. Raises ValueError if the subframe is
+        empty, extends beyond the detector or splits summed rows.
         """
         rows, columns = self.response.shape
         count = self.parameters.rows_summed
         if row % count or size[1] % count:
-            raise ValueError(f"a subframe of {size[1]} rows from row {row} cuts through {count} summed rows")
+            raise ValueError(f"a subframe of {size[1]} rows from row {row} splits groups of {count} summed rows")
         if min(row, column) < 0 or min(size) < 1 or column + size[0] > columns or row + size[1] > rows:
             raise ValueError(
-                f"a subframe of {size[0]} x {size[1]} pixels at ({column}, {row}) leaves the detector of "
+                f"a subframe of {size[0]} x {size[1]} pixels at ({column}, {row}) is not inside the detector of "
                 f"{columns} x {rows}"
             )
         part = np.s_[row : row + size[1], column : column + size[0]]
@@ -195,17 +195,17 @@ class Detector:
         calibration = replace(self.calibration, flat_field=self.calibration.flat_field[summed])
         return replace(self, response=self.response[part].copy(), calibration=calibration, hot_e_s=hot, listed=listed)
 
-    def expose(self, radiance: Picture, rng: np.random.Generator, motion: ImageMotion | None = None) -> Delivered:
-        """Simulate the counts of one exposure from the scene's radiance factor at mid exposure."""
+    def expose(self, radiance: Image, rng: np.random.Generator, motion: ImageMotion | None = None) -> Delivered:
+        """Simulate the counts of one exposure; `radiance` is the radiance factor of the scene at mid exposure."""
         p = self.parameters
         mean = _sum_rows(self.charge(radiance, motion), p.rows_summed) + self.dark_charge()
-        # the point spread's kernel has negative weights: next to a bright edge the mean may be negative
+        # the point spread kernel has negative weights: the mean may be negative next to a bright edge
         electrons = rng.poisson(np.maximum(mean, 0.0)).astype(np.float32)
         electrons += np.float32(p.read_noise_e) * rng.standard_normal(electrons.shape, dtype=np.float32)
         np.minimum(electrons, np.float32(p.full_well_e), out=electrons)
         counts = electrons / np.float32(p.gain_e_dn) + np.float32(p.offset_dn)
         if p.bursts.bursts > 0.0:
-            # at random positions of the readout, along the rows
+            # bursts start at random positions of the readout, which is row by row
             readout = counts.reshape(-1)
             for _ in range(int(rng.poisson(p.bursts.bursts))):
                 start = int(rng.integers(readout.size))
@@ -216,12 +216,12 @@ class Detector:
             delivered = fill_bad_pixels(delivered, self.listed)
         return expand(compand(delivered, p.full_scale_dn), p.full_scale_dn) if p.companded else delivered
 
-    def charge(self, radiance: Picture, motion: ImageMotion | None = None) -> Picture:
+    def charge(self, radiance: Image, motion: ImageMotion | None = None) -> Image:
         """Compute the mean photo charge in electrons of each physical pixel at the end of the transfer.
 
-        Besides its exposure, a packet collects light from the rows that it passes: during the clearing before the
-        exposure the rows after its own, on the way to the storage area the rows before its own. Each row is in its
-        state at the time when the packet passes it.
+        In addition to the exposure, a charge packet collects light from the rows that it passes: the rows after its
+        start row during the clearing before the exposure, and the rows before its start row on the way to the storage
+        area. Each row has the radiance at the time when the packet passes it.
         """
         p = self.parameters
         scene = apply_point_spread(radiance, p.optics)
@@ -231,15 +231,15 @@ class Detector:
             seconds *= np.float32(p.responsivity_e_s)
             return seconds
         rate = scene * self.response * np.float32(p.responsivity_e_s)
-        charge: Picture = np.float32(p.exposure_s) * rate
+        charge: Image = np.float32(p.exposure_s) * rate
         if p.transfer_row_s > 0.0 or p.clear_row_s > 0.0:
-            passed = np.cumsum(rate, axis=0)
-            charge += np.float32(p.transfer_row_s) * (passed - rate)
-            charge += np.float32(p.clear_row_s) * (passed[-1:] - passed)
+            cumulative = np.cumsum(rate, axis=0)
+            charge += np.float32(p.transfer_row_s) * (cumulative - rate)
+            charge += np.float32(p.clear_row_s) * (cumulative[-1:] - cumulative)
         return charge
 
     def dark_charge(self) -> Float32[np.ndarray, "delivered_rows _"]:
-        """Compute the mean dark charge in electrons of each delivered pixel; one column if all are equal."""
+        """Compute the mean dark charge in electrons of each delivered pixel; one column if all columns are equal."""
         p = self.parameters
         rows = len(self.response)
         current = np.full((rows // p.rows_summed, 1), p.rows_summed * p.dark_e_s, dtype=np.float32)
@@ -250,21 +250,21 @@ class Detector:
 
 
 def dark_seconds(parameters: DetectorParameters, rows: int) -> Float64[np.ndarray, "delivered_rows"]:
-    """Duration of each delivered row's dark current: exposure, transfer and wait for readout; row 0 is first."""
+    """Compute the integration time of dark current for each delivered row: exposure, transfer, and wait for readout."""
     waits = parameters.readout_row_s * np.arange(rows // parameters.rows_summed, dtype=np.float64)
     return np.asarray(waits + parameters.exposure_s + rows * parameters.transfer_row_s)
 
 
-def _sum_rows(picture: Float[np.ndarray, "rows columns"], count: int) -> Float[np.ndarray, "summed columns"]:
-    rows, columns = picture.shape
-    return np.asarray(picture.reshape(rows // count, count, columns).sum(axis=1))
+def _sum_rows(image: Float[np.ndarray, "rows columns"], count: int) -> Float[np.ndarray, "summed columns"]:
+    rows, columns = image.shape
+    return np.asarray(image.reshape(rows // count, count, columns).sum(axis=1))
 
 
 def fill_bad_pixels(counts: Counts, bad: Bool[np.ndarray, "rows columns"]) -> Counts:
-    """Replace bad pixels by the mean of the good ones among their eight neighbours, if there are any."""
+    """Replace bad pixels by the mean of the good pixels among the eight neighbours; keep them if there are none."""
     good = np.where(bad, 0.0, 1.0)
     total, fraction = (uniform_filter(values, 3, mode="constant") for values in (good * counts, good))
-    # means of nine: with one good neighbour the fraction is 1/9
+    # both are means over nine pixels: with one good neighbour the fraction is 1/9
     fillable = bad & (fraction > 0.5 / 9.0)
     repaired = counts.copy()
     repaired[fillable] = np.rint(total[fillable] / fraction[fillable]).astype(np.uint16)
@@ -273,7 +273,7 @@ def fill_bad_pixels(counts: Counts, bad: Bool[np.ndarray, "rows columns"]) -> Co
 
 @cache
 def compression_table(full_scale_dn: int) -> UInt8[np.ndarray, "counts"]:
-    """Code of every count. Raises ValueError if the full scale is below 255: nothing is to be compressed."""
+    """Return the code of every count. Raises ValueError if the full scale is below 255."""
     if full_scale_dn < CODES - 1:
         raise ValueError(f"counts up to {full_scale_dn} need no companding; allowed: {CODES - 1} or more")
     if full_scale_dn == CODES - 1:
@@ -287,7 +287,7 @@ def compression_table(full_scale_dn: int) -> UInt8[np.ndarray, "counts"]:
 
 @cache
 def expansion_table(full_scale_dn: int) -> UInt16[np.ndarray, "codes"]:
-    """Count of every code."""
+    """Return the count of every code."""
     table = compression_table(full_scale_dn)
     first = np.searchsorted(table, np.arange(CODES), side="left")
     last = np.searchsorted(table, np.arange(CODES), side="right") - 1
@@ -310,9 +310,9 @@ def expand(codes: UInt8[np.ndarray, "rows columns"], full_scale_dn: int) -> Coun
 class AutoExposure:
     """Result of auto-exposure.
 
-    - detector: the detector with the adjusted exposure time
-    - exposures_s: exposure times of the test pictures
-    - converged: whether the last test picture reached the target
+    - detector: detector with the adjusted exposure time
+    - exposures_s: exposure times of the test images
+    - converged: whether the last test image reached the target
     """
 
     detector: Detector
@@ -322,39 +322,39 @@ class AutoExposure:
 
 def auto_expose(
     detector: Detector,
-    radiance: Picture,
+    radiance: Image,
     parameters: AutoExposureParameters,
     rng: np.random.Generator,
     region: tuple[slice, slice] | None = None,
     motion: ImageMotion | None = None,
 ) -> AutoExposure:
-    """Take test pictures and scale the exposure time until the picture has the target brightness.
+    """Expose test images and scale the exposure time until the image has the target brightness.
 
-    - detector: its exposure time is tried first
-    - rng: random stream of the test pictures' noise
-    - region: rows and columns of the delivered picture whose percentile is used; all by default
+    - detector: the first test image has its exposure time
+    - rng: random generator for the noise of the test images
+    - region: rows and columns of the delivered image in which the percentile is computed; all by default
 
     The factor on the exposure time is 1/8 to 8, and a quarter if the counts saturate. Raises ValueError if the region
-    has no pixel.
+    is empty.
     """
-    tried: list[float] = []
+    exposures: list[float] = []
     p = detector.parameters
     saturation = min(float(p.full_scale_dn), p.full_well_e / p.gain_e_dn + p.offset_dn)
     exposure = float(np.clip(p.exposure_s, parameters.min_exposure_s, parameters.max_exposure_s))
     while True:
         current = detector.with_exposure(exposure)
-        tried.append(exposure)
+        exposures.append(exposure)
         counts = current.expose(radiance, rng, motion)[region or np.s_[:]]
         if counts.size == 0:
-            raise ValueError("auto-exposure was given a region without pixels")
+            raise ValueError("the auto-exposure region is empty")
         level = float(np.percentile(counts, parameters.percentile))
         signal = max(level - p.offset_dn, 1.0)
         factor = float(np.clip((parameters.target * saturation - p.offset_dn) / signal, 0.125, 8.0))
         factor = 0.25 if level >= 0.99 * saturation else factor
         converged = abs(factor - 1.0) <= parameters.tolerance
-        following = float(np.clip(exposure * factor, parameters.min_exposure_s, parameters.max_exposure_s))
-        if converged or following == exposure:
-            return AutoExposure(current, tuple(tried), converged)
-        if len(tried) == parameters.pictures:
-            return AutoExposure(detector.with_exposure(following), tuple(tried), False)
-        exposure = following
+        next_exposure = float(np.clip(exposure * factor, parameters.min_exposure_s, parameters.max_exposure_s))
+        if converged or next_exposure == exposure:
+            return AutoExposure(current, tuple(exposures), converged)
+        if len(exposures) == parameters.pictures:
+            return AutoExposure(detector.with_exposure(next_exposure), tuple(exposures), False)
+        exposure = next_exposure

@@ -1,11 +1,11 @@
-"""Inertial measurement unit: angle and velocity increments of a motion, with the errors of the unit's class.
+"""Inertial measurement unit: angle and velocity increments of a trajectory, with typical sensor errors.
 
-The world frame is inertial here: the planet's rotation, which flight software knows and removes, is left out of motion
-and measurement. The unit is at the body's origin, its axes parallel to the body's.
+The world frame is treated as inertial: the rotation of the planet, which flight software compensates, is neglected in
+motion and measurement. The unit is at the origin of the body frame, with parallel axes.
 
 The sensors are sampled much faster than the increments are delivered: an angle increment is the exact rotation vector
-between two boundaries (coning included), a velocity increment the integral of specific force in the body axes at the
-interval's start (sculling included).
+between two sample boundaries (coning included). A velocity increment is the integral of specific force in the body axes
+at the start of the interval (sculling included).
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ Quaternions = Float64[np.ndarray, "n 4"]  #: In the order x, y, z, w.
 
 
 class WarmUp(Parameters):
-    """Temperature of the unit less the calibration temperature: zero, then an exponential approach to a change."""
+    """Temperature of the unit minus the calibration temperature: zero, then an exponential approach to `change_k`."""
 
     start_s: Annotated[float, Field(description="time at which the change begins, s")] = 0.0
     change_k: Annotated[float, Field(ge=-100.0, le=100.0, description="final change, K")] = 0.0
     time_constant_s: Annotated[Positive, Field(description="time constant of the approach, s")] = 600.0
 
     def temperature_k(self, times_s: Times) -> Times:
-        """Compute the temperature less the calibration temperature, K."""
+        """Compute the temperature minus the calibration temperature, K."""
         return np.asarray(-self.change_k * np.expm1(-np.maximum(times_s - self.start_s, 0.0) / self.time_constant_s))
 
 
 class ImuParameters(Parameters):
     """An inertial measurement unit of the class of Litton's LN-200; spreads are one standard deviation per axis.
 
-    Repeatability of bias (1 deg/h to 3 deg/h, 0.2 mg to 1 mg), its wander in operation (0.35 deg/h over 100 s,
-    0.05 mg over 60 s), random walk, scale factors (100 ppm, 300 ppm) and misalignment: LN-200's data sheet, Northrop
-    Grumman. Size of the counts: NovAtel's table of raw inertial data. Change with temperature and time tags: assumed.
+    Bias repeatability (1 deg/h to 3 deg/h, 0.2 mg to 1 mg), bias instability in operation (0.35 deg/h over 100 s,
+    0.05 mg over 60 s), random walk, scale factors (100 ppm, 300 ppm) and misalignment: LN-200 data sheet, Northrop
+    Grumman. Resolution: NovAtel's table of raw inertial data. Temperature sensitivity and time tags: assumed.
     """
 
     rate_hz: Annotated[Positive, Field(le=10000.0, description="samples per second")] = 400.0
@@ -59,23 +59,23 @@ class ImuParameters(Parameters):
     gyro_wander_s: Annotated[Positive, Field(description="correlation time of the bias, s")] = 100.0
     gyro_bias_deg_h_k: Annotated[NonNegative, Field(description="bias change with temperature, deg/h/K")] = 0.1
     angular_random_walk_deg_sqrt_h: Annotated[NonNegative, Field(description="angular random walk, deg/sqrt(h)")] = 0.07
-    gyro_scale_ppm: Annotated[NonNegative, Field(description="error of the gyros' scale factors, ppm")] = 100.0
-    gyro_misalignment_mrad: Annotated[NonNegative, Field(description="each gyro's input from another axis, mrad")] = 0.1
-    gyro_count_rad: Annotated[NonNegative, Field(description="angle of a count, rad; 0: no rounding")] = 2.0**-19
+    gyro_scale_ppm: Annotated[NonNegative, Field(description="gyro scale factor error, ppm")] = 100.0
+    gyro_misalignment_mrad: Annotated[NonNegative, Field(description="cross-axis sensitivity of each gyro, mrad")] = 0.1
+    gyro_count_rad: Annotated[NonNegative, Field(description="resolution, rad; 0: no rounding")] = 2.0**-19
     accelerometer_bias_mg: Annotated[NonNegative, Field(description="constant accelerometer bias, mg")] = 0.3
     accelerometer_wander_mg: Annotated[NonNegative, Field(description="time-correlated accelerometer bias, mg")] = 0.05
     accelerometer_wander_s: Annotated[Positive, Field(description="correlation time of the bias, s")] = 60.0
     accelerometer_bias_mg_k: Annotated[NonNegative, Field(description="bias change with temperature, mg/K")] = 0.02
     velocity_random_walk_ug_sqrt_hz: Annotated[NonNegative, Field(description="velocity noise, ug/sqrt(Hz)")] = 50.0
-    accelerometer_scale_ppm: Annotated[NonNegative, Field(description="error of the scale factors, ppm")] = 300.0
-    accelerometer_misalignment_mrad: Annotated[NonNegative, Field(description="input from another axis, mrad")] = 0.1
-    accelerometer_count_m_s: Annotated[NonNegative, Field(description="velocity of a count, m/s; 0: exact")] = 2.0**-14
+    accelerometer_scale_ppm: Annotated[NonNegative, Field(description="accelerometer scale factor error, ppm")] = 300.0
+    accelerometer_misalignment_mrad: Annotated[NonNegative, Field(description="cross-axis sensitivity, mrad")] = 0.1
+    accelerometer_count_m_s: Annotated[NonNegative, Field(description="resolution, m/s; 0: no rounding")] = 2.0**-14
     warm_up: WarmUp = WarmUp()
     clock: ClockParameters = ClockParameters(offset_sd_s=0.0002, jitter_sd_s=0.00002)
 
 
-#: A small quartz or silicon unit of a 2 m helicopter; assumed (the landing paper names Inertial Science's ISIS, without
-#: figures). The gyro bias is the residual after zeroing on the ground.
+#: A small quartz or silicon unit of a 2 m helicopter; assumed (the landing paper uses Inertial Science's ISIS, without
+#: error values). The gyro bias is the residual after zeroing on the ground.
 SMALL_UNIT = ImuParameters(
     rate_hz=100.0, gyro_bias_deg_h=60.0, gyro_wander_deg_h=20.0, gyro_bias_deg_h_k=0.0,
     angular_random_walk_deg_sqrt_h=2.0, gyro_scale_ppm=1000.0, gyro_misalignment_mrad=1.0, gyro_count_rad=2.0**-19,
@@ -87,14 +87,14 @@ SMALL_UNIT = ImuParameters(
 
 @dataclass(frozen=True)
 class Triad:
-    """The errors of three gyros (unit: rad) or accelerometers (unit: m/s).
+    """Errors of three gyros (unit: rad) or accelerometers (unit: m/s).
 
     - bias, bias_per_k: constant bias, unit/s, and its change with temperature, unit/s/K
     - wander: time-correlated bias, unit/s
     - warm_up: temperature over time
     - scale: relative errors of the scale factors
-    - misalignment: input of each sensor (row) from the other axes (columns), radians; its diagonal is 0
-    - random_walk: white noise of rate, unit/sqrt(s)
+    - misalignment: cross-axis sensitivity of each sensor (row) to the axes (columns), radians; zero diagonal
+    - random_walk: random walk coefficient, unit/sqrt(s)
     - count: resolution, unit; 0 for no rounding
     """
 
@@ -109,7 +109,7 @@ class Triad:
 
     @property
     def sensitivity_error(self) -> Float64[np.ndarray, "3 3"]:
-        """Matrix of scale and misalignment errors: measured less true input is this matrix times the input."""
+        """Matrix of scale and misalignment errors: measured minus true input is this matrix times the input."""
         return np.asarray(np.diag(self.scale) + self.misalignment)
 
     def bias_at(self, times_s: Times) -> Vectors:
@@ -118,7 +118,7 @@ class Triad:
         return np.asarray(self.bias + thermal + self.wander.at(times_s))
 
     def measure(self, true: Vectors, boundaries_s: Boundaries, rng: np.random.Generator) -> Vectors:
-        """Measure true increments between m = n + 1 boundaries; rounding residuals are carried over."""
+        """Measure true increments between m = n + 1 boundaries; rounding residuals are added to the next increment."""
         steps = np.diff(boundaries_s)[:, None]
         noise = self.random_walk * np.sqrt(steps) * rng.standard_normal(true.shape)
         bias = self.bias_at(0.5 * (boundaries_s[1:] + boundaries_s[:-1])) * steps
@@ -133,10 +133,10 @@ class Triad:
 class ImuIncrements:
     """Increments measured by an inertial unit.
 
-    - times_s: time tags of the sample boundaries, never decreasing; one more than samples
+    - times_s: time tags of the sample boundaries, non-decreasing; one more than samples
     - period_s: nominal time between boundaries
-    - delta_angles_rad: rotation vectors from the body axes at each interval's start to those at its end
-    - delta_velocities_m_s: integrals of specific force over each interval, in the body axes at its start
+    - delta_angles_rad: rotation vectors from the body axes at the start of each interval to the body axes at its end
+    - delta_velocities_m_s: integrals of specific force over each interval, body axes at the start of the interval
     """
 
     times_s: Boundaries
@@ -147,7 +147,7 @@ class ImuIncrements:
 
 @dataclass(frozen=True)
 class Imu:
-    """An inertial unit with its errors over a time span drawn; noise is drawn with the increments."""
+    """An inertial unit with errors drawn for a time span; noise is drawn with the increments."""
 
     parameters: ImuParameters
     gyro: Triad
@@ -159,8 +159,8 @@ class Imu:
         """Draw the errors for use within a time span."""
         p = parameters
 
-        def triad(sensor: str, biases: tuple[float, ...], wander_s: float, random_walk: float, count: float) -> Triad:
-            """Draw the errors of three sensors; `biases`: constant bias, its change per K, and wander, SI units."""
+        def draw(sensor: str, biases: tuple[float, ...], wander_s: float, random_walk: float, count: float) -> Triad:
+            """Draw the errors of three sensors; `biases`: constant bias, bias change per K, and wander, SI units."""
             bias, per_k, wander = biases
             return Triad(
                 bias=bias * rng.standard_normal(3),
@@ -176,24 +176,24 @@ class Imu:
             )
 
         rates = (p.gyro_bias_deg_h * DEG_H, p.gyro_bias_deg_h_k * DEG_H, p.gyro_wander_deg_h * DEG_H)
-        gyro = triad("gyro", rates, p.gyro_wander_s, p.angular_random_walk_deg_sqrt_h * DEG_SQRT_H, p.gyro_count_rad)
+        gyro = draw("gyro", rates, p.gyro_wander_s, p.angular_random_walk_deg_sqrt_h * DEG_SQRT_H, p.gyro_count_rad)
         forces = (p.accelerometer_bias_mg, p.accelerometer_bias_mg_k, p.accelerometer_wander_mg)
         walk = 1e-3 * p.velocity_random_walk_ug_sqrt_hz * MILLI_G
         biases = tuple(force * MILLI_G for force in forces)
-        accelerometer = triad("accelerometer", biases, p.accelerometer_wander_s, walk, p.accelerometer_count_m_s)
+        accelerometer = draw("accelerometer", biases, p.accelerometer_wander_s, walk, p.accelerometer_count_m_s)
         return cls(parameters, gyro, accelerometer, Clock.draw(p.clock, rng))
 
     def boundaries(self, start_s: float, end_s: float) -> Boundaries:
-        """Compute the true times of the sample boundaries from start to the last one not after the end."""
+        """Compute the true times of the sample boundaries from start to end."""
         count = int(np.floor((end_s - start_s) * self.parameters.rate_hz + 1e-9))
         if count < 1:
-            raise ValueError(f"there is no sample from {start_s} s to {end_s} s at {self.parameters.rate_hz} Hz")
+            raise ValueError(f"no sample lies between {start_s} s and {end_s} s at {self.parameters.rate_hz} Hz")
         return np.asarray(start_s + np.arange(count + 1) / self.parameters.rate_hz)
 
     def increments(
         self, trajectory: Trajectory, start_s: float, end_s: float, rng: np.random.Generator
     ) -> ImuIncrements:
-        """Measure a motion from a start to an end, both true times within the span."""
+        """Measure a trajectory from start to end, both true times within the drawn time span."""
         boundaries = self.boundaries(start_s, end_s)
         angles, velocities = true_increments(trajectory, boundaries)
         return ImuIncrements(
@@ -205,21 +205,21 @@ class Imu:
 
 
 def true_increments(trajectory: Trajectory, boundaries_s: Boundaries) -> tuple[Vectors, Vectors]:
-    """Compute rotation vectors between boundaries and integrals of specific force in the body axes at each start.
+    """Compute rotation vectors and velocity increments between boundaries, body axes at the start of each interval.
 
     Specific force is integrated in world axes as a cubic spline through the boundaries. For a frequency f the relative
-    error is of the order of (2 pi f step)^4 / 720: 1e-9 for a nodding of 1 Hz at 400 samples per second.
+    error is of the order of (2 pi f step)^4 / 720: 1e-9 for a pitch oscillation of 1 Hz at 400 samples per second.
     """
     motion = trajectory.motion(boundaries_s)
     forces = motion.attitudes.apply(motion.specific_forces_m_s2)
-    gained = np.diff(CubicSpline(boundaries_s, forces).antiderivative()(boundaries_s), axis=0)
-    at_start = motion.attitudes[:-1].inv()
-    turns = Rotation.from_quat(multiply_quaternions(at_start.as_quat(), motion.attitudes[1:].as_quat()))
-    return turns.as_rotvec(), at_start.apply(gained)
+    velocity_increments = np.diff(CubicSpline(boundaries_s, forces).antiderivative()(boundaries_s), axis=0)
+    start_inverse = motion.attitudes[:-1].inv()
+    rotations = Rotation.from_quat(multiply_quaternions(start_inverse.as_quat(), motion.attitudes[1:].as_quat()))
+    return rotations.as_rotvec(), start_inverse.apply(velocity_increments)
 
 
 def multiply_quaternions(left: Quaternions, right: Quaternions) -> Quaternions:
-    """Multiply quaternions (x, y, z, w) pairwise, several times faster than `Rotation`; the right one acts first."""
+    """Multiply quaternions (x, y, z, w) pairwise, faster than `Rotation`; the right rotation is applied first."""
     ax, ay, az, aw = left.T
     bx, by, bz, bw = right.T
     x = aw * bx + ax * bw + ay * bz - az * by
@@ -229,16 +229,16 @@ def multiply_quaternions(left: Quaternions, right: Quaternions) -> Quaternions:
 
 
 def accumulate_quaternions(steps: Quaternions) -> Quaternions:
-    """Compute the products of the first 1, 2, ... n quaternions, each step to the right of those before it.
+    """Compute the products of the first 1, 2, ... n quaternions; each step multiplies from the right.
 
-    Recursion: the products of pairs give every second running product; the others follow from these.
+    Recursion: products of pairs give every second cumulative product; one more product each gives the others.
     """
     count = len(steps)
     if count == 1:
         return steps
-    through_pairs = accumulate_quaternions(multiply_quaternions(steps[: count - 1 : 2], steps[1::2]))
-    running = np.empty((count, 4))
-    running[0] = steps[0]
-    running[1::2] = through_pairs
-    running[2::2] = multiply_quaternions(through_pairs[: (count - 1) // 2], steps[2::2])
-    return running
+    pair_products = accumulate_quaternions(multiply_quaternions(steps[: count - 1 : 2], steps[1::2]))
+    cumulative = np.empty((count, 4))
+    cumulative[0] = steps[0]
+    cumulative[1::2] = pair_products
+    cumulative[2::2] = multiply_quaternions(pair_products[: (count - 1) // 2], steps[2::2])
+    return cumulative

@@ -1,15 +1,15 @@
-"""Inertial navigation on board: strapdown propagation, and its initial errors at the start of the descent.
+"""On-board inertial navigation: strapdown propagation, and navigation errors at the start of the descent.
 
-`InertialSolution` propagates attitude and velocity from an inertial unit's increments. `Approach` propagates the errors
-from the last star reference through spinning cruise, entry, braking and the parachute to the descent. Only the errors
-are propagated, along a nominal profile, in steps that resolve the spin:
+`InertialSolution` propagates attitude and velocity from the increments of an inertial unit. `Approach` propagates only
+the errors, along a nominal profile, from the last star reference through spinning cruise, entry and parachute phase to
+the descent, in steps that resolve the spin:
 
     d(attitude)/dt = R (bias + sensitivity error x body rate) + noise
     d(velocity)/dt = attitude x (R f) + R (bias + sensitivity error x f) + noise
 
-with R the nominal attitude, f the nominal specific force, both errors in world axes, to first order (Titterton and
-Weston, Strapdown Inertial Navigation Technology, ch. 12, over minutes and without the errors' effect on gravity). The
-unit and its errors are those of the descent.
+R is the nominal attitude and f the nominal specific force; both errors are in world axes, to first order (Titterton and
+Weston, Strapdown Inertial Navigation Technology, ch. 12). The effect of the errors on gravity is neglected. The unit
+has the same sensor errors as in the descent.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.sensor.imu import Imu, ImuIncrements, Vector, Vectors, accumulate_quaternions, multiply_quaternions
 from marsyard.sim.sensor.instrument import Times
 
-#: Steps of the propagation per second: at 2 rpm the midpoint rule's error is 5e-5 of the effect that the spin averages.
+#: Propagation steps per second: at 2 rpm the relative error of the midpoint rule over the spin is 5e-5.
 STEPS_PER_S = 5.0
-_MEAN_SIN4 = 3.0 / 8.0  #: Mean of sin^4, the shape of the deceleration over the entry.
+_MEAN_SIN4 = 3.0 / 8.0  #: Mean of sin^4, the assumed profile of the deceleration during entry.
 
 
 @dataclass(frozen=True)
 class NavigationErrors:
-    """Errors of an inertial navigation at one time.
+    """Navigation errors at one time.
 
-    - attitude_rad: small rotation about the world axes from the true to the estimated attitude
-    - velocity_m_s: estimated less true velocity, world axes
+    - attitude_rad: rotation vector from the true to the estimated attitude, world axes
+    - velocity_m_s: estimated minus true velocity, world axes
     """
 
     attitude_rad: Vector
@@ -49,7 +49,7 @@ class NavigationErrors:
 
 @dataclass(frozen=True)
 class InertialSolution:
-    """Attitude, velocity and displacement propagated on board from inertial increments; times are the unit's tags.
+    """Attitude, velocity and displacement propagated from inertial increments; times are time tags of the unit.
 
     - attitudes: rotations from body to world axes at the sample boundaries
     - velocities_m_s, displacements_m: at the sample boundaries, world axes; displacement from the first boundary
@@ -65,19 +65,19 @@ class InertialSolution:
         cls, increments: ImuIncrements, attitude: Rotation, velocity_m_s: Vector, gravity_m_s2: float
     ) -> InertialSolution:
         """Propagate from an estimated attitude and velocity at the first boundary, with gravity along world -z."""
-        turns = Rotation.from_rotvec(increments.delta_angles_rad).as_quat()
-        attitudes = Rotation.from_quat(accumulate_quaternions(np.concatenate([attitude.as_quat()[None], turns])))
+        steps = Rotation.from_rotvec(increments.delta_angles_rad).as_quat()
+        attitudes = Rotation.from_quat(accumulate_quaternions(np.concatenate([attitude.as_quat()[None], steps])))
         gravity = np.array([0.0, 0.0, -gravity_m_s2])
-        gained = attitudes[:-1].apply(increments.delta_velocities_m_s) + gravity * increments.period_s
-        velocities = velocity_m_s + _running_sums(gained)
-        moved = 0.5 * (velocities[1:] + velocities[:-1]) * increments.period_s
-        return cls(increments, attitudes, velocities, _running_sums(moved))
+        delta_velocities = attitudes[:-1].apply(increments.delta_velocities_m_s) + gravity * increments.period_s
+        velocities = velocity_m_s + _running_sums(delta_velocities)
+        delta_positions = 0.5 * (velocities[1:] + velocities[:-1]) * increments.period_s
+        return cls(increments, attitudes, velocities, _running_sums(delta_positions))
 
     def attitude(self, times_s: Times) -> Rotation:
         """Interpolate attitudes at time tags with a constant rate between samples."""
         interval, fraction = self._locate(times_s)
-        turns = fraction[:, None] * self.increments.delta_angles_rad[interval]
-        return self.attitudes[interval] * Rotation.from_rotvec(turns)
+        rotation_vectors = fraction[:, None] * self.increments.delta_angles_rad[interval]
+        return self.attitudes[interval] * Rotation.from_rotvec(rotation_vectors)
 
     def velocity(self, times_s: Times) -> Vectors:
         """Interpolate velocities at time tags linearly between samples, world axes."""
@@ -86,7 +86,7 @@ class InertialSolution:
         return np.asarray(before + fraction[:, None] * (after - before))
 
     def mean_velocities(self, times_s: Times) -> Float64[np.ndarray, "intervals 3"]:
-        """Compute mean velocities between successive time tags, world axes; acceleration is constant in a sample."""
+        """Compute mean velocities between successive time tags, world axes; constant acceleration in a sample."""
         interval, fraction = self._locate(times_s)
         before, after = self.velocities_m_s[interval], self.velocities_m_s[interval + 1]
         elapsed = fraction[:, None] * self.increments.period_s
@@ -94,14 +94,14 @@ class InertialSolution:
         return np.asarray(np.diff(displacements, axis=0) / np.diff(times_s)[:, None])
 
     def _locate(self, times_s: Times) -> tuple[np.ndarray, Times]:
-        """Interval of each time, and its elapsed fraction. Raises ValueError before the first or after the last tag."""
+        """Return the interval of each time and the elapsed fraction. Raises ValueError outside the time tags."""
         tags = self.increments.times_s
         if times_s.size and (times_s.min() < tags[0] or times_s.max() > tags[-1]):
             raise ValueError(
-                f"navigation is asked for from {times_s.min():.4f} s to {times_s.max():.4f} s; it is known from "
+                f"requested times {times_s.min():.4f} s to {times_s.max():.4f} s are outside the navigation solution, "
                 f"{tags[0]:.4f} s to {tags[-1]:.4f} s"
             )
-        # the last of equal tags, so that no interval is empty
+        # of equal tags, use the last, so that no interval has zero length
         interval = np.minimum(np.searchsorted(tags, times_s, side="right"), tags.size - 1) - 1
         length = np.maximum(tags[interval + 1] - tags[interval], np.finfo(float).tiny)
         return interval, np.minimum((times_s - tags[interval]) / length, 1.0)
@@ -112,31 +112,31 @@ def _running_sums(steps: Vectors) -> Float64[np.ndarray, "m 3"]:
 
 
 class ApproachParameters(Parameters):
-    """From the last star reference to the descent. Defaults: nominal times and speeds of the MER landings.
+    """Approach from the last star reference to the descent. Defaults: nominal times and speeds of the MER landings.
 
-    Times and speeds: Desai and Knocke (2007), rounded. Assumed: the errors of the star reference, and the spin axis's
-    scale factor error after calibration against the stars in cruise.
+    Times and speeds: Desai and Knocke (2007), rounded. Assumed: the errors of the star reference, and the
+    scale factor error of the spin-axis gyro after calibration against the stars in cruise.
     """
 
-    attitude_sd_deg: Annotated[NonNegative, Field(description="error of the star reference per axis, deg")] = 0.05
-    velocity_sd_m_s: Annotated[NonNegative, Field(description="error of the velocity at that time, per axis")] = 1.0
-    spin_scale_ppm: Annotated[NonNegative, Field(description="residual scale error of the spin gyro, ppm")] = 20.0
+    attitude_sd_deg: Annotated[NonNegative, Field(description="attitude error at the reference per axis, deg")] = 0.05
+    velocity_sd_m_s: Annotated[NonNegative, Field(description="velocity error at the reference per axis, m/s")] = 1.0
+    spin_scale_ppm: Annotated[NonNegative, Field(description="scale factor error of the spin gyro, ppm")] = 20.0
     cruise_s: Annotated[NonNegative, Field(le=20000.0, description="from the star reference to entry, s")] = 900.0
-    entry_s: Annotated[Positive, Field(le=2000.0, description="from entry to the parachute's opening, s")] = 240.0
-    parachute_s: Annotated[Positive, Field(le=2000.0, description="from there to the descent's start, s")] = 80.0
-    spin_rpm: Annotated[float, Field(ge=-10.0, le=10.0, description="spin until the parachute opens, rpm")] = 2.0
-    heading_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="azimuth of the flight at entry")] = 80.0
-    entry_off_nadir_deg: Annotated[float, Field(ge=0.0, le=180.0, description="flight's direction at entry")] = 78.0
-    deploy_off_nadir_deg: Annotated[float, Field(ge=0.0, le=180.0, description="flight's direction at opening")] = 62.0
-    upright_s: Annotated[Positive, Field(description="from the parachute's opening to hanging straight, s")] = 30.0
-    entry_speed_m_s: Annotated[Positive, Field(description="lost from entry to opening, m/s")] = 5000.0
-    parachute_speed_m_s: Annotated[NonNegative, Field(description="lost under the parachute, m/s")] = 340.0
-    inflation_s: Annotated[Positive, Field(description="time constant of that loss, s")] = 8.0
-    gravity_m_s2: Annotated[NonNegative, Field(description="carried by the parachute, m/s2")] = 3.71
+    entry_s: Annotated[Positive, Field(le=2000.0, description="from entry to parachute deployment, s")] = 240.0
+    parachute_s: Annotated[Positive, Field(le=2000.0, description="from deployment to the descent's start, s")] = 80.0
+    spin_rpm: Annotated[float, Field(ge=-10.0, le=10.0, description="spin until deployment, rpm")] = 2.0
+    heading_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="azimuth of the velocity at entry")] = 80.0
+    entry_off_nadir_deg: Annotated[float, Field(ge=0.0, le=180.0, description="nadir angle at entry, deg")] = 78.0
+    deploy_off_nadir_deg: Annotated[float, Field(ge=0.0, le=180.0, description="nadir angle at deployment, deg")] = 62.0
+    upright_s: Annotated[Positive, Field(description="from deployment until the body is upright, s")] = 30.0
+    entry_delta_v_m_s: Annotated[Positive, Field(description="velocity change from entry to deployment, m/s")] = 5000.0
+    parachute_delta_v_m_s: Annotated[NonNegative, Field(description="velocity change under the parachute, m/s")] = 340.0
+    inflation_s: Annotated[Positive, Field(description="time constant of this change, s")] = 8.0
+    gravity_m_s2: Annotated[NonNegative, Field(description="local gravity, m/s2")] = 3.71
 
     @property
     def duration_s(self) -> float:
-        """From the star reference to the descent's start."""
+        """Duration from the star reference to the start of the descent, s."""
         return self.cruise_s + self.entry_s + self.parachute_s
 
 
@@ -149,7 +149,7 @@ class Approach:
 
     @property
     def start_s(self) -> float:
-        """Time of the star reference."""
+        """Time of the star reference, s."""
         return self.end_s - self.parameters.duration_s
 
     def calibrate(self, imu: Imu, rng: np.random.Generator) -> Imu:
@@ -165,41 +165,41 @@ class Approach:
         step = p.duration_s / count
         times = self.start_s + step * (np.arange(count) + 0.5)
         attitudes, rates, forces = self.attitudes(times), self.body_rates(times), self.specific_forces(times)
-        turned = attitudes.apply(imu.gyro.bias_at(times) + rates @ imu.gyro.sensitivity_error.T) * step
-        turned += imu.gyro.random_walk * np.sqrt(step) * rng.standard_normal(turned.shape)
+        attitude_increments = attitudes.apply(imu.gyro.bias_at(times) + rates @ imu.gyro.sensitivity_error.T) * step
+        attitude_increments += imu.gyro.random_walk * np.sqrt(step) * rng.standard_normal(attitude_increments.shape)
         reference = np.radians(p.attitude_sd_deg) * rng.standard_normal(3)
-        attitude = reference + np.cumsum(turned, axis=0)
-        sensed = imu.accelerometer.bias_at(times) + forces @ imu.accelerometer.sensitivity_error.T
-        # attitude error at the middle of each step
-        gained = (np.cross(attitude - 0.5 * turned, attitudes.apply(forces)) + attitudes.apply(sensed)) * step
-        gained += imu.accelerometer.random_walk * np.sqrt(step) * rng.standard_normal(gained.shape)
-        velocity = p.velocity_sd_m_s * rng.standard_normal(3) + gained.sum(axis=0)
+        attitude = reference + np.cumsum(attitude_increments, axis=0)
+        force_errors = imu.accelerometer.bias_at(times) + forces @ imu.accelerometer.sensitivity_error.T
+        midpoint_attitude = attitude - 0.5 * attitude_increments
+        increments = (np.cross(midpoint_attitude, attitudes.apply(forces)) + attitudes.apply(force_errors)) * step
+        increments += imu.accelerometer.random_walk * np.sqrt(step) * rng.standard_normal(increments.shape)
+        velocity = p.velocity_sd_m_s * rng.standard_normal(3) + increments.sum(axis=0)
         return NavigationErrors(attitude_rad=attitude[-1], velocity_m_s=velocity)
 
     def attitudes(self, times_s: Times) -> Rotation:
-        """Nominal rotations from body to world axes: body -z along the flight direction, spinning about it."""
-        flight = Rotation.from_rotvec(np.interp(times_s, *self._knots())[:, None] * self._turn_axis())
+        """Compute nominal rotations from body to world axes: body -z along the velocity, spinning about it."""
+        pitch = Rotation.from_rotvec(np.interp(times_s, *self._pitch_profile())[:, None] * self._pitch_axis())
         spin = Rotation.from_rotvec(self._spin_angle(times_s)[:, None] * np.array([0.0, 0.0, 1.0]))
-        return Rotation.from_quat(multiply_quaternions(flight.as_quat(), spin.as_quat()))
+        return Rotation.from_quat(multiply_quaternions(pitch.as_quat(), spin.as_quat()))
 
     def body_rates(self, times_s: Times) -> Vectors:
-        """Nominal angular velocities, body axes, rad/s."""
-        # the turn of the flight direction leaves its axis fixed: only the spin moves the axis in the body
-        times, angles = self._knots()
+        """Compute nominal angular velocities, body axes, rad/s."""
+        # the pitch axis is fixed in the world and rotates in the body with the spin
+        times, angles = self._pitch_profile()
         knot_rates = np.concatenate([[0.0], np.diff(angles) / np.diff(times), [0.0]])
-        turning = knot_rates[np.searchsorted(times, times_s, side="right")]
-        angle, (first, second, _) = self._spin_angle(times_s), self._turn_axis()
-        x = turning * (np.cos(angle) * first + np.sin(angle) * second)
-        y = turning * (np.cos(angle) * second - np.sin(angle) * first)
+        pitch_rates = knot_rates[np.searchsorted(times, times_s, side="right")]
+        angle, (first, second, _) = self._spin_angle(times_s), self._pitch_axis()
+        x = pitch_rates * (np.cos(angle) * first + np.sin(angle) * second)
+        y = pitch_rates * (np.cos(angle) * second - np.sin(angle) * first)
         return np.stack([x, y, np.where(times_s < self._deploy_s(), self._spin_rate(), 0.0)], axis=1)
 
     def specific_forces(self, times_s: Times) -> Vectors:
-        """Nominal acceleration less gravity, body axes, m/s2: drag along the spin axis."""
+        """Compute nominal specific forces, body axes, m/s2: drag along the spin axis."""
         p = self.parameters
-        entering = np.clip((times_s - (self._deploy_s() - p.entry_s)) / p.entry_s, 0.0, 1.0)
-        drag = p.entry_speed_m_s / (p.entry_s * _MEAN_SIN4) * np.sin(np.pi * entering) ** 4
-        hanging = np.maximum(times_s - self._deploy_s(), 0.0)
-        braking = p.parachute_speed_m_s / p.inflation_s * np.exp(-hanging / p.inflation_s) + p.gravity_m_s2
+        entry_fraction = np.clip((times_s - (self._deploy_s() - p.entry_s)) / p.entry_s, 0.0, 1.0)
+        drag = p.entry_delta_v_m_s / (p.entry_s * _MEAN_SIN4) * np.sin(np.pi * entry_fraction) ** 4
+        since_deployment_s = np.maximum(times_s - self._deploy_s(), 0.0)
+        braking = p.parachute_delta_v_m_s / p.inflation_s * np.exp(-since_deployment_s / p.inflation_s) + p.gravity_m_s2
         drag += np.where(times_s >= self._deploy_s(), braking, 0.0)
         return np.asarray(drag[:, None] * np.array([0.0, 0.0, 1.0]))
 
@@ -212,13 +212,13 @@ class Approach:
     def _spin_angle(self, times_s: Times) -> Times:
         return np.asarray(self._spin_rate() * (np.minimum(times_s, self._deploy_s()) - self.start_s))
 
-    def _turn_axis(self) -> Vector:
-        # tilts nadir towards the heading: (0, 0, -1) x (sin a, cos a, 0)
+    def _pitch_axis(self) -> Vector:
+        # a rotation about this axis tilts nadir towards the heading a: (0, 0, -1) x (sin a, cos a, 0)
         heading = np.radians(self.parameters.heading_deg)
         return np.array([np.cos(heading), -np.sin(heading), 0.0])
 
-    def _knots(self) -> tuple[Vector, Vector]:
-        """Times at which the turn rate of the flight direction changes, and its angle from nadir there."""
+    def _pitch_profile(self) -> tuple[Vector, Vector]:
+        """Return the times at which the pitch rate changes, and the angles of the velocity from nadir."""
         p = self.parameters
         times = self._deploy_s() + np.array([-p.entry_s, 0.0, p.upright_s])
         return times, np.radians([p.entry_off_nadir_deg, p.deploy_off_nadir_deg, 0.0])

@@ -22,7 +22,7 @@ Times = Float64[np.ndarray, "n"]  #: One time per row, seconds.
 
 @dataclass(frozen=True)
 class Readings:
-    """Readings of an instrument, with their time tags.
+    """Readings of an instrument with time tags.
 
     `values` has one row per reading: a range (altimeters, metres) or a position (receivers, metres, world axes). NaN
     marks a missing reading.
@@ -56,16 +56,16 @@ class Sampling:
 
 
 class ClockParameters(Parameters):
-    """Errors of time tags: tagged less true time."""
+    """Errors of time tags: tag minus true time."""
 
     offset_s: Annotated[float, Field(ge=-10.0, le=10.0, description="mean of the constant offset, s")] = 0.0
-    offset_sd_s: Annotated[_Deviation, Field(description="spread of the constant offset between units, s")] = 0.0
-    jitter_sd_s: Annotated[_Deviation, Field(description="spread of the tags about the offset, new in each, s")] = 0.0
+    offset_sd_s: Annotated[_Deviation, Field(description="sd of the constant offset between units, s")] = 0.0
+    jitter_sd_s: Annotated[_Deviation, Field(description="sd of the random part of each tag, s")] = 0.0
 
 
 @dataclass(frozen=True)
 class Clock:
-    """An instrument's clock; `offset_s` is the constant part of tagged less true time."""
+    """An instrument's clock; `offset_s` is the constant part of tag minus true time."""
 
     parameters: ClockParameters
     offset_s: float
@@ -83,7 +83,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class GaussMarkov:
-    """A stationary first-order Gauss-Markov process of zero mean, a column per channel; linear between its knots."""
+    """A stationary first-order Gauss-Markov process with zero mean, one column per channel; linear between knots."""
 
     knots_s: Float64[np.ndarray, "knots"]
     values: Float64[np.ndarray, "knots channels"]
@@ -92,10 +92,10 @@ class GaussMarkov:
     def draw(
         cls, sd: Float64[np.ndarray, "channels"], correlation_s: float, span_s: tuple[float, float], rng: Generator
     ) -> GaussMarkov:
-        """Draw a realisation by standard deviations and correlation time. Raises ValueError for an invalid span."""
+        """Draw a realisation with these standard deviations. Raises ValueError for an invalid span."""
         first, last = span_s
         if not (np.isfinite(first) and np.isfinite(last) and first <= last):
-            raise ValueError(f"a process cannot be drawn from {first} s to {last} s; a finite span is needed")
+            raise ValueError(f"the time span {first} s to {last} s is not valid; a finite span is needed")
         step = correlation_s / KNOTS_PER_CORRELATION
         count = int(np.ceil((last - first) / step)) + 2
         decay = np.exp(-step / correlation_s)
@@ -108,7 +108,7 @@ class GaussMarkov:
         """Interpolate the process. Raises ValueError if a time is outside the span."""
         if times_s.size and (times_s.min() < self.knots_s[0] or times_s.max() > self.knots_s[-1]):
             raise ValueError(
-                f"errors are asked for from {times_s.min():.3f} s to {times_s.max():.3f} s; they were drawn from "
+                f"requested times {times_s.min():.3f} s to {times_s.max():.3f} s are outside the drawn errors, "
                 f"{self.knots_s[0]:.3f} s to {self.knots_s[-1]:.3f} s"
             )
         return np.asarray(make_interp_spline(self.knots_s, self.values, k=1)(times_s))

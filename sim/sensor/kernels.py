@@ -1,8 +1,8 @@
-"""Compiled kernels of a moving exposure: motion blur, and smear during the charge transfer.
+"""Compiled kernels for the exposure of a moving scene: motion blur, and smear during the charge transfer.
 
-The scene is given at mid exposure, with `pad` rows and columns repeated beyond each border, and its image velocity
-(rows and columns per second) on a coarse grid. A point at x at time t was at x - velocity * t at mid exposure. Velocity
-is constant within tiles of `TILE` x `TILE` pixels.
+The scene is the radiance at mid exposure, extended by `pad` rows and columns beyond each border. The image velocity
+(rows and columns per second) is defined on a coarse grid. A point at x at time t was at x - velocity * t at mid
+exposure. Velocity is constant within tiles of `TILE` x `TILE` pixels.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
-#: Side of the tiles within which image velocity is constant, pixels.
+#: Side length of the tiles with constant image velocity, pixels.
 TILE = 32
-#: Steps per pixel of path of the integral over the exposure.
+#: Integration steps per pixel of image motion.
 STEPS_PER_PX = 8
-#: Weights below this are left out.
+#: Kernel weights below this value are skipped.
 MIN_TAP = 1e-6
 
 
 class Transfer(NamedTuple):
     """A moving scene during the charge transfer.
 
-    - padded, pad: the scene, and its border in rows and columns
+    - padded, pad: scene with border, and width of the border in pixels
     - edges: first row of each block of rows, and the number of rows, shape (blocks + 1,)
     - field, step: image velocity, as in `blur`
-    - start_s, row_s: start of the transfer after mid exposure, and time per row
+    - start_s, row_s: start time of the transfer relative to mid exposure, and time per row
     """
 
     padded: Array32
@@ -45,7 +45,7 @@ class Transfer(NamedTuple):
 
 
 @njit(cache=True)
-def velocity_at(field: Array, step: float, row: float, column: float) -> tuple[float, float]:
+def interpolate_velocity(field: Array, step: float, row: float, column: float) -> tuple[float, float]:
     """Interpolate the velocity bilinearly at a pixel, rows and columns per second; constant beyond the grid."""
     y = min(max(row / step, 0.0), field.shape[0] - 1.0)
     x = min(max(column / step, 0.0), field.shape[1] - 1.0)
@@ -59,8 +59,8 @@ def velocity_at(field: Array, step: float, row: float, column: float) -> tuple[f
 
 
 @njit(cache=True)
-def _cubic(f: float, weights: Array) -> None:
-    """Weights of samples -1, 0, 1, 2 at 0 <= f < 1: cubic convolution (Keys 1981, a = -1/2)."""
+def _cubic_weights(f: float, weights: Array) -> None:
+    """Write the weights of samples -1, 0, 1, 2 for 0 <= f < 1: cubic convolution (Keys 1981, a = -1/2)."""
     weights[0] = ((-0.5 * f + 1.0) * f - 0.5) * f
     weights[1] = (1.5 * f - 2.5) * f * f + 1.0
     weights[2] = ((-1.5 * f + 2.0) * f + 0.5) * f
@@ -68,30 +68,30 @@ def _cubic(f: float, weights: Array) -> None:
 
 
 @njit(cache=True)
-def path_kernel(row_path: float, column_path: float, reach: int, kernel: Array) -> None:
-    """Write the convolution kernel of the mean over a straight path centred on the pixel.
+def path_kernel(row_path: float, column_path: float, half_size: int, kernel: Array) -> None:
+    """Write the convolution kernel that averages over a straight path centred on the pixel.
 
     - row_path, column_path: length of the path in rows and columns
-    - reach: half size of the kernel
-    - kernel: output, shape (2 reach + 1, at least 2 reach + 1); its sum is 1
+    - half_size: half size of the kernel
+    - kernel: output, shape (2 half_size + 1, at least 2 half_size + 1); its sum is 1
     """
     kernel[:] = 0.0
     count = max(1, math.ceil(STEPS_PER_PX * math.sqrt(row_path * row_path + column_path * column_path)))
-    down, right = np.empty(4), np.empty(4)
+    row_weights, column_weights = np.empty(4), np.empty(4)
     for n in range(count):
         fraction = (n + 0.5) / count - 0.5
         y, x = fraction * row_path, fraction * column_path
         i, j = math.floor(y), math.floor(x)
-        _cubic(y - i, down)
-        _cubic(x - j, right)
+        _cubic_weights(y - i, row_weights)
+        _cubic_weights(x - j, column_weights)
         for p in range(4):
             for q in range(4):
-                kernel[reach + i + p - 1, reach + j + q - 1] += down[p] * right[q] / count
+                kernel[half_size + i + p - 1, half_size + j + q - 1] += row_weights[p] * column_weights[q] / count
 
 
 @njit(cache=True)
-def _tap_groups(kernel: Array, groups: NDArray[np.int64]) -> int:
-    """Write first row and column of each group of four neighbouring non-zero taps; return the number of groups."""
+def _find_tap_groups(kernel: Array, groups: NDArray[np.int64]) -> int:
+    """Write row and first column of each group of four neighbouring kernel taps; return the number of groups."""
     count = 0
     for p in range(kernel.shape[0]):
         q = 0
@@ -107,14 +107,14 @@ def _tap_groups(kernel: Array, groups: NDArray[np.int64]) -> int:
 
 @njit(cache=True)
 def blur(padded: Array32, pad: int, field: Array, step: float, exposure_s: float, out: Array32) -> None:
-    """Average the moving scene over an exposure centred on the time of `padded`.
+    """Average the moving scene over the exposure; `padded` is the scene at mid exposure.
 
-    - padded, pad: the scene, and its border, with three more columns on the right
+    - padded, pad: scene with border, and width of the border; three more columns on the right
     - field, step: image velocity at grid nodes (rows and columns per second), and the grid spacing in pixels
     - out: output, shape of the scene without its border
     """
     rows, columns = out.shape
-    # three columns more, always 0: taps are added four at a time
+    # three additional zero columns, because four taps are added at a time
     kernel = np.zeros((2 * pad + 1, 2 * pad + 4))
     line = np.empty(TILE, dtype=np.float32)
     groups = np.empty(((2 * pad + 1) * (2 * pad + 4), 2), dtype=np.int64)
@@ -122,9 +122,9 @@ def blur(padded: Array32, pad: int, field: Array, step: float, exposure_s: float
         bottom = min(top + TILE, rows)
         for left in range(0, columns, TILE):
             width = min(TILE, columns - left)
-            by_row, by_column = velocity_at(field, step, 0.5 * (top + bottom - 1), left + 0.5 * (width - 1))
-            path_kernel(by_row * exposure_s, by_column * exposure_s, pad, kernel)
-            count = _tap_groups(kernel, groups)
+            v_row, v_column = interpolate_velocity(field, step, 0.5 * (top + bottom - 1), left + 0.5 * (width - 1))
+            path_kernel(v_row * exposure_s, v_column * exposure_s, pad, kernel)
+            count = _find_tap_groups(kernel, groups)
             for r in range(top, bottom):
                 line[:] = 0.0
                 for n in range(count):
@@ -139,26 +139,24 @@ def blur(padded: Array32, pad: int, field: Array, step: float, exposure_s: float
 
 
 @njit(cache=True)
-def _split(position: float, size: int) -> tuple[int, np.float32]:
-    """Integer and fractional part of a position, clipped so that the next sample exists."""
+def _split_position(position: float, size: int) -> tuple[int, np.float32]:
+    """Return the integer and fractional part of a position, clipped so that the next sample exists."""
     i = math.floor(position)
     if i < 0:
         return 0, np.float32(0.0)
-    if i > size - 2:
-        return size - 2, np.float32(1.0)
-    return i, np.float32(position - i)
+    return (size - 2, np.float32(1.0)) if i > size - 2 else (i, np.float32(position - i))
 
 
 @njit(cache=True)
 def _add_shifted(
     source: Array32, shape: tuple[int, int], y: float, x: float, factor: np.float32, line: Array32, width: int
 ) -> None:
-    """Add factor times a picture at row y and columns x, x + 1, ... to a line, with bilinear interpolation.
+    """Add factor times an image at row y and columns x, x + 1, ... to a line, with bilinear interpolation.
 
-    The picture is flat with its shape: slicing rows would take longer than adding them.
+    The image is a flat array with its shape as argument, because slicing rows is slower than adding them.
     """
-    i, fy = _split(y, shape[0])
-    j, fx = _split(x, shape[1] - width)
+    i, fy = _split_position(y, shape[0])
+    j, fx = _split_position(x, shape[1] - width)
     one, shift = np.float32(1.0), np.uint64(1)
     a, b = factor * (one - fy) * (one - fx), factor * (one - fy) * fx
     c, d = factor * fy * (one - fx), factor * fy * fx
@@ -171,8 +169,8 @@ def _add_shifted(
 
 
 @njit(cache=True)
-def sums_before(scene: Array32) -> Array32:
-    """Compute sums over the rows before each row, shape (rows + 1, columns)."""
+def cumulative_row_sums(scene: Array32) -> Array32:
+    """Compute sums over all rows above each row, shape (rows + 1, columns)."""
     rows, columns = scene.shape
     sums = np.empty((rows + 1, columns), dtype=np.float32)
     sums[0] = 0.0
@@ -183,42 +181,42 @@ def sums_before(scene: Array32) -> Array32:
 
 
 @njit(cache=True)
-def block_means(picture: Array32, edges: NDArray[np.int64]) -> Array32:
+def average_blocks(image: Array32, edges: NDArray[np.int64]) -> Array32:
     """Compute means over blocks of rows, shape (blocks, columns)."""
-    means = np.zeros((len(edges) - 1, picture.shape[1]), dtype=np.float32)
+    means = np.zeros((len(edges) - 1, image.shape[1]), dtype=np.float32)
     for block in range(len(edges) - 1):
         weight = np.float32(1.0 / (edges[block + 1] - edges[block]))
         for r in range(edges[block], edges[block + 1]):
-            for c in range(picture.shape[1]):
-                means[block, c] += weight * picture[r, c]
+            for c in range(image.shape[1]):
+                means[block, c] += weight * image[r, c]
     return means
 
 
 @njit(cache=True)
 def gather_blocks(transfer: Transfer, prefix: Array32, response: Array32) -> Array32:
-    """Compute the charge that a packet gathers on its way out from each block edge, radiance x rows.
+    """Compute the charge that a packet collects during the transfer from each block edge, radiance x rows.
 
-    A packet that starts at the upper edge of block R passes the middle of block K < R after the time of (R - K - 1/2)
-    blocks. Each block of the scene is sampled at that time.
+    A packet that starts at the upper edge of block R passes the centre of block K < R after the transfer time of
+    (R - K - 1/2) blocks. Each block of the scene is sampled at that time.
 
-    - prefix: sums over the padded scene's rows before each row, shape (padded rows + 1, padded columns)
+    - prefix: sums over all rows of the padded scene above each row, shape (padded rows + 1, padded columns)
     - response: mean response of each block, shape (blocks, columns)
 
     Returns the sum at each edge, shape (blocks + 1, columns).
     """
-    pad, edges = transfer.pad, transfer.edges
+    pad, edges, field, step = transfer.pad, transfer.edges, transfer.field, transfer.step
     blocks, columns = response.shape
     line = np.empty(TILE, dtype=np.float32)
     sums = prefix.reshape(-1)
     out = np.zeros((blocks + 1, columns), dtype=np.float32)
     for start in range(1, blocks + 1):
         for block in range(start):
-            middle = 0.5 * (edges[block] + edges[block + 1])
-            time = transfer.start_s + (edges[start] - middle) * transfer.row_s
+            centre = 0.5 * (edges[block] + edges[block + 1])
+            time = transfer.start_s + (edges[start] - centre) * transfer.row_s
             for left in range(0, columns, TILE):
                 width = min(TILE, columns - left)
-                by_row, by_column = velocity_at(transfer.field, transfer.step, middle - 0.5, left + 0.5 * (width - 1))
-                y, x = pad - by_row * time, pad + left - by_column * time
+                v_row, v_column = interpolate_velocity(field, step, centre - 0.5, left + 0.5 * (width - 1))
+                y, x = pad - v_row * time, pad + left - v_column * time
                 line[:] = 0.0
                 _add_shifted(sums, prefix.shape, edges[block + 1] + y, x, np.float32(1.0), line, width)
                 _add_shifted(sums, prefix.shape, edges[block] + y, x, np.float32(-1.0), line, width)
@@ -229,30 +227,30 @@ def gather_blocks(transfer: Transfer, prefix: Array32, response: Array32) -> Arr
 
 @njit(cache=True)
 def add_smear(transfer: Transfer, gathered: Array32, charge: Array32) -> None:
-    """Add the charge that every row's packet gathers on its way out to `charge` (radiance x seconds, in place).
+    """Add the charge that each packet collects during the transfer to `charge` (radiance x seconds, in place).
 
-    Between the edges of a block the sums over earlier blocks (`gather_blocks`) are interpolated linearly; the block's
-    own rows are added one by one, sampled half a block's time after the start.
+    Within a block, the sums over previous blocks (`gather_blocks`) are interpolated linearly. The rows of the same
+    block are added one by one; they are sampled when half of the block has been transferred.
     """
     padded, pad, response, edges = transfer.padded, transfer.pad, transfer.response, transfer.edges
     columns = response.shape[1]
     seconds = np.float32(transfer.row_s)
     scene, weights, total = padded.reshape(-1), response.reshape(-1), charge.reshape(-1)
     shifted = np.empty((np.max(np.diff(edges)), TILE), dtype=np.float32)
-    in_block, before = np.empty(TILE, dtype=np.float32), np.empty(TILE, dtype=np.float32)
+    in_block, edge_charge = np.empty(TILE, dtype=np.float32), np.empty(TILE, dtype=np.float32)
     change = np.empty(TILE, dtype=np.float32)
     for block in range(len(edges) - 1):
         first, last = edges[block], edges[block + 1]
         time = transfer.start_s + 0.5 * (last - first) * transfer.row_s
         for left in range(0, columns, TILE):
             width = min(TILE, columns - left)
-            middle = 0.5 * (first + last - 1)
-            by_row, by_column = velocity_at(transfer.field, transfer.step, middle, left + 0.5 * (width - 1))
-            y, x = pad - by_row * time, pad + left - by_column * time
+            centre = 0.5 * (first + last - 1)
+            v_row, v_column = interpolate_velocity(transfer.field, transfer.step, centre, left + 0.5 * (width - 1))
+            y, x = pad - v_row * time, pad + left - v_column * time
             shifted[:], in_block[:] = 0.0, 0.0
             for k in range(width):
-                before[k] = gathered[block, left + k]
-                change[k] = gathered[block + 1, left + k] - before[k]
+                edge_charge[k] = gathered[block, left + k]
+                change[k] = gathered[block + 1, left + k] - edge_charge[k]
             for r in range(first, last):
                 line = shifted[r - first]
                 _add_shifted(scene, padded.shape, r + y, x, np.float32(1.0), line, width)
@@ -265,5 +263,5 @@ def add_smear(transfer: Transfer, gathered: Array32, charge: Array32) -> None:
                 line = shifted[r - first]
                 start = np.uint64(r * columns + left)
                 for k in range(width):
-                    total[start + np.uint64(k)] += seconds * (before[k] + fraction * change[k] + in_block[k])
+                    total[start + np.uint64(k)] += seconds * (edge_charge[k] + fraction * change[k] + in_block[k])
                     in_block[k] += line[k]

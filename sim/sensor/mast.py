@@ -1,14 +1,14 @@
 """Pan-tilt mast with a stereo pair: pointing errors and calibration errors.
 
-Pointing. Each axis has a motor with an encoder, followed by gears with backlash. The motor stops near the command; the
-encoder reads it in whole counts. The axis follows the motor within half the backlash to either side (play operator:
-``axis = clip(axis, motor - b/2, motor + b/2)``): it lags by half the backlash after a long move and does not move in a
-reversal shorter than the backlash. The true angle is the axis' less a zero error of the encoder that is constant in a
-run. Flight software receives the encoders' readings.
+Pointing. Each axis has a motor with an encoder, and gears with backlash b. The motor stops near the command; the
+encoder measures its angle in whole counts. The axis follows the motor within half the backlash (play operator:
+``axis = clip(axis, motor - b/2, motor + b/2)``): it lags by half the backlash after a long move, and does not move in a
+reversal shorter than the backlash. The true angle is the axis angle minus a zero error of the encoder that is constant
+in a run. Flight software receives the readings of the encoders.
 
-Calibration. The true cameras are the design's. The calibrated cameras differ by a common rotation of the pair on its
-head, and each by half a relative rotation (an error of disparity or across the epipolar lines), a roll and an error of
-its focal length.
+Calibration. The true cameras equal the design. The calibrated cameras differ by a common rotation of the pair on the
+head. In addition, each has half of a relative rotation (an error in disparity or perpendicular to the epipolar lines),
+a roll error and a focal length error.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ Degrees = Annotated[float, Field(ge=0.0, le=10.0)]
 Pixels = Annotated[float, Field(ge=0.0, le=50.0)]
 Angles = Float64[np.ndarray, "2"]  #: Azimuth and elevation.
 
-#: MER's mast: azimuth axis at (0.457, -0.026) m; the elevation axis crosses it 1.096 m above the rover frame of the
-#: labels, which lies 0.29 m above the ground (Opportunity's PDS labels 1N491020376 and 1N491020519; Maki et al. 2003:
+#: MER mast: azimuth axis at (0.457, -0.026) m; the elevation axis intersects it 1.096 m above the rover frame of the
+#: labels, which is 0.29 m above the ground (Opportunity's PDS labels 1N491020376 and 1N491020519; Maki et al. 2003:
 #: navcams 1.54 m above the ground). The navcams are 0.155 m above the elevation axis, 0.013 m to its right.
 MER_MAST = MastGeometry(
     base_m=np.array([0.457, -0.026, 1.386]),
@@ -40,46 +40,46 @@ MER_MAST = MastGeometry(
     head_m=np.array([0.0, -0.013, 0.155]),
     elevation_limits_rad=(float(np.radians(-87.0)), float(np.radians(87.0))),
 )
-#: The research rover's mast, with cameras at about 1.5 m: all assumed.
+#: Mast of the research rover, with cameras at about 1.5 m; all values assumed.
 RESEARCH_MAST = MastGeometry(
     base_m=np.array([0.25, 0.0, 1.0]),
     elbow_m=np.array([0.0, 0.0, 0.45]),
     head_m=np.array([0.06, 0.0, 0.05]),
     elevation_limits_rad=(float(np.radians(-80.0)), float(np.radians(80.0))),
 )
-#: Masts with stereo pairs, by the names of their cameras' presets.
+#: Masts of stereo pairs by camera preset.
 MASTS = {"mer-navcam": MER_MAST, "research-navcam": RESEARCH_MAST, "research-pancam": RESEARCH_MAST}
 
 
 class PointingParameters(Parameters):
     """Pointing errors of a mast, the same for both axes; spreads are one standard deviation.
 
-    Requested and measured angles differ by 0.0004 to 0.015 deg in the labels of two of Opportunity's navcam pictures;
+    Requested and measured angles differ by 0.0004 to 0.015 deg in the labels of two Opportunity navcam images;
     the other values are assumed.
     """
 
-    zero_deg: Annotated[Degrees, Field(description="error of the encoder's zero, fixed to a run, deg")] = 0.1
-    backlash_deg: Annotated[Degrees, Field(description="full width of the gears' play, deg")] = 0.1
-    settling_deg: Annotated[Degrees, Field(description="motor stop's distance from the command, deg")] = 0.01
-    count_deg: Annotated[Degrees, Field(description="the encoder's count, deg; 0: no rounding")] = 0.005
+    zero_deg: Annotated[Degrees, Field(description="zero error of the encoder, constant in a run, deg")] = 0.1
+    backlash_deg: Annotated[Degrees, Field(description="full width of the backlash, deg")] = 0.1
+    settling_deg: Annotated[Degrees, Field(description="motor stop minus command, deg")] = 0.01
+    count_deg: Annotated[Degrees, Field(description="encoder resolution, deg; 0: no rounding")] = 0.005
 
 
 class StereoCalibrationParameters(Parameters):
     """Calibration errors of a stereo pair; spreads are one standard deviation."""
 
-    disparity_error_px: Annotated[Pixels, Field(description="limit of the uniform disparity error mid-frame, px")] = 0.5
-    epipolar_error_px: Annotated[Pixels, Field(description="across the epipolar lines in the frames' middle, px")] = 0.2
-    alignment_deg: Annotated[Degrees, Field(description="of the pair on its head, each axis, deg")] = 0.05
-    roll_deg: Annotated[Degrees, Field(description="of each camera about its axis, deg")] = 0.01
-    focal_error: Annotated[float, Field(ge=0.0, le=0.05, description="of each focal length, relative")] = 1e-4
+    disparity_error_px: Annotated[Pixels, Field(description="limit of the uniform disparity error, px")] = 0.5
+    epipolar_error_px: Annotated[Pixels, Field(description="perpendicular to the epipolar lines, px")] = 0.2
+    alignment_deg: Annotated[Degrees, Field(description="alignment error of the pair per axis, deg")] = 0.05
+    roll_deg: Annotated[Degrees, Field(description="roll error of each camera, deg")] = 0.01
+    focal_error: Annotated[float, Field(ge=0.0, le=0.05, description="relative error of each focal length")] = 1e-4
 
 
 @dataclass(frozen=True)
 class MastState:
     """Pointing of a mast.
 
-    - readings_rad, true_rad: azimuth and elevation as read by the encoders, and the true ones
-    - axes_rad, motors_rad: angles of both axes and both motors, before the encoders' zero errors
+    - readings_rad, true_rad: encoder readings and true angles; azimuth and elevation
+    - axes_rad, motors_rad: angles of both axes and both motors, without the zero errors of the encoders
     """
 
     readings_rad: tuple[float, float]
@@ -92,8 +92,8 @@ class MastState:
 class Mast:
     """A mast with the errors of one run.
 
-    - geometry: the mast, as surveyed and as it is
-    - zeros_rad: zero errors of the azimuth and elevation encoders, subtracted from the axes' angles
+    - geometry: dimensions of the mast, known without error
+    - zeros_rad: zero errors of the azimuth and elevation encoders, subtracted from the axis angles
     """
 
     parameters: PointingParameters
@@ -107,33 +107,33 @@ class Mast:
 
     @property
     def rest(self) -> MastState:
-        """Pointing straight ahead, the gears in the middle of their play."""
+        """State that points straight ahead, with the gears centred in the backlash."""
         return self._state(np.zeros(2), np.zeros(2))
 
     def point(self, state: MastState, azimuth_rad: float, elevation_rad: float, rng: np.random.Generator) -> MastState:
-        """Move the mast to commanded angles (see `MastGeometry`) within its limits; `rng` draws the motors' stops."""
+        """Move the mast to commanded angles (see `MastGeometry`) within its limits; `rng` draws the motor stops."""
         p, g = self.parameters, self.geometry
         lower, upper = np.array([g.azimuth_limits_rad, g.elevation_limits_rad]).T
-        stopped = np.radians(p.settling_deg) * rng.standard_normal(2)
-        motors = np.clip(np.clip(np.array([azimuth_rad, elevation_rad]), lower, upper) + stopped, lower, upper)
-        play = 0.5 * np.radians(p.backlash_deg)
-        return self._state(motors, np.clip(state.axes_rad, motors - play, motors + play))
+        settling_errors = np.radians(p.settling_deg) * rng.standard_normal(2)
+        motors = np.clip(np.clip(np.array([azimuth_rad, elevation_rad]), lower, upper) + settling_errors, lower, upper)
+        half_backlash = 0.5 * np.radians(p.backlash_deg)
+        return self._state(motors, np.clip(state.axes_rad, motors - half_backlash, motors + half_backlash))
 
     def rover_from_head(self, state: MastState) -> RigidTransform:
-        """True pose of the head in the rover frame."""
+        """Return the true pose of the head in the rover frame."""
         return self.geometry.rover_from_head(*state.true_rad)
 
     def _state(self, motors_rad: Angles, axes_rad: Angles) -> MastState:
         count = np.radians(self.parameters.count_deg)
         readings = count * np.rint(motors_rad / count) if count > 0.0 else motors_rad
         true = axes_rad - self.zeros_rad
-        read, actual = ((float(angles[0]), float(angles[1])) for angles in (readings, true))
-        return MastState(read, actual, axes_rad, motors_rad)
+        measured_pair, true_pair = ((float(angles[0]), float(angles[1])) for angles in (readings, true))
+        return MastState(measured_pair, true_pair, axes_rad, motors_rad)
 
 
 @dataclass(frozen=True)
 class StereoHead:
-    """A stereo pair on a mast: the true cameras (the design's) and the calibrated ones of flight software."""
+    """A stereo pair on a mast: true cameras (the design) and calibrated cameras (flight software)."""
 
     true: MastCalibration
     calibrated: MastCalibration
@@ -142,50 +142,50 @@ class StereoHead:
     def draw(cls, design: MastCalibration, p: StereoCalibrationParameters, rng: np.random.Generator) -> StereoHead:
         """Draw the calibration errors of a pair."""
         disparity = p.disparity_error_px * rng.uniform(-1.0, 1.0)
-        across = p.epipolar_error_px * rng.standard_normal()
+        epipolar = p.epipolar_error_px * rng.standard_normal()
         common = Rotation.from_rotvec(np.radians(p.alignment_deg) * rng.standard_normal(3))
         rolls = np.radians(p.roll_deg) * rng.standard_normal(2)
         focal = 1.0 + p.focal_error * rng.standard_normal(2)
         cameras = []
         for camera, side, roll, scale in zip((design.left, design.right), (0.5, -0.5), rolls, focal, strict=True):
-            # a camera turned to the right about its rows' normal moves the picture to the left
-            columns, rows = camera.focal_lengths
-            turn = camera.down * (-side * disparity / columns) + camera.right * (side * across / rows) + camera.a * roll
+            # a rotation of the camera to the right moves the image to the left
+            fx, fy = camera.focal_lengths
+            turn = camera.down * (-side * disparity / fx) + camera.right * (side * epipolar / fy) + camera.a * roll
             rotation = Rotation.from_rotvec(turn)
-            # about the camera's own centre
+            # rotate about the centre of the camera
             pose = rigid(rotation, camera.c - rotation.apply(camera.c.copy()))
             cameras.append(camera.magnify(float(scale)).transform(pose).transform(rigid(common, np.zeros(3))))
         return cls(design, replace(design, left=cameras[0], right=cameras[1]))
 
     def disparity_error_px(self, range_m: float) -> float:
-        """Calibrated less true disparity of a point at this range straight ahead of each pair."""
+        """Compute calibrated minus true disparity of a point at this range straight ahead of each pair."""
         disparities_px = []
         for mast in (self.calibrated, self.true):
-            ahead = mast.left.boresight() + mast.right.boresight()
-            point = 0.5 * (mast.left.c + mast.right.c) + range_m * ahead / np.linalg.norm(ahead)
+            forward = mast.left.boresight() + mast.right.boresight()
+            point = 0.5 * (mast.left.c + mast.right.c) + range_m * forward / np.linalg.norm(forward)
             disparities_px.append(float(mast.left.project(point)[0][0] - mast.right.project(point)[0][0]))
         return disparities_px[0] - disparities_px[1]
 
 
-#: From a body whose camera looks along -z, its columns along x, to a head whose cameras look along x, columns along -y.
+#: Rotation from a body whose camera looks along -z (columns along x) to a head looking along x (columns along -y).
 _HEAD_FROM_DOWN = Rotation.from_matrix(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
 
 
 def mount_on_head(
     left: CameraModel, right: CameraModel, baseline_m: float, toe_in_deg: float
 ) -> tuple[CameraModel, CameraModel]:
-    """Mount two cameras that look down on a head as a stereo pair that looks forwards, turned inwards by the toe-in."""
+    """Mount two cameras that look along -z on a head, as a stereo pair that looks forward with toe-in."""
 
     def mount(camera: CameraModel, side: float) -> CameraModel:
-        turn = Rotation.from_rotvec([0.0, 0.0, -side * np.radians(toe_in_deg)])
-        return camera.transform(rigid(turn * _HEAD_FROM_DOWN, np.array([0.0, 0.5 * side * baseline_m, 0.0])))
+        toe_in = Rotation.from_rotvec([0.0, 0.0, -side * np.radians(toe_in_deg)])
+        return camera.transform(rigid(toe_in * _HEAD_FROM_DOWN, np.array([0.0, 0.5 * side * baseline_m, 0.0])))
 
     return mount(left, 1.0), mount(right, -1.0)
 
 
 def stereo_mast(name: str) -> MastCalibration:
-    """Return the design of a mast and its stereo pair by the cameras' preset (`MASTS`); ValueError if unknown."""
+    """Return the design of a mast and its stereo pair by camera preset (`MASTS`). Raises ValueError if unknown."""
     if name not in MASTS:
-        raise ValueError(f"no mast carries cameras called {name!r}; allowed: {', '.join(MASTS)}")
+        raise ValueError(f"no mast has the camera preset {name!r}; allowed: {', '.join(MASTS)}")
     left, right = preset(name).cameras()
     return MastCalibration(MASTS[name], left, right)

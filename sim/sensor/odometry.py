@@ -1,19 +1,19 @@
-"""Pose estimation of a rover: wheel odometry with an inertial unit, and optional visual odometry.
+"""Pose estimation of a rover: wheel odometry with an inertial unit, and optionally visual odometry.
 
 Attitude (Ali et al. 2005, as on MER). Accelerometers measure the tilt at each stop, gyros the heading along a drive:
-``R_estimated = Rz(heading error) A R_true B N``. B is a misalignment of the accelerometers, constant in a run. A, a
-rotation of the world, makes the estimate exact at the start: B has an effect only when the rover turns or tilts. N is
-the noise of a stop. The heading error is the sum of a fraction of the turns, a drift along the path and a random walk.
+``R_estimated = Rz(heading error) A R_true B N``. B is a misalignment of the accelerometers, constant in a run. The
+rotation A makes the estimate exact at the start, so that B has an effect only when the rover turns or tilts. N is the
+noise of a stop. The heading error is the sum of a fraction of the turns, a drift along the path and a random walk.
 
-Position by wheels. Each part of a drive adds the commanded path in the estimated axes; slip is not observed:
+Position from wheel odometry. Each part of a drive adds the commanded path in estimated axes; slip is not observed:
 ``dp = R_estimated ((1 + scale) path_commanded + noise)``.
 
-Position by visual odometry (paper, section 4.2: "roughly 2% of the rover travel distance"). Each drive adds its true
-motion with an own scale error, a random walk and a floor; the attitude is the inertial unit's. If it does not converge,
-the wheels' estimate is used for that drive.
+Position from visual odometry (paper, section 4.2: "roughly 2% of the rover travel distance"). Each drive adds the true
+motion with a separate scale error, a random walk and a constant noise; attitude comes from the inertial unit. If visual
+odometry does not converge, wheel odometry is used for that drive.
 
-Constant errors of a run are drawn once (`Odometer.drawn`), the others with every drive. The estimate is exact at the
-start by definition. The estimate assumes flat ground between stops: climbed rocks are part of the slip.
+Constant errors of a run are drawn once (`Odometer.draw`), the others with each drive. The estimate is exact at the
+start by definition. It assumes flat ground between stops: climbing over rocks is part of the slip.
 """
 
 from __future__ import annotations
@@ -38,34 +38,34 @@ Degrees = Annotated[float, Field(ge=0.0, le=30.0)]
 class VisualOdometryParameters(Parameters):
     """Visual odometry; spreads are one standard deviation.
 
-    With the defaults the RMS position error is 2 % of the distance on 8 m (the paper's value; its split into a constant
-    error of a run and random errors is assumed), and 3 % on 2 m.
+    With the defaults the RMS position error is 2 % of the distance on 8 m (value of the paper; the split into constant
+    and random errors is assumed), and 3 % on 2 m.
     """
 
-    scale_error: Annotated[Fraction, Field(description="of the distance, constant in a run (stereo)")] = 0.015
+    scale_error: Annotated[Fraction, Field(description="fraction of the distance, constant in a run")] = 0.015
     walk_m: Annotated[float, Field(ge=0.0, le=1.0, description="error per axis per root metre, m")] = 0.02
-    floor_m: Annotated[float, Field(ge=0.0, le=1.0, description="error per axis new with every drive, m")] = 0.002
+    floor_m: Annotated[float, Field(ge=0.0, le=1.0, description="additional error per axis and drive, m")] = 0.002
     failure_fraction: Annotated[Fraction, Field(description="fraction of drives without convergence")] = 0.0
 
 
 class OdometryParameters(Parameters):
-    """Wheel odometry with an inertial unit, and optional visual odometry; spreads are one standard deviation.
+    """Wheel odometry with an inertial unit, and optionally visual odometry; spreads are one standard deviation.
 
-    The unit is of the class of MER's LN-200; all values are assumed. On flat, hard ground the error is 1.1 % of 8 m;
-    slip, in addition, is part of the motion (`marsyard.sim.dynamics.driving`).
+    The unit is of the class of MER's LN-200; all values are assumed. On flat, hard ground the error is 1.1 % of 8 m.
+    Slip is not included: it is part of the motion (`marsyard.sim.dynamics.driving`).
     """
 
-    scale_error: Annotated[Fraction, Field(description="of the path, constant in a run (wheel radius)")] = 0.01
-    walk_m: Annotated[float, Field(ge=0.0, le=1.0, description="error along and across per root metre, m")] = 0.01
-    heading_scale_error: Annotated[Fraction, Field(description="of the turn, constant in a run")] = 0.002
+    scale_error: Annotated[Fraction, Field(description="fraction of the path, constant (wheel radius)")] = 0.01
+    walk_m: Annotated[float, Field(ge=0.0, le=1.0, description="error per axis per root metre, m")] = 0.01
+    heading_scale_error: Annotated[Fraction, Field(description="fraction of the turn, constant in a run")] = 0.002
     heading_drift_deg_m: Annotated[Degrees, Field(description="drift along the path, constant in a run, deg/m")] = 0.03
     heading_walk_deg: Annotated[Degrees, Field(description="heading error per root metre of path, deg")] = 0.05
-    misalignment_deg: Annotated[Degrees, Field(description="of the accelerometers, per axis, constant in a run")] = 0.1
-    tilt_noise_deg: Annotated[Degrees, Field(description="of pitch and roll, new at every stop")] = 0.03
+    misalignment_deg: Annotated[Degrees, Field(description="accelerometer misalignment per axis, constant")] = 0.1
+    tilt_noise_deg: Annotated[Degrees, Field(description="pitch and roll noise at each stop")] = 0.03
     visual: VisualOdometryParameters = VisualOdometryParameters()
 
 
-#: Odometry without own errors: slip is its only error, which visual odometry observes.
+#: Odometry without sensor errors: the only error is slip, which visual odometry measures.
 EXACT = OdometryParameters(
     scale_error=0.0, walk_m=0.0, heading_scale_error=0.0, heading_drift_deg_m=0.0, heading_walk_deg=0.0,
     misalignment_deg=0.0, tilt_noise_deg=0.0,
@@ -77,8 +77,8 @@ EXACT = OdometryParameters(
 class PoseEstimate:
     """The rover's estimate of its pose at a stop.
 
-    - heading_error_rad: true error of the estimated heading, to the left: for rows and figures, not for flight software
-    - visual_failed: whether visual odometry was on during the last drive and did not converge
+    - heading_error_rad: true error of the estimated heading, positive to the left; not known to flight software
+    - visual_failed: whether visual odometry was used in the last drive and did not converge
     """
 
     world_from_rover: RigidTransform
@@ -86,18 +86,18 @@ class PoseEstimate:
     visual_failed: bool = False
 
     def error_m(self, true: RigidTransform) -> Float64[np.ndarray, "3"]:
-        """Estimated less true position, world axes."""
+        """Return estimated minus true position, world axes."""
         return np.asarray(self.world_from_rover.translation - true.translation)
 
 
 @dataclass(frozen=True)
 class Odometer:
-    """The pose estimator of one run with its constant errors drawn.
+    """Pose estimator of one run, with its constant errors.
 
     - start: the initial pose, known exactly
-    - wheel_scale, visual_scale, heading_scale: relative errors of the wheels' path, visual odometry's path and turns
-    - heading_drift_rad_m: heading drift along the path, to the left
-    - misalignment: B of the module's equation
+    - wheel_scale, visual_scale, heading_scale: relative errors of wheel path, visual odometry path and turns
+    - heading_drift_rad_m: heading drift along the path, positive to the left
+    - misalignment: B in the equation of the module
     """
 
     parameters: OdometryParameters
@@ -124,53 +124,53 @@ class Odometer:
         )
 
     @property
-    def first(self) -> PoseEstimate:
-        """The exact estimate at the start."""
+    def initial_estimate(self) -> PoseEstimate:
+        """Estimate at the start, which is exact."""
         return PoseEstimate(self.start)
 
     def step(
-        self, estimate: PoseEstimate, driven: Drive, rng: np.random.Generator, visual: bool = False
+        self, estimate: PoseEstimate, drive: Drive, rng: np.random.Generator, visual: bool = False
     ) -> PoseEstimate:
-        """Update the estimate after a true drive, with or without visual odometry; the number of draws is the same."""
+        """Update the estimate after a drive, with or without visual odometry, with the same number of draws."""
         p = self.parameters
         wheels, walk, *tilt = np.split(rng.standard_normal(8), [2, 3, 5])
         fails = bool(rng.random() < p.visual.failure_fraction)
         if visual and not fails:
-            start, end = driven.start.world_from_rover, driven.end.world_from_rover
-            error = np.hypot(p.visual.walk_m * np.sqrt(driven.length_m), p.visual.floor_m) * tilt[1]
+            start, end = drive.start.world_from_rover, drive.end.world_from_rover
+            error = np.hypot(p.visual.walk_m * np.sqrt(drive.length_m), p.visual.floor_m) * tilt[1]
             path = (1.0 + self.visual_scale) * (start.inv() * end).translation + error
             displacement = self._attitude(start, estimate.heading_error_rad).apply(path)
         else:
-            noise_m = p.walk_m * np.sqrt(driven.command.length_m) * wheels
-            displacement = self._wheel_displacement(estimate, driven, noise_m)
-        heading = estimate.heading_error_rad + self.heading_scale * driven.turn_left_rad
-        heading += self.heading_drift_rad_m * driven.length_m
-        heading += float(np.radians(p.heading_walk_deg) * np.sqrt(driven.length_m) * walk[0])
+            noise_m = p.walk_m * np.sqrt(drive.command.length_m) * wheels
+            displacement = self._wheel_displacement(estimate, drive, noise_m)
+        heading = estimate.heading_error_rad + self.heading_scale * drive.turn_left_rad
+        heading += self.heading_drift_rad_m * drive.length_m
+        heading += float(np.radians(p.heading_walk_deg) * np.sqrt(drive.length_m) * walk[0])
         noise = Rotation.from_rotvec(np.radians(p.tilt_noise_deg) * np.array([*tilt[0], 0.0]))
-        attitude = self._attitude(driven.end.world_from_rover, heading) * noise
+        attitude = self._attitude(drive.end.world_from_rover, heading) * noise
         return PoseEstimate(
             rigid(attitude, estimate.world_from_rover.translation + displacement), heading, visual and fails
         )
 
     @cached_property
     def _anchor(self) -> Rotation:
-        """A of the module's equation."""
+        """A in the equation of the module."""
         return self.start.rotation * (self.start.rotation * self.misalignment).inv()
 
     def _attitude(self, true: RigidTransform, heading_error_rad: float) -> Rotation:
-        """Estimated attitude without the noise of a stop."""
+        """Compute the estimated attitude without the noise of a stop."""
         return Rotation.from_rotvec([0.0, 0.0, heading_error_rad]) * self._anchor * true.rotation * self.misalignment
 
     def _wheel_displacement(
-        self, estimate: PoseEstimate, driven: Drive, noise_m: Float64[np.ndarray, "2"]
+        self, estimate: PoseEstimate, drive: Drive, noise_m: Float64[np.ndarray, "2"]
     ) -> Float64[np.ndarray, "3"]:
-        """Displacement by the wheels' path and the gyros' turn, world axes."""
+        """Compute the displacement from the wheel path and the turns of the gyros, world axes."""
         scale = 1.0 + self.wheel_scale
-        paths = np.zeros((len(driven.parts), 3))
-        for path, part in zip(paths, driven.parts, strict=True):
+        paths = np.zeros((len(drive.parts), 3))
+        for path, part in zip(paths, drive.parts, strict=True):
             forward_m, left_m = scale * part.command.forward_m, scale * part.command.left_m
             path[:2] = DriveCommand(forward_m, left_m, part.turn_left_rad).displacement_m
         paths[:, :2] += noise_m / len(paths)
-        true = Rotation.concatenate([part.before.world_from_rover.rotation for part in driven.parts])
-        turn = Rotation.from_rotvec([0.0, 0.0, estimate.heading_error_rad]) * self._anchor
-        return np.asarray((turn * true * self.misalignment).apply(paths).sum(axis=0))
+        true = Rotation.concatenate([part.before.world_from_rover.rotation for part in drive.parts])
+        heading_error = Rotation.from_rotvec([0.0, 0.0, estimate.heading_error_rad]) * self._anchor
+        return np.asarray((heading_error * true * self.misalignment).apply(paths).sum(axis=0))

@@ -1,18 +1,18 @@
-"""Optics and radiometry of a camera: sunlight to electrons, point spread, natural fall-off, dust, and motion blur.
+"""Camera optics and radiometry: sunlight to electrons, point spread, natural fall-off, dust, and motion blur.
 
-A surface of radiance factor I/F under the solar photon irradiance E shows the radiance (I/F) E / pi. Behind a lens of
-f-number N and transmission T a pixel of area A gathers, on axis, electrons per second at the rate
+A surface with radiance factor I/F under the solar photon irradiance E has the radiance (I/F) E / pi. Behind a lens with
+f-number N and transmission T, a pixel of area A on the optical axis collects electrons per second at the rate
 ``(I/F) A T / (4 N^2)  integral of E(wavelength) T_filter(wavelength) QE(wavelength)``.
 
-The sun is a black body of 5772 K and of its true size (IAU 2015 Resolution B3): 1361 W/m2 at 1 AU. Between 400 and
-1100 nm that is within a few per cent of the measured spectrum, less than the uncertainty of quantum efficiency and lens
-transmission. The calibrated transmission of the lens absorbs the difference.
+The sun is a black body of 5772 K with its nominal radius (IAU 2015 Resolution B3): 1361 W/m2 at 1 AU. Between 400 and
+1100 nm the difference from the measured spectrum is a few per cent, less than the uncertainty of quantum efficiency and
+lens transmission. The calibrated transmission of the lens absorbs the difference.
 
-Calibration: the field-test paper (section III.B) gives the dark current's part of the noise and the signal-to-noise
-ratio on the darkest terrain at -34, 0 and +23 deg C. Two constants fit them together: `LENS_TRANSMISSION` (signal) and
-`DARK_E_S` (dark current). The part is 1 - SNR / SNR without dark current; the ratio is the mean over the picture's
-rows, which wait for their readout for different times. From 0 to 23 deg C a dark current that doubles every 6 deg C
-grows by a factor of 14.3, and the paper's parts by 9.1. The constant lies between: both parts have the same error.
+Calibration: the field-test paper (section III.B) gives the signal-to-noise ratio (SNR) on the darkest terrain, and the
+fraction of the noise due to dark current, at -34, 0 and +23 deg C. Two constants are fitted: `LENS_TRANSMISSION`
+(signal) and `DARK_E_S` (dark current). The fraction is 1 - SNR / (SNR without dark current), averaged over the image
+rows, which have different readout delays. From 0 to 23 deg C a dark current that doubles every 6 deg C grows by a
+factor of 14.3, the fraction in the paper by 9.1. `DARK_E_S` is a compromise: both fractions have the same error.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.sim.camera import Cahvore, CameraModel
 from marsyard.sim.parameters import NonNegative, Parameters
 from marsyard.sim.sensor.imu import Vector
-from marsyard.sim.sensor.kernels import Transfer, add_smear, block_means, blur, gather_blocks, sums_before
+from marsyard.sim.sensor.kernels import Transfer, add_smear, average_blocks, blur, cumulative_row_sums, gather_blocks
 
 _PLANCK, _LIGHT, _BOLTZMANN = 6.62607015e-34, 2.99792458e8, 1.380649e-23
 _SUN_K, _SUN_RADIUS_M, _AU_M = 5772.0, 6.957e8, 1.495978707e11
@@ -39,28 +39,28 @@ _SUN_K, _SUN_RADIUS_M, _AU_M = 5772.0, 6.957e8, 1.495978707e11
 LENS_TRANSMISSION = 0.519
 DARK_E_S = 159.0  #: Calibrated: dark current of a 12 um pixel at 0 deg C, electrons per second (0.018 nA/cm2).
 DARKEST_RADIANCE_FACTOR = 0.07  #: Radiance factor of the darkest terrain: albedo 0.1 under an afternoon sun.
-#: Optical densities of the paper's filters (III.B.2), weighted by the detector's solar response, with the reflection at
+#: Optical densities of the paper's filters (III.B.2), weighted by the detector's solar response, with reflection at
 #: both surfaces: 1.44 mm of NG4 in flight, 1.35 mm of NG3 in the field test.
 NG4_FLIGHT, NG3_FIELD = 0.67, 0.97
-#: Assumed: relative change of a neutral glass' density per 100 nm. Filters of the paper's densities then transmit the
-#: paper's 22 % and 11 % (a flat density would give 21.4 % and 10.7 %).
+#: Assumed: relative change of a neutral glass' density per 100 nm. The filters then have the
+#: transmissions in the paper, 22 % and 11 % (a flat density would give 21.4 % and 10.7 %).
 DENSITY_SLOPE_PER_100_NM = -0.085
 
 #: Assumed: quantum efficiency of a front-illuminated silicon CCD.
 _QE_NM = np.arange(400.0, 1101.0, 50.0)
 _QE = np.array([15.0, 22.0, 28.0, 33.0, 38.0, 42.0, 43.0, 40.0, 34.0, 27.0, 19.0, 11.0, 5.0, 2.0, 0.0]) / 100.0
-#: Default exposure: a radiance factor of 0.3 fills 60 % of the full well.
+#: Default exposure: radiance factor 0.3 gives 60 % of the full well.
 BRIGHT_RADIANCE_FACTOR, BRIGHT_FILL = 0.3, 0.6
-REACH_PX = 6  #: Half size of the point spread's kernel, pixels.
-Picture = Float32[np.ndarray, "rows columns"]
-#: Fraction of the field angle by which a fisheye's pupil is foreshortened: a MER front hazcam's, measured on the sky of
-#: Opportunity's picture 1F483288473EFFCMUFP1214L0M1 from 60 to 85 deg off axis (not flat-fielded; to 10 %).
+KERNEL_HALF_SIZE_PX = 6  #: Half size of the point spread kernel, pixels.
+Image = Float32[np.ndarray, "rows columns"]
+#: Factor q of the field angle in the projected pupil area of a fisheye, cos(q theta): from a MER front hazcam, the sky
+#: of Opportunity image 1F483288473EFFCMUFP1214L0M1, 60 to 85 deg off axis (not flat-fielded; to 10 %).
 PUPIL_FRACTION = 0.95
 Spectrum = Float64[np.ndarray, "n"]  #: One value per wavelength.
 
 
 def bright_exposure_s(full_well_e: float, responsivity_e_s: float) -> float:
-    """Compute the default exposure time."""
+    """Compute the default exposure time, s."""
     return BRIGHT_FILL * full_well_e / (BRIGHT_RADIANCE_FACTOR * responsivity_e_s)
 
 
@@ -69,10 +69,10 @@ class LightPath:
     """The light path from the sun to a pixel's electrons.
 
     - band_nm: first and last wavelength of the passband
-    - neutral_density: optical density of the filter before the lens, or None
-    - transmission: of the lens
-    - quantum_efficiency: wavelengths, nm, and electrons per photon at these, linear between and zero outside; None for
-      a front-illuminated silicon CCD
+    - neutral_density: optical density of the filter in front of the lens, or None
+    - transmission: transmission of the lens
+    - quantum_efficiency: wavelengths, nm, and electrons per photon, interpolated linearly, zero outside; None for a
+      front-illuminated silicon CCD
     """
 
     f_number: float
@@ -84,18 +84,18 @@ class LightPath:
 
     def responsivity_e_s(self, sun_distance_au: float) -> float:
         """Compute the electrons per second in a pixel on axis at radiance factor 1."""
-        wavelength_nm, passed = self._filtered_electrons()
+        wavelength_nm, electrons = self._filtered_electrons()
         area = (self.pixel_pitch_um * 1e-6) ** 2
-        flux = float(np.trapezoid(passed, wavelength_nm)) / sun_distance_au**2
+        flux = float(np.trapezoid(electrons, wavelength_nm)) / sun_distance_au**2
         return area * self.transmission * flux / (4.0 * self.f_number**2)
 
     def diffraction_px(self) -> float:
-        """Compute the mean wavelength of the detected photons times f-number over the pixel pitch."""
-        wavelength_nm, passed = self._filtered_electrons()
-        return 1e-3 * float(np.average(wavelength_nm, weights=passed)) * self.f_number / self.pixel_pitch_um
+        """Compute the mean wavelength of the detected photons times f-number, divided by the pixel pitch."""
+        wavelength_nm, electrons = self._filtered_electrons()
+        return 1e-3 * float(np.average(wavelength_nm, weights=electrons)) * self.f_number / self.pixel_pitch_um
 
     def _filtered_electrons(self) -> tuple[Spectrum, Spectrum]:
-        """Wavelengths, and electrons per second, m2 and nm at 1 AU behind the filter, without the lens."""
+        """Return wavelengths and electrons per second, m2 and nm at 1 AU behind the filter, without the lens."""
         wavelength_nm = np.linspace(*self.band_nm, 281)
         if self.quantum_efficiency is None:
             efficiency = np.interp(wavelength_nm, _QE_NM, _QE)
@@ -104,9 +104,9 @@ class LightPath:
         electrons = solar_photons(wavelength_nm) * efficiency
         if self.neutral_density is None:
             return wavelength_nm, electrons
-        middle = np.average(wavelength_nm, weights=electrons)
-        tilt = 1.0 + DENSITY_SLOPE_PER_100_NM * (wavelength_nm - middle) / 100.0
-        return wavelength_nm, electrons * 10.0 ** (-self.neutral_density * tilt)
+        mean_nm = np.average(wavelength_nm, weights=electrons)
+        relative_density = 1.0 + DENSITY_SLOPE_PER_100_NM * (wavelength_nm - mean_nm) / 100.0
+        return wavelength_nm, electrons * 10.0 ** (-self.neutral_density * relative_density)
 
 
 def solar_photons(wavelength_nm: Spectrum) -> Spectrum:
@@ -125,18 +125,18 @@ class OpticsParameters(Parameters):
     pixel_aperture: Annotated[bool, Field(description="average over pixels; not for area-sampled renderings")] = False
     dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on the lens")] = 0
     dust_depth: Annotated[float, Field(ge=0.0, le=1.0, description="fraction of the light absorbed by a speck")] = 0.3
-    dust_radius_px: Annotated[float, Field(gt=0.0, le=1000.0, description="mean shadow radius, px; +- a third")] = 25.0
-    dust_softness: Annotated[float, Field(gt=0.0, le=1.0, description="half width of its edge over the radius")] = 0.5
+    dust_radius_px: Annotated[float, Field(gt=0.0, le=1000.0, description="mean shadow radius, px; +- 1/3")] = 25.0
+    dust_softness: Annotated[float, Field(gt=0.0, le=1.0, description="half width of the edge / radius")] = 0.5
 
 
 @lru_cache(maxsize=32)
 def line_spread(parameters: OpticsParameters) -> Float32[np.ndarray, "taps"]:
-    """Compute the line spread function: weights of a pixel's neighbours along a row or column, with the sum 1.
+    """Compute the line spread function: weights of the neighbouring pixels along a row or column, with sum 1.
 
-    Their Fourier series is the modulation transfer function up to the Nyquist frequency: that of a diffraction-limited
-    circular pupil, 2/pi (acos s - s sqrt(1 - s^2)) with s = frequency x wavelength x f-number (Goodman, Introduction to
-    Fourier Optics, 6.4), times that of diffusion, exp(-2 (pi sigma f)^2), and optionally the pixel aperture's, sinc(f).
-    Rows and columns are separable: the transfer function of the round pupil is replaced by the product of its sections.
+    The Fourier series of the weights is the modulation transfer function up to the Nyquist frequency: the product of a
+    diffraction-limited circular pupil, 2/pi (acos s - s sqrt(1 - s^2)) with s = frequency x wavelength x f-number
+    (Goodman, Introduction to Fourier Optics, 6.4), of diffusion, exp(-2 (pi sigma f)^2), and optionally of the pixel
+    aperture, sinc(f). Rows and columns are treated as separable, which is an approximation for a round pupil.
     """
     frequency = np.linspace(0.0, 0.5, 513)
     transfer = np.exp(-2.0 * (np.pi * parameters.diffusion_px * frequency) ** 2)
@@ -144,7 +144,7 @@ def line_spread(parameters: OpticsParameters) -> Float32[np.ndarray, "taps"]:
         transfer = transfer * np.sinc(frequency)
     s = np.minimum(frequency * parameters.diffraction_px, 1.0)
     transfer = transfer * (2.0 / np.pi) * (np.arccos(s) - s * np.sqrt(1.0 - s * s))
-    offsets = np.arange(-REACH_PX, REACH_PX + 1)
+    offsets = np.arange(-KERNEL_HALF_SIZE_PX, KERNEL_HALF_SIZE_PX + 1)
     waves = np.cos(2.0 * np.pi * frequency[:, None] * offsets)
     taps = 2.0 * np.trapezoid(transfer[:, None] * waves, frequency, axis=0)
     weights: Float32[np.ndarray, "taps"] = (taps / taps.sum()).astype(np.float32)
@@ -152,22 +152,21 @@ def line_spread(parameters: OpticsParameters) -> Float32[np.ndarray, "taps"]:
     return weights
 
 
-def apply_point_spread(radiance: Picture, parameters: OpticsParameters) -> Picture:
-    """Blur a scene by the lens and charge diffusion, without loss or shift; the scene is mirrored at the border."""
+def apply_point_spread(radiance: Image, parameters: OpticsParameters) -> Image:
+    """Blur a scene by lens and charge diffusion, without loss or shift; the scene is mirrored at the border."""
     if parameters.diffraction_px == 0.0 and parameters.diffusion_px == 0.0 and not parameters.pixel_aperture:
         return radiance
     taps = line_spread(parameters)
     return np.asarray(cv2.sepFilter2D(radiance, cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT))
 
 
-def natural_fall_off(camera: CameraModel) -> Picture:
+def natural_fall_off(camera: CameraModel) -> Image:
     """Compute the relative brightness of each pixel behind an unvignetted lens, 1 at the brightest.
 
-    It is proportional to the pixel's solid angle and to the projected area of the entrance pupil:
-    ``dOmega cos(q theta)``, theta being the angle from the optical axis. For a fixed pupil q is 1: for a perspective
-    lens the product is the fourth power of the cosine. A fisheye's pupil, whose motion CAHVORE describes, turns a
-    little towards the ray (Kumler & Bauer 2000, Proc. SPIE 4093), and its picture has light at 90 deg: q is
-    `PUPIL_FRACTION`.
+    It is proportional to the pixel's solid angle and to the projected area of the entrance pupil: ``dOmega cos(q
+    theta)``, theta being the angle from the optical axis. For a fixed pupil q is 1: for a perspective lens the product
+    is the fourth power of the cosine. The pupil of a fisheye (CAHVORE) tilts towards the ray (Kumler & Bauer 2000,
+    Proc. SPIE 4093), so that the image is not dark at 90 deg: q is `PUPIL_FRACTION`.
     """
     _origins, directions = camera.rays(camera.pixel_grid())
     down, right = np.gradient(directions, axis=(0, 1), edge_order=2)
@@ -175,44 +174,44 @@ def natural_fall_off(camera: CameraModel) -> Picture:
     axis, fraction = (camera.o, PUPIL_FRACTION) if isinstance(camera, Cahvore) else (camera.a, 1.0)
     off_axis = np.arccos(np.clip(directions @ (axis / np.linalg.norm(axis)), -1.0, 1.0))
     brightness = solid_angle * np.clip(np.cos(fraction * off_axis), 0.0, None)
-    # pixels that no ray reaches are dark
+    # pixels without a ray are dark
     return np.asarray(np.nan_to_num(brightness / np.nanmax(brightness)).astype(np.float32))
 
 
-def dust_transmission(shape: tuple[int, int], parameters: OpticsParameters, rng: np.random.Generator) -> Picture:
+def dust_transmission(shape: tuple[int, int], parameters: OpticsParameters, rng: np.random.Generator) -> Image:
     """Draw the transmission of dust on the lens: soft absorbing discs at random positions."""
     transmission = np.ones(shape, dtype=np.float32)
     row, column = np.ogrid[: shape[0], : shape[1]]
     for _ in range(parameters.dust_discs):
-        middle = rng.uniform(0.0, 1.0, 2) * shape
+        centre = rng.uniform(0.0, 1.0, 2) * shape
         radius = parameters.dust_radius_px * rng.uniform(2.0 / 3.0, 4.0 / 3.0)
-        distance = np.hypot(row - middle[0], column - middle[1]) / radius
-        inside = np.clip((1.0 + parameters.dust_softness - distance) / (2.0 * parameters.dust_softness), 0.0, 1.0)
-        transmission *= (1.0 - parameters.dust_depth * inside**2 * (3.0 - 2.0 * inside)).astype(np.float32)
+        distance = np.hypot(row - centre[0], column - centre[1]) / radius
+        coverage = np.clip((1.0 + parameters.dust_softness - distance) / (2.0 * parameters.dust_softness), 0.0, 1.0)
+        transmission *= (1.0 - parameters.dust_depth * coverage**2 * (3.0 - 2.0 * coverage)).astype(np.float32)
     return transmission
 
 
 GRID_STEP_PX = 32.0  #: Spacing of the velocity grid's nodes, pixels.
-FAR_M = 1e9  #: Distance of points without range (the sky), metres.
-STILL_PX = 0.01  #: Motion below which a picture is still, pixels.
+SKY_DISTANCE_M = 1e9  #: Distance assumed for pixels without range (the sky), metres.
+STILL_PX = 0.01  #: Maximum motion of an image that is treated as still, pixels.
 #: Motion within a block of rows of the transfer, pixels, and minimum and maximum number of rows in a block.
 BLOCK_PX, BLOCK_ROWS = 0.25, (4, 32)
-#: The padded scene, the response and the charge, which is changed in place.
-_Pictures = tuple[Float32[np.ndarray, "padded_rows padded_columns"], Picture, Picture]
+#: Padded scene, response, and charge (changed in place).
+_ExposureArrays = tuple[Float32[np.ndarray, "padded_rows padded_columns"], Image, Image]
 
 
 @dataclass(frozen=True)
 class ImageMotion:
-    """Image velocity over a picture.
+    """Image velocity over an image.
 
-    `velocity_px_s` has rows and columns per second at the nodes of a grid of at least 2 x 2. The first node is pixel
-    (0, 0), the spacing `GRID_STEP_PX`; the velocity is constant beyond the last node.
+    `velocity_px_s` contains rows and columns per second at the nodes of a grid of at least 2 x 2. The first node is
+    pixel (0, 0), the spacing is `GRID_STEP_PX`; the velocity is constant beyond the last node.
     """
 
     velocity_px_s: Float64[np.ndarray, "n m 2"]
 
     @classmethod
-    def of_camera(
+    def from_camera(
         cls,
         camera: CameraModel,
         range_m: Float[np.ndarray, "rows columns"],
@@ -229,13 +228,13 @@ class ImageMotion:
         rows, columns = range_m.shape
         v, u = np.meshgrid(_nodes(rows), _nodes(columns), indexing="ij")
         origins, directions = camera.rays(np.stack([u, v], axis=-1))
-        at = (np.minimum(v.astype(np.int64), rows - 1), np.minimum(u.astype(np.int64), columns - 1))
-        distance = np.minimum(range_m[at].astype(np.float64), FAR_M)
+        pixel = (np.minimum(v.astype(np.int64), rows - 1), np.minimum(u.astype(np.int64), columns - 1))
+        distance = np.minimum(range_m[pixel].astype(np.float64), SKY_DISTANCE_M)
         points = origins + distance[..., None] * directions
         body_from_world = world_from_body.rotation.inv()
-        moving = -body_from_world.apply(velocity_m_s) - np.cross(body_from_world.apply(rate_rad_s), points)
-        pixels = np.einsum("...ij,...j->...i", camera.projection_jacobian(points), moving)
-        # nodes outside the optics have no motion: no pixel of the frame lies there
+        point_velocities = -body_from_world.apply(velocity_m_s) - np.cross(body_from_world.apply(rate_rad_s), points)
+        pixels = np.einsum("...ij,...j->...i", camera.projection_jacobian(points), point_velocities)
+        # nodes outside the field of view have zero motion; no pixel of the image uses them
         return cls(np.ascontiguousarray(np.nan_to_num(pixels[..., ::-1])))
 
     @property
@@ -244,7 +243,7 @@ class ImageMotion:
         return float(np.hypot(*np.moveaxis(self.velocity_px_s, -1, 0)).max())
 
     def is_still(self, duration_s: float) -> bool:
-        """Whether all motion within this time is below `STILL_PX`."""
+        """Whether all motion within `duration_s` is below `STILL_PX`."""
         return self.max_px_s * duration_s < STILL_PX
 
 
@@ -254,57 +253,57 @@ def _nodes(extent: int) -> Float64[np.ndarray, "nodes"]:
 
 
 def moving_exposure(
-    scene: Picture, response: Picture, motion: ImageMotion, exposure_s: float, transfer_row_s: float, clear_row_s: float
-) -> Picture:
-    """Compute the exposure of every pixel to a moving scene including clearing and transfer, radiance x seconds.
+    scene: Image, response: Image, motion: ImageMotion, exposure_s: float, transfer_row_s: float, clear_row_s: float
+) -> Image:
+    """Compute the exposure of every pixel to a moving scene, including clearing and transfer, radiance x seconds.
 
-    Beyond the frame's border the scene is constant. At 60 deg/s, 4.9 pixels in an exposure of the descent camera, the
-    error is 1.2 % of the mean (RMS, Gusev from 2 km) in the outermost pixels, 0.5 % in the next, and below 0.15 % from
-    the third on: a seventh of the noise at SNR 100:1.
+    The scene is constant beyond the image border. At 60 deg/s (4.9 pixels per exposure of the descent camera) the RMS
+    error is 1.2 % of the mean in the outermost pixels (Gusev from 2 km), 0.5 % in the next, and below 0.15 % from
+    the third pixel on, which is a seventh of the noise at SNR 100:1.
 
     - scene: radiance at mid exposure
     - response: relative response of every pixel
     - transfer_row_s, clear_row_s: time under each row during the transfer and the clearing
     """
-    reach_s = 0.5 * exposure_s + len(scene) * max(transfer_row_s, clear_row_s)
-    pad = int(np.ceil(motion.max_px_s * reach_s)) + 3
-    near = int(np.ceil(0.5 * motion.max_px_s * exposure_s)) + 2
+    max_time_s = 0.5 * exposure_s + len(scene) * max(transfer_row_s, clear_row_s)
+    pad = int(np.ceil(motion.max_px_s * max_time_s)) + 3
+    blur_pad = int(np.ceil(0.5 * motion.max_px_s * exposure_s)) + 2
     padded = np.pad(scene, pad, mode="edge")
-    inner = np.pad(scene, ((near, near), (near, near + 3)), mode="edge")
+    blur_scene = np.pad(scene, ((blur_pad, blur_pad), (blur_pad, blur_pad + 3)), mode="edge")
     charge = np.empty_like(scene)
-    blur(inner, near, motion.velocity_px_s, GRID_STEP_PX, exposure_s, charge)
+    blur(blur_scene, blur_pad, motion.velocity_px_s, GRID_STEP_PX, exposure_s, charge)
     charge *= np.float32(exposure_s)
     charge *= response
-    pictures = (padded, response, charge)
+    arrays = (padded, response, charge)
     if transfer_row_s > 0.0:
-        _add_smear(pictures, motion, 0.5 * exposure_s, transfer_row_s)
+        _add_smear(arrays, motion, 0.5 * exposure_s, transfer_row_s)
     if clear_row_s > 0.0:
-        _add_clearing(pictures, motion, 0.5 * exposure_s, clear_row_s)
+        _add_clearing(arrays, motion, 0.5 * exposure_s, clear_row_s)
     return charge
 
 
-def _add_clearing(pictures: _Pictures, motion: ImageMotion, start_s: float, row_s: float) -> None:
-    """Add the clearing: the transfer of an inverted picture with time running backwards."""
-    padded, response, charge = pictures
+def _add_clearing(arrays: _ExposureArrays, motion: ImageMotion, start_s: float, row_s: float) -> None:
+    """Add the clearing: the transfer of the vertically flipped image with time running backwards."""
+    padded, response, charge = arrays
     rows = len(response)
-    # velocities of the inverted picture at its own nodes: the row velocity is inverted twice, the column velocity once
-    upright = np.clip((rows - 1 - _nodes(rows)) / GRID_STEP_PX, 0.0, len(motion.velocity_px_s) - 1.0)
-    below = np.minimum(upright.astype(np.int64), len(motion.velocity_px_s) - 2)
-    fraction = (upright - below)[:, None, None]
-    inverted = (1.0 - fraction) * motion.velocity_px_s[below] + fraction * motion.velocity_px_s[below + 1]
-    backwards = ImageMotion(np.ascontiguousarray(inverted * np.array([1.0, -1.0])))
-    gathered = np.zeros_like(charge)
-    turned = (np.ascontiguousarray(padded[::-1]), np.ascontiguousarray(response[::-1]), gathered)
-    _add_smear(turned, backwards, start_s, row_s)
-    charge += gathered[::-1]
+    # velocities at the nodes of the flipped image: flip and time reversal cancel for rows; columns change sign
+    positions = np.clip((rows - 1 - _nodes(rows)) / GRID_STEP_PX, 0.0, len(motion.velocity_px_s) - 1.0)
+    below = np.minimum(positions.astype(np.int64), len(motion.velocity_px_s) - 2)
+    fraction = (positions - below)[:, None, None]
+    flipped = (1.0 - fraction) * motion.velocity_px_s[below] + fraction * motion.velocity_px_s[below + 1]
+    backwards = ImageMotion(np.ascontiguousarray(flipped * np.array([1.0, -1.0])))
+    clearing_charge = np.zeros_like(charge)
+    flipped_arrays = (np.ascontiguousarray(padded[::-1]), np.ascontiguousarray(response[::-1]), clearing_charge)
+    _add_smear(flipped_arrays, backwards, start_s, row_s)
+    charge += clearing_charge[::-1]
 
 
-def _add_smear(pictures: _Pictures, motion: ImageMotion, start_s: float, row_s: float) -> None:
-    """Add the charge gathered under the rows before a packet's own, from `start_s` after mid exposure."""
-    padded, response, charge = pictures
+def _add_smear(arrays: _ExposureArrays, motion: ImageMotion, start_s: float, row_s: float) -> None:
+    """Add the charge that packets collect from the rows above; the transfer starts `start_s` after mid exposure."""
+    padded, response, charge = arrays
     rows = len(response)
     block_rows = int(np.clip(BLOCK_PX / max(motion.max_px_s * row_s, 1e-12), *BLOCK_ROWS))
     edges = np.append(np.arange(0, rows, block_rows), rows).astype(np.int64)
     pad = (len(padded) - rows) // 2
     transfer = Transfer(padded, pad, response, edges, motion.velocity_px_s, GRID_STEP_PX, start_s, row_s)
-    add_smear(transfer, gather_blocks(transfer, sums_before(padded), block_means(response, edges)), charge)
+    add_smear(transfer, gather_blocks(transfer, cumulative_row_sums(padded), average_blocks(response, edges)), charge)

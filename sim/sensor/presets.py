@@ -1,14 +1,14 @@
-"""Cameras and detectors by name or datasheet: geometry and detector of the papers' cameras, detectors of users.
+"""Camera presets and datasheets: geometry and detector of the cameras in the papers, and custom cameras.
 
-A descent camera is given in the body frame: at its origin, looking along -z, columns along +x. All others are given in
-a frame with x forward, y left and z up, with its origin between the two cameras of a pair: the mast's or the rover's.
+A descent camera is defined in the body frame: at its origin, looking along -z, columns along +x. All other cameras are
+defined in the frame of the mast or rover: x forward, y left, z up, with its origin between the two cameras of a pair.
 ``camera.transform(body_from_mast)`` mounts them on a vehicle.
 
 Sources: the field-test paper III.B; the target tracking paper section 3 (research rover); the landing paper section 5;
 Maki et al. 2003, "Mars Exploration Rover Engineering Cameras" (MER). Assumed values are marked.
 
-Datasheets are TOML files with the manufacturer's values (those of EMVA 1288: saturation capacity, temporal dark noise,
-quantum efficiency, dark current, photo response non-uniformity) and the lens before the detector: see `Datasheet`.
+Datasheets are TOML files with values of the manufacturer (those of EMVA 1288: saturation capacity, temporal dark noise,
+quantum efficiency, dark current, photo response non-uniformity) and the lens in front of the detector: see `Datasheet`.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from marsyard.sim.sensor import optics
 from marsyard.sim.sensor.detector import DetectorParameters
 from marsyard.sim.sensor.optics import LENS_TRANSMISSION, LightPath, OpticsParameters, bright_exposure_s
 
-#: Distance of Mars from the sun at the MER landings (the paper's "1.5 AU": 44 % of Earth's sunlight), AU.
+#: Distance of Mars from the sun at the MER landings ("1.5 AU" in the paper: 44 % of the sunlight at Earth), AU.
 MARS_AU = 1.5
 NAVCAM_RADIAL = (0.00096, -0.002183, 0.018547)  #: Distortion of Opportunity's left navcam (its PDS label), R of CAHVOR.
-#: Barrel distortion of a small C-mount lens, R of CAHVOR: 1.8 % in the corner of the XC-55's picture; assumed.
+#: Barrel distortion of a small C-mount lens, R of CAHVOR: 1.8 % in the image corner of the XC-55; assumed.
 C_MOUNT_RADIAL = (0.0, -0.08, 0.025)
 _MAX_BYTES = 1 << 20  #: Maximum size of a datasheet.
 
@@ -45,10 +45,10 @@ class CameraDesign:
 
     - size: (columns, rows)
     - radial: R of CAHVOR or CAHVORE
-    - linearity: of CAHVORE; None for CAHVOR
-    - baseline_m: distance of the cameras of a pair; None for a single camera
-    - toe_in_deg: rotation of each camera of a pair towards the other
-    - down: whether it looks down along -z instead of forward along +x
+    - linearity: parameter of CAHVORE; None for CAHVOR
+    - baseline_m: distance between the cameras of a pair; None for a single camera
+    - toe_in_deg: inward rotation of each camera of a pair
+    - down: whether the camera looks down along -z instead of forward along +x
     """
 
     focal_length_mm: float
@@ -64,18 +64,18 @@ class CameraDesign:
         """Create the camera, or the left and the right camera of the pair."""
         if self.baseline_m is None:
             return (self._camera(0.0, 0.0),)
-        half, toe = 0.5 * self.baseline_m, np.radians(self.toe_in_deg)
-        return (self._camera(half, -toe), self._camera(-half, toe))
+        left_m, toe_in = 0.5 * self.baseline_m, np.radians(self.toe_in_deg)
+        return (self._camera(left_m, -toe_in), self._camera(-left_m, toe_in))
 
     def _camera(self, left_m: float, azimuth_rad: float) -> CameraModel:
-        turn = Rotation.from_rotvec([0.0, 0.0, azimuth_rad])
+        rotation = Rotation.from_rotvec([0.0, 0.0, azimuth_rad])
         pinhole = Cahv.from_focal_length(
             focal_m=self.focal_length_mm * 1e-3,
             pixel_pitch_m=self.pixel_pitch_um * 1e-6,
             size=self.size,
             centre=np.array([0.0, left_m, 0.0]),
-            axis=np.array([0.0, 0.0, -1.0]) if self.down else turn.apply([1.0, 0.0, 0.0]),
-            right=np.array([1.0, 0.0, 0.0]) if self.down else turn.apply([0.0, -1.0, 0.0]),
+            axis=np.array([0.0, 0.0, -1.0]) if self.down else rotation.apply([1.0, 0.0, 0.0]),
+            right=np.array([1.0, 0.0, 0.0]) if self.down else rotation.apply([0.0, -1.0, 0.0]),
         )
         if self.linearity is None:
             return Cahvor.from_cahv(pinhole, r=np.array(self.radial))
@@ -84,7 +84,7 @@ class CameraDesign:
 
 @dataclass(frozen=True)
 class Preset:
-    """A camera of the papers: geometry, light path and detector."""
+    """A camera from the papers: geometry, light path and detector."""
 
     design: CameraDesign
     light: LightPath
@@ -95,8 +95,8 @@ class Preset:
         return self.design.cameras()
 
 
-def _mer(design: CameraDesign, light: LightPath, sun_au: float, **changes: float | int) -> Preset:
-    """A camera with the MER detector; the defaults of `DetectorParameters` are the descent camera's."""
+def _mer_preset(design: CameraDesign, light: LightPath, sun_au: float, **changes: float | int) -> Preset:
+    """Create a camera with the MER detector; the defaults of `DetectorParameters` are those of the descent camera."""
     settings = {
         "responsivity_e_s": light.responsivity_e_s(sun_au),
         "sun_au": sun_au,
@@ -113,26 +113,26 @@ _DESCENT_BAND, _ROVER_BAND = (400.0, 1100.0), (600.0, 800.0)  #: Passbands (Maki
 
 def _mer_descent_flown() -> Preset:
     light = LightPath(12.0, 12.0, _DESCENT_BAND, optics.NG4_FLIGHT)
-    return _mer(_DESCENT, light, MARS_AU, exposure_s=_FLIGHT_EXPOSURE_S, temperature_c=-34.0)
+    return _mer_preset(_DESCENT, light, MARS_AU, exposure_s=_FLIGHT_EXPOSURE_S, temperature_c=-34.0)
 
 
 def _mer_descent_field() -> Preset:
-    """Under Earth's sun, with the exposure time that gives as many electrons from the same ground as in flight."""
+    """Create the camera on Earth, with the exposure time scaled to the same signal electrons as in flight."""
     light = LightPath(12.0, 12.0, _DESCENT_BAND, optics.NG3_FIELD)
-    flown = _mer_descent_flown().detector.responsivity_e_s
-    exposure = _FLIGHT_EXPOSURE_S * flown / light.responsivity_e_s(1.0)
-    return _mer(_DESCENT, light, 1.0, exposure_s=exposure, temperature_c=0.0)
+    flight_responsivity = _mer_descent_flown().detector.responsivity_e_s
+    exposure = _FLIGHT_EXPOSURE_S * flight_responsivity / light.responsivity_e_s(1.0)
+    return _mer_preset(_DESCENT, light, 1.0, exposure_s=exposure, temperature_c=0.0)
 
 
 def _mer_rover(design: CameraDesign, f_number: float) -> Preset:
-    """Rows are not summed; the temperature is assumed."""
+    """Create a rover camera; rows are not summed, the temperature is assumed."""
     light = LightPath(f_number, design.pixel_pitch_um, _ROVER_BAND)
     exposure = bright_exposure_s(170000.0, light.responsivity_e_s(MARS_AU))
-    return _mer(design, light, MARS_AU, exposure_s=exposure, temperature_c=-40.0, rows_summed=1)
+    return _mer_preset(design, light, MARS_AU, exposure_s=exposure, temperature_c=-40.0, rows_summed=1)
 
 
-def _interline(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
-    """An interline CCD without smear on Earth at +20 deg C; f/4, 700 nm, full well, noise, dark current: assumed."""
+def _interline_preset(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
+    """Create an interline CCD on Earth at +20 deg C, no smear; f/4, 700 nm, full well, noise, dark current: assumed."""
     light = LightPath(4.0, design.pixel_pitch_um, (400.0, 700.0))
     responsivity = light.responsivity_e_s(1.0)
     detector = DetectorParameters(
@@ -159,27 +159,27 @@ PRESETS: Mapping[str, Callable[[], Preset]] = {
     "mer-descent-flown": _mer_descent_flown,
     "mer-descent-field": _mer_descent_field,
     "mer-navcam": partial(_mer_rover, CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, baseline_m=0.20), 12.0),
-    # an equidistant fisheye without distortion, its pupil fixed: both assumed
+    # assumed: equidistant fisheye without distortion, with a fixed pupil
     "mer-hazcam": partial(_mer_rover, CameraDesign(5.58, 12.0, (1024, 1024), linearity=0.0, baseline_m=0.10), 15.0),
-    "research-navcam": partial(_interline, CameraDesign(6.0, 4.65, (1024, 768), baseline_m=0.20), 13000.0, 10),
-    # the toe-in is assumed, that of MER's pancams: parallel cameras would see a point at 2 m 516 px apart
+    "research-navcam": partial(_interline_preset, CameraDesign(6.0, 4.65, (1024, 768), baseline_m=0.20), 13000.0, 10),
+    # assumed: toe-in of the MER pancams; parallel cameras have a disparity of 516 px at 2 m
     "research-pancam": partial(
-        _interline, CameraDesign(16.0, 4.65, (1024, 768), baseline_m=0.30, toe_in_deg=1.0), 13000.0, 10
+        _interline_preset, CameraDesign(16.0, 4.65, (1024, 768), baseline_m=0.30, toe_in_deg=1.0), 13000.0, 10
     ),
-    # the lens is assumed: 6 mm, 43 deg, with some distortion
-    "xc-55": partial(_interline, CameraDesign(6.0, 7.4, (640, 480), C_MOUNT_RADIAL, down=True), 20000.0, 8),
+    # assumed: 6 mm lens, 43 deg, with some distortion
+    "xc-55": partial(_interline_preset, CameraDesign(6.0, 7.4, (640, 480), C_MOUNT_RADIAL, down=True), 20000.0, 8),
 }
 
 
 def preset(name: str) -> Preset:
-    """Create the camera of this name. Raises ValueError if it is unknown."""
+    """Create a camera preset by name. Raises ValueError if it is unknown."""
     if name not in PRESETS:
-        raise ValueError(f"there is no camera preset {name!r}; allowed: {', '.join(PRESETS)}")
+        raise ValueError(f"unknown camera preset {name!r}; allowed: {', '.join(PRESETS)}")
     return PRESETS[name]()
 
 
 class QuantumEfficiency(Parameters):
-    """Electrons per photon by wavelength, linear between the points and zero outside."""
+    """Electrons per photon by wavelength, interpolated linearly, zero outside."""
 
     wavelength_nm: Annotated[tuple[float, ...], Field(min_length=2)]
     efficiency: Annotated[tuple[Annotated[float, Field(ge=0.0, le=1.0)], ...], Field(min_length=2)]
@@ -188,18 +188,18 @@ class QuantumEfficiency(Parameters):
     def _check_curve(self) -> QuantumEfficiency:
         if len(self.wavelength_nm) != len(self.efficiency):
             counts = f"{len(self.wavelength_nm)} wavelengths and {len(self.efficiency)} efficiencies"
-            raise ValueError(f"{counts}; as many of each")
+            raise ValueError(f"{counts}; both lists must have the same length")
         if np.any(np.diff(self.wavelength_nm) <= 0.0):
             raise ValueError("wavelength_nm must increase")
         return self
 
 
 class Lens(Parameters):
-    """The lens before the detector."""
+    """The lens in front of the detector."""
 
     f_number: Annotated[float, Field(gt=0.0, le=100.0)]
     band_nm: Annotated[tuple[Positive, Positive], Field(description="first and last wavelength of the passband")]
-    transmission: Annotated[float, Field(gt=0.0, le=1.0, description="of the lens and its filters")] = LENS_TRANSMISSION
+    transmission: Annotated[float, Field(gt=0.0, le=1.0, description="lens and filters")] = LENS_TRANSMISSION
 
     @model_validator(mode="after")
     def _check_band(self) -> Lens:
@@ -209,35 +209,35 @@ class Lens(Parameters):
 
 
 class Datasheet(Parameters):
-    """The values of a detector's datasheet."""
+    """Values of a detector datasheet."""
 
     name: str = ""
     pixel_pitch_um: Annotated[float, Field(gt=0.1, le=100.0)]
     full_well_e: Annotated[Positive, Field(description="saturation capacity, electrons")]
     read_noise_e: Annotated[NonNegative, Field(description="temporal dark noise, electrons")]
     bits: Annotated[int, Field(ge=8, le=16)]
-    gain_e_dn: Annotated[Positive | None, Field(description="electrons per count; default: full well/all")] = None
+    gain_e_dn: Annotated[Positive | None, Field(description="electrons per count; default: full well / 2^bits")] = None
     black_level_dn: NonNegative = 0.0
     quantum_efficiency: Annotated[float, Field(gt=0.0, le=1.0)] | QuantumEfficiency
-    dark_current_e_s: Annotated[NonNegative, Field(description="of a pixel at dark_temperature_c, electrons per s")]
+    dark_current_e_s: Annotated[NonNegative, Field(description="per pixel at dark_temperature_c, electrons/s")]
     dark_temperature_c: Annotated[float, Field(ge=-150.0, le=100.0)]
     dark_doubling_c: Annotated[float, Field(gt=0.0, le=50.0)] = 6.0
     temperature_c: Annotated[float | None, Field(ge=-150.0, le=80.0, description="default: dark_temperature_c")] = None
-    prnu: Annotated[float, Field(ge=0.0, le=0.1, description="RMS of the pixels' relative response")] = 0.01
-    shutter: Annotated[Literal["global", "frame-transfer"], Field(description="no rolling shutter")] = "global"
-    transfer_row_s: Annotated[NonNegative, Field(description="frame transfer: time under each row")] = 0.0
+    prnu: Annotated[float, Field(ge=0.0, le=0.1, description="RMS of the relative pixel response")] = 0.01
+    shutter: Annotated[Literal["global", "frame-transfer"], Field(description="rolling is not supported")] = "global"
+    transfer_row_s: Annotated[NonNegative, Field(description="frame transfer: shift time per row")] = 0.0
     rows: Annotated[int, Field(ge=16, le=16384, description="rows of a frame")]
-    readout_s: Annotated[NonNegative, Field(description="to read out a frame, s")]
+    readout_s: Annotated[NonNegative, Field(description="readout time of a frame, s")]
     exposure_s: Annotated[float | None, Field(gt=0.0, le=10.0, description="default: 60 % of full well at I/F 0.3")] = (
         None
     )
-    sun_au: Annotated[float, Field(gt=0.1, le=100.0, description="distance of the sun in use; sets exposure_s")] = 1.5
+    sun_au: Annotated[float, Field(gt=0.1, le=100.0, description="distance from the sun; sets exposure_s")] = 1.5
     lens: Lens
 
     @model_validator(mode="after")
     def _check_shutter(self) -> Datasheet:
         if (self.shutter == "frame-transfer") != (self.transfer_row_s > 0.0):
-            raise ValueError("transfer_row_s belongs to the shutter 'frame-transfer', which needs it above 0")
+            raise ValueError("transfer_row_s must be above 0 for the shutter 'frame-transfer', and 0 otherwise")
         return self
 
     def light(self) -> LightPath:
@@ -247,12 +247,12 @@ class Datasheet(Parameters):
         return LightPath(lens.f_number, self.pixel_pitch_um, lens.band_nm, None, lens.transmission, curve)
 
     def parameters(self) -> DetectorParameters:
-        """Create the parameters of the simulated detector, which reads every pixel."""
+        """Create the parameters of the simulated detector, which reads all pixels."""
         light = self.light()
         responsivity = light.responsivity_e_s(self.sun_au)
-        equal = {"sun_au", "transfer_row_s", "full_well_e", "read_noise_e", "bits", "dark_doubling_c"}
+        same_fields = {"sun_au", "transfer_row_s", "full_well_e", "read_noise_e", "bits", "dark_doubling_c"}
         return DetectorParameters(
-            **self.model_dump(include=equal),
+            **self.model_dump(include=same_fields),
             exposure_s=self.exposure_s or bright_exposure_s(self.full_well_e, responsivity),
             responsivity_e_s=responsivity,
             rows_summed=1,
@@ -268,36 +268,36 @@ class Datasheet(Parameters):
 
 
 def read_datasheet(path: str | Path) -> Datasheet:
-    """Read a datasheet from a TOML file; raises ValueError with file and field if it is unreadable or wrong."""
+    """Read a datasheet from a TOML file; raises ValueError with file and field if it cannot be read or is not valid."""
     try:
         with open_regular(path) as file:
             contents = file.read(_MAX_BYTES + 1)
-    except OSError as fault:
-        raise ValueError(f"{path}: cannot be read ({fault.strerror})") from fault
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
     if len(contents) > _MAX_BYTES:
-        raise ValueError(f"{path}: larger than {_MAX_BYTES >> 20} MiB; a datasheet in TOML is needed")
+        raise ValueError(f"{path}: larger than {_MAX_BYTES >> 20} MiB; expected a datasheet in TOML")
     try:
-        stated: dict[str, Any] = tomllib.loads(contents.decode("utf-8"))
-    except ValueError as fault:
-        raise ValueError(f"{path}: not valid TOML ({fault})") from fault
+        values: dict[str, Any] = tomllib.loads(contents.decode("utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: not valid TOML ({error})") from error
     try:
-        return Datasheet.model_validate(stated)
-    except ValidationError as fault:
-        first = fault.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "datasheet"
-        raise ValueError(f"{path}: {where}: {first['msg'].removeprefix('Value error, ')}") from fault
+        return Datasheet.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"]) or "datasheet"
+        raise ValueError(f"{path}: {key}: {first['msg'].removeprefix('Value error, ')}") from error
 
 
 def _resolve_detector(settings: object) -> object:
-    """Merge settings into those of a preset or a datasheet, if they name one."""
+    """Merge settings with those of the selected preset or datasheet, if there is one."""
     if isinstance(settings, str):
         settings = {"file": settings} if settings.endswith(".toml") else {"preset": settings}
     if not isinstance(settings, Mapping) or all(settings.get(key) is None for key in ("preset", "file")):
         return settings
-    if set(DetectorParameters.model_fields) <= set(settings):  # already resolved, and stored with the campaign
+    if set(DetectorParameters.model_fields) <= set(settings):  # already resolved: settings stored with a campaign
         return settings
     if {"preset", "file"} <= set(settings):
-        raise ValueError("a detector is a preset or a datasheet's file, not both")
+        raise ValueError("a detector is defined by a preset or by a datasheet file, not both")
     changes = {key: value for key, value in settings.items() if key not in ("preset", "file")}
     if "file" in settings:
         file = str(settings["file"])
@@ -305,35 +305,35 @@ def _resolve_detector(settings: object) -> object:
     return merge_settings(preset(str(settings["preset"])).detector.model_dump(), changes)
 
 
-#: Detector parameters of a campaign, stated by values or by changes to a preset or a datasheet:
-#: ``[parameters.detector]`` with ``preset = "mer-descent-field"`` and, say, ``temperature_c = 23.0``; or
+#: Detector parameters of a campaign, defined by values or by changes to a preset or datasheet:
+#: ``[parameters.detector]`` with ``preset = "mer-descent-field"`` and, for example, ``temperature_c = 23.0``; or
 #: ``file = "sensor.toml"``.
 DetectorChoice = Annotated[DetectorParameters, BeforeValidator(_resolve_detector)]
 
 
 Vector = tuple[float, float, float]
-_FILES = ("file", "number", "subframe_folded_in", "size")
+_FILE_KEYS = ("file", "number", "subframe_folded_in", "size")
 
 
 class CustomCamera(Parameters):
     """A camera of the CAHV family in the body frame: at its origin, looking along -z, columns along +x.
 
-    Stated as ``{ file = "camera.yaml" }`` (any format of `marsyard.sim.camera.read_cameras`) or the path alone; the
-    other fields are then filled in. The camera is mounted so that A looks down, independent of its pose in the file.
+    Defined by ``{ file = "camera.yaml" }`` (any format of `marsyard.sim.camera.read_cameras`) or by the path; the other
+    fields are then read from the file. The camera is mounted with A pointing down, independent of its pose in the file.
     """
 
     file: Annotated[str | None, Field(description="camera file that the model was read from")] = None
-    number: Annotated[int, Field(ge=0, description="which of the file's cameras, from 0")] = 0
-    subframe_folded_in: Annotated[bool, Field(description="PDS: a subframe's model is the stored picture's")] = False
-    model: Annotated[Literal["CAHV", "CAHVOR", "CAHVORE"], Field(description="filled in from the file")]
+    number: Annotated[int, Field(ge=0, description="index of the camera in the file, from 0")] = 0
+    subframe_folded_in: Annotated[bool, Field(description="PDS: the model includes the subframe offset")] = False
+    model: Annotated[Literal["CAHV", "CAHVOR", "CAHVORE"], Field(description="type of the model, read from the file")]
     columns: Annotated[int, Field(ge=16, le=16384)]
     rows: Annotated[int, Field(ge=16, le=16384)]
     h: Annotated[Vector, Field(description="horizontal image vector, pixels")]
     v: Annotated[Vector, Field(description="vertical image vector, pixels")]
     o: Annotated[Vector | None, Field(description="optical axis, unit vector")] = None
     r: Annotated[Vector | None, Field(description="radial distortion")] = None
-    e: Annotated[Vector | None, Field(description="the pupil's motion, m")] = None
-    linearity: Annotated[float | None, Field(description="of CAHVORE")] = None
+    e: Annotated[Vector | None, Field(description="entrance pupil shift coefficients, m")] = None
+    linearity: Annotated[float | None, Field(description="parameter of CAHVORE")] = None
 
     @model_validator(mode="after")
     def _check_camera(self) -> CustomCamera:
@@ -341,69 +341,69 @@ class CustomCamera(Parameters):
         return self
 
     def camera(self) -> CameraModel:
-        """Create the camera in the body frame. Raises ValueError if the model lacks a vector."""
+        """Create the camera in the body frame. Raises ValueError if a vector is missing."""
         pinhole = Cahv(np.zeros(3), np.array([0.0, 0.0, -1.0]), np.array(self.h), np.array(self.v), self.size)
         if self.model == "CAHV":
             return pinhole
         if self.o is None or self.r is None:
-            raise ValueError(f"{self.model} needs o and r")
+            raise ValueError(f"{self.model} requires o and r")
         if self.model == "CAHVOR":
             return Cahvor.from_cahv(pinhole, r=np.array(self.r), o=np.array(self.o))
         if self.e is None or self.linearity is None:
-            raise ValueError("CAHVORE needs e and linearity")
+            raise ValueError("CAHVORE requires e and linearity")
         r, e, o = (np.array(vector) for vector in (self.r, self.e, self.o))
         return Cahvore.from_cahv(pinhole, r, e, linearity=self.linearity, o=o)
 
     def input_files(self) -> tuple[str, ...]:
-        """The file that the camera was read from."""
+        """Return the file that the camera was read from."""
         return () if self.file is None else (self.file,)
 
     @property
     def size(self) -> tuple[int, int]:
-        """(columns, rows)."""
+        """Image size (columns, rows)."""
         return self.columns, self.rows
 
     @classmethod
-    def of(cls, camera: CameraModel, **origin: Any) -> CustomCamera:
-        """Create the parameters of a camera of any pose, mounted to look down."""
+    def from_camera(cls, camera: CameraModel, **origin: Any) -> CustomCamera:
+        """Create the parameters from a camera with any pose; the camera is mounted to look down."""
         mounted = mount_looking_down(camera)
-        length = float(np.linalg.norm(mounted.a))  # labels round A
+        length = float(np.linalg.norm(mounted.a))  # A in PDS labels is rounded and not exactly a unit vector
         vectors: dict[str, Any] = {
             letter: tuple((getattr(mounted, letter) / (length if letter in "hv" else 1.0)).tolist())
             for letter in "hvore"
             if hasattr(mounted, letter)
         }
         values = {"columns": mounted.size[0], "rows": mounted.size[1], "linearity": getattr(mounted, "linearity", None)}
-        # the classes' names are the models'
+        # class names equal model names
         return cls.model_validate({"model": type(mounted).__name__.upper(), **values, **vectors, **origin})
 
 
-def _read(stated: object) -> object:
-    """Read the camera file if a campaign names one; return other statements unchanged."""
-    if isinstance(stated, str | Path):
-        stated = {"file": str(stated)}
-    if not isinstance(stated, Mapping) or "model" in stated or not isinstance(stated.get("file"), str | Path):
-        return stated
-    unknown = [name for name in stated if name not in _FILES]
+def _resolve_camera(settings: object) -> object:
+    """Read the camera file if the settings contain one; return other settings unchanged."""
+    if isinstance(settings, str | Path):
+        settings = {"file": str(settings)}
+    if not isinstance(settings, Mapping) or "model" in settings or not isinstance(settings.get("file"), str | Path):
+        return settings
+    unknown = [name for name in settings if name not in _FILE_KEYS]
     if unknown:
-        raise ValueError(f"a camera file leaves nothing else to state than {', '.join(_FILES)}; given: {unknown[0]}")
-    path, number, folded = str(stated["file"]), stated.get("number", 0), stated.get("subframe_folded_in", False)
-    size = stated.get("size")
-    if size is not None and not (isinstance(size, list | tuple) and [type(one) for one in size] == [int, int]):
+        raise ValueError(f"unknown key {unknown[0]} for a camera file; allowed: {', '.join(_FILE_KEYS)}")
+    path, number, folded = str(settings["file"]), settings.get("number", 0), settings.get("subframe_folded_in", False)
+    size = settings.get("size")
+    if size is not None and not (isinstance(size, list | tuple) and [type(value) for value in size] == [int, int]):
         raise ValueError(f"{path}: size is {size!r}; allowed: [columns, rows]")
     cameras = read_cameras(path, subframe_folded_in=bool(folded), size=None if size is None else (size[0], size[1]))
     if not (isinstance(number, int) and 0 <= number < len(cameras)):
-        raise ValueError(f"{path}: holds {len(cameras)} cameras; number may be 0 to {len(cameras) - 1}, not {number!r}")
-    if len(cameras) > 1 and "number" not in stated:
-        raise ValueError(f"{path}: holds {len(cameras)} cameras; choose one with number, 0 to {len(cameras) - 1}")
-    return CustomCamera.of(cameras[number], file=path, number=number, subframe_folded_in=bool(folded))
+        raise ValueError(f"{path}: number is {number!r}; allowed: 0 to {len(cameras) - 1}")
+    if len(cameras) > 1 and "number" not in settings:
+        raise ValueError(f"{path}: contains {len(cameras)} cameras; set number, 0 to {len(cameras) - 1}")
+    return CustomCamera.from_camera(cameras[number], file=path, number=number, subframe_folded_in=bool(folded))
 
 
-def _read_camera_path(stated: object) -> object:
-    """Return a preset's name unchanged; read a path, which has a suffix or a folder."""
-    return stated if isinstance(stated, str) and not Path(stated).suffix and "/" not in stated else _read(stated)
+def _resolve_camera_or_preset(value: object) -> object:
+    """Return the name of a preset unchanged; read a camera file, whose path has a suffix or a folder."""
+    return value if isinstance(value, str) and not Path(value).suffix and "/" not in value else _resolve_camera(value)
 
 
-#: A user camera in a campaign; and a user camera or a preset's name.
-CustomCameraChoice = Annotated[CustomCamera, BeforeValidator(_read)]
-NamedOrCustomCamera = Annotated[str | CustomCamera, BeforeValidator(_read_camera_path)]
+#: Custom camera in a campaign; and custom camera or name of a preset.
+CustomCameraChoice = Annotated[CustomCamera, BeforeValidator(_resolve_camera)]
+NamedOrCustomCamera = Annotated[str | CustomCamera, BeforeValidator(_resolve_camera_or_preset)]

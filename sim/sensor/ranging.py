@@ -1,8 +1,8 @@
-"""Ranging instruments: common errors, laser ranges along a ray, the radar altimeter, and the true height above ground.
+"""Ranging instruments: common errors, laser ranges along a ray, radar altimeter, and true height above ground.
 
-The radar reads the range to the nearest ground within a cone fixed to the body: over a slope the foot of the
-perpendicular, over relief the nearest crest, and at tilts beyond the beam's half width the beam's edge. The ground's
-reflectivity and the antenna pattern are not modelled.
+The radar measures the range to the nearest ground within a cone fixed to the body. The nearest point is the foot of the
+perpendicular over a slope, the nearest crest over relief, and at the edge of the beam if the tilt exceeds half the beam
+width. Ground reflectivity and antenna pattern are not modelled.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from marsyard.sim.sensor.imu import Vector
 from marsyard.sim.sensor.instrument import Clock, ClockParameters, Readings, Sampling, Times
 from marsyard.sim.terrain import Surface
 
-#: Pointing of an altimeter in body axes: down at the identity attitude, as the descent camera.
+#: Pointing of an altimeter in body axes: down at the identity attitude, like the descent camera.
 DOWN = np.array([0.0, 0.0, -1.0])
-MIN_POINTS = 64  #: Minimum number of points along a laser ray at which it is compared with the ground.
-#: Radar: step of the coarsest grid over the height, refinement of each further grid, and number of grids.
+MIN_POINTS = 64  #: Minimum number of points along a laser ray that are compared with the ground.
+#: Radar: step of the coarsest grid / height, refinement factor of each next grid, and number of grids.
 COARSEST_STEP, REFINEMENT, PASSES = 1.0 / 64.0, 5, 3
-#: Ground around a node may be nearer than the node by this plus the node's slope, times the step.
+#: Bound on nearer ground around a node: this value plus the slope at the node, times the step.
 RELIEF_PER_STEP = 0.2
 MAX_SLOPE = 3.0  #: Maximum slope of the ground in the radar's search.
 
@@ -39,12 +39,12 @@ class RangingParameters(Parameters):
     """Errors of a ranging instrument; fractions of the range are one standard deviation."""
 
     rate_hz: Annotated[float, Field(gt=0.0, le=10000.0, description="readings per second")] = 10.0
-    scale_error: Annotated[_Fraction, Field(description="fraction of the range, constant for a unit")] = 0.0
-    noise: Annotated[_Fraction, Field(description="fraction of the range, new in every reading")] = 0.0
-    noise_m: Annotated[_Metres, Field(description="at any range, new in every reading, m")] = 0.0
-    count_m: Annotated[_Metres, Field(description="range of a count, m; 0: no rounding")] = 0.0
-    min_range_m: Annotated[float, Field(ge=0.0, description="shortest range that is read, m")] = 0.0
-    max_range_m: Annotated[float, Field(gt=0.0, le=20000.0, description="longest range that is read, m")] = 5000.0
+    scale_error: Annotated[_Fraction, Field(description="fraction of the range, constant")] = 0.0
+    noise: Annotated[_Fraction, Field(description="fraction of the range, per reading")] = 0.0
+    noise_m: Annotated[_Metres, Field(description="independent of range, per reading, m")] = 0.0
+    count_m: Annotated[_Metres, Field(description="resolution, m; 0: no rounding")] = 0.0
+    min_range_m: Annotated[float, Field(ge=0.0, description="minimum range, m")] = 0.0
+    max_range_m: Annotated[float, Field(gt=0.0, le=20000.0, description="maximum range, m")] = 5000.0
     clock: ClockParameters = ClockParameters()
 
     @model_validator(mode="after")
@@ -59,9 +59,9 @@ class LaserParameters(RangingParameters):
     """A laser altimeter. Defaults: a surveying laser on a small helicopter, assumed."""
 
     rate_hz: Annotated[float, Field(gt=0.0, le=10000.0, description="readings per second")] = 50.0
-    noise_m: Annotated[_Metres, Field(description="at any range, new in every reading, m")] = 0.05
-    count_m: Annotated[_Metres, Field(description="range of a count, m; 0: no rounding")] = 0.01
-    max_range_m: Annotated[float, Field(gt=0.0, le=20000.0, description="longest range that is read, m")] = 300.0
+    noise_m: Annotated[_Metres, Field(description="independent of range, per reading, m")] = 0.05
+    count_m: Annotated[_Metres, Field(description="resolution, m; 0: no rounding")] = 0.01
+    max_range_m: Annotated[float, Field(gt=0.0, le=20000.0, description="maximum range, m")] = 300.0
     beam_mrad: Annotated[float, Field(ge=0.0, le=50.0, description="full width of the beam, mrad")] = 0.0
     clock: ClockParameters = ClockParameters(offset_sd_s=0.002, jitter_sd_s=0.0005)
 
@@ -73,16 +73,16 @@ class RadarParameters(RangingParameters):
     """
 
     beam_deg: Annotated[float, Field(gt=0.0, lt=180.0, description="full width of the beam, deg")] = 60.0
-    scale_error: Annotated[_Fraction, Field(description="fraction of the range, constant for a unit")] = 0.003
-    noise: Annotated[_Fraction, Field(description="fraction of the range, new in every reading")] = 0.0015
-    count_m: Annotated[_Metres, Field(description="range of a count, m; 0: no rounding")] = 0.3
-    min_range_m: Annotated[float, Field(ge=0.0, description="shortest range that is read, m")] = 5.0
+    scale_error: Annotated[_Fraction, Field(description="fraction of the range, constant")] = 0.003
+    noise: Annotated[_Fraction, Field(description="fraction of the range, per reading")] = 0.0015
+    count_m: Annotated[_Metres, Field(description="resolution, m; 0: no rounding")] = 0.3
+    min_range_m: Annotated[float, Field(ge=0.0, description="minimum range, m")] = 5.0
     clock: ClockParameters = ClockParameters(offset_sd_s=0.002, jitter_sd_s=0.001)
 
 
 @dataclass(frozen=True)
 class RangingUnit:
-    """A ranging instrument with its constant errors drawn; `scale` is the noise-free ratio of read to true range."""
+    """A ranging instrument with its constant errors; `scale` is the noise-free ratio of measured to true range."""
 
     parameters: RangingParameters
     sampling: Sampling
@@ -109,7 +109,7 @@ class RangingUnit:
 
 
 def range_along(surface: Surface, position_m: Vector, axis: Vector, max_range_m: float) -> float:
-    """Intersect a ray with the terrain, compared at least once per sample; return the range, or infinity."""
+    """Intersect a ray with the terrain, with at least one point per terrain sample; return the range, or infinity."""
     horizontal_m = float(np.hypot(axis[0], axis[1])) * max_range_m
     count = MIN_POINTS + int(np.ceil(horizontal_m / surface.spacing_m))
 
@@ -145,7 +145,7 @@ class RadarAltimeter:
         return self.unit.sampling
 
     def measure(self, trajectory: Trajectory, times_s: Times, rng: Generator) -> Readings:
-        """Read one range to the nearest ground within the beam per true time."""
+        """Measure the range to the nearest ground within the beam at each true time."""
         motion, p = trajectory.motion(times_s), self.parameters
         axes = motion.attitudes.apply(DOWN.copy())
         half_angle = np.radians(0.5 * p.beam_deg)
@@ -164,57 +164,57 @@ def first_return(
     - position_m, axis: apex of the cone and unit vector along it, world axes
     - half_angle_rad: angle between the cone's axis and its edge
 
-    Ground within a distance r lies, in plan view, within r sin(a) of the apex, a being the cone's maximum angle from
-    nadir. A grid over that square gives the nearest ground to a few metres; finer grids around the candidate nodes give
-    it to 0.05 % of the height. The square grows until it contains all ground nearer than the range.
+    In plan view, ground within a distance r is within r sin(a) of the apex; a is the maximum angle of the cone from
+    nadir. A grid over this square gives the range with an error of a few metres. Finer grids around candidate nodes
+    reduce the error to 0.05 % of the height. The square is enlarged until it contains all ground nearer than the range.
     """
     clearance = position_m[2] - float(surface.height(float(position_m[0]), float(position_m[1])))
     if clearance <= 0.0:
         return 0.0
     tilt = float(np.arccos(np.clip(-axis[2], -1.0, 1.0)))
-    widest = np.sin(min(tilt + half_angle_rad, 0.5 * np.pi))
-    nearest_angle = max(tilt - half_angle_rad, 0.0)
-    reach = min(1.2 * clearance / max(np.cos(nearest_angle), 0.05), max_range_m)
+    max_sine = np.sin(min(tilt + half_angle_rad, 0.5 * np.pi))
+    min_angle = max(tilt - half_angle_rad, 0.0)
+    search_range = min(1.2 * clearance / max(np.cos(min_angle), 0.05), max_range_m)
     while True:
-        # the step grows with the reach, which bounds the number of nodes
-        step = COARSEST_STEP * max(clearance, 0.5 * reach)
-        nearest = _search(surface, position_m, axis, half_angle_rad, step, reach * widest)
-        if nearest <= reach or reach >= max_range_m:
+        # the step grows with the search range, which limits the number of nodes
+        step = COARSEST_STEP * max(clearance, 0.5 * search_range)
+        nearest = _search_nearest_ground(surface, position_m, axis, half_angle_rad, step, search_range * max_sine)
+        if nearest <= search_range or search_range >= max_range_m:
             return nearest if nearest <= max_range_m else np.inf
-        reach = min(max(2.0 * reach, nearest if np.isfinite(nearest) else 0.0), max_range_m)
+        search_range = min(max(2.0 * search_range, nearest if np.isfinite(nearest) else 0.0), max_range_m)
 
 
-def _search(
+def _search_nearest_ground(
     surface: Surface, position_m: Vector, axis: Vector, half_angle_rad: float, step_m: float, half_side_m: float
 ) -> float:
-    """Range to the nearest ground within a cone and, in plan view, within a square; infinite if there is none."""
+    """Compute the range to the nearest ground within a cone and, in plan view, a square; infinite if there is none."""
     line = np.arange(-np.ceil(half_side_m / step_m), np.ceil(half_side_m / step_m) + 1.0) * step_m
     offsets = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     nearest = np.inf
     for number in range(PASSES):
-        # range to the ground at the offsets, smoothed to the step, and its angle from the axis
+        # range to the ground (smoothed to the step) at the offsets, and angle from the axis
         level = int(min(np.floor(np.log2(max(step_m / surface.spacing_m, 1.0))), len(surface.levels) - 1))
         x, y = position_m[0] + offsets[:, 0], position_m[1] + offsets[:, 1]
         down = position_m[2] - surface.height(x, y, level)
         ranges = np.sqrt(offsets[:, 0] ** 2 + offsets[:, 1] ** 2 + down**2)
-        along = offsets[:, 0] * axis[0] + offsets[:, 1] * axis[1] - down * axis[2]
-        angles = np.arccos(np.clip(along / ranges, -1.0, 1.0))
-        inside = angles <= half_angle_rad
-        if inside.any():
-            nearest = float(ranges[inside].min())
+        axial = offsets[:, 0] * axis[0] + offsets[:, 1] * axis[1] - down * axis[2]
+        angles = np.arccos(np.clip(axial / ranges, -1.0, 1.0))
+        in_cone = angles <= half_angle_rad
+        if in_cone.any():
+            nearest = float(ranges[in_cone].min())
         if number == PASSES - 1:
             return nearest
-        # candidates: nodes within half a step of the cone whose surroundings may hold nearer ground
+        # candidates: nodes within a step of the cone, with possibly nearer ground around them
         candidates = (angles <= half_angle_rad + step_m / ranges) & (
             ranges <= nearest + (RELIEF_PER_STEP + MAX_SLOPE) * step_m
         )
         slopes = np.linalg.norm(surface.gradient(x[candidates], y[candidates], level), axis=-1)
-        near = ranges[candidates] <= nearest + (RELIEF_PER_STEP + slopes) * step_m
-        offsets = offsets[candidates][near]
-        # each node with its neighbours of a finer grid
+        may_be_nearest = ranges[candidates] <= nearest + (RELIEF_PER_STEP + slopes) * step_m
+        offsets = offsets[candidates][may_be_nearest]
+        # replace each node by the nodes of a finer grid around it
         step_m /= REFINEMENT
-        fine = (np.arange(REFINEMENT) - 0.5 * (REFINEMENT - 1)) * step_m
-        neighbours = np.stack(np.meshgrid(fine, fine), axis=-1).reshape(-1, 2)
+        fine_line = (np.arange(REFINEMENT) - 0.5 * (REFINEMENT - 1)) * step_m
+        neighbours = np.stack(np.meshgrid(fine_line, fine_line), axis=-1).reshape(-1, 2)
         offsets = np.asarray((offsets[:, None, :] + neighbours).reshape(-1, 2))
         if not offsets.size:
             return nearest
@@ -222,5 +222,5 @@ def _search(
 
 
 def height_above_ground(surface: Surface, positions_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
-    """Compute the true altitude: height above the ground straight below."""
+    """Compute the true altitude: height above the ground vertically below."""
     return np.asarray(positions_m[:, 2] - surface.height(positions_m[:, 0], positions_m[:, 1]))

@@ -1,8 +1,8 @@
-"""Satellite navigation receivers: GPS positions, and an RTK receiver with positions, velocities and their deviations.
+"""Satellite navigation receivers: GPS (positions), and RTK (positions, velocities and reported deviations).
 
-An RTK receiver compares carrier phases with a base station. Its solution is *fixed* while the phase ambiguities are
-known as integers, and *floating* otherwise; each type has its own time-correlated and white errors. The receiver
-changes between them at random times and delivers nothing during an outage. Antennas are at the body's origin.
+An RTK receiver compares carrier phases with a base station. Its solution is *fixed* while the integer phase
+ambiguities are resolved, and *floating* otherwise; each type has separate time-correlated and white errors. The type
+changes at random times. There are no solutions during an outage. Antennas are at the origin of the body frame.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ class GpsParameters(Parameters):
     """A GPS receiver. Spreads are one standard deviation per axis."""
 
     rate_hz: Annotated[float, Field(gt=0.0, le=1000.0, description="fixes per second")] = 10.0
-    horizontal_noise_m: Annotated[NonNegative, Field(description="new in every fix, m")] = 0.3
-    vertical_noise_m: Annotated[NonNegative, Field(description="new in every fix, m")] = 0.6
+    horizontal_noise_m: Annotated[NonNegative, Field(description="white noise per fix, m")] = 0.3
+    vertical_noise_m: Annotated[NonNegative, Field(description="white noise per fix, m")] = 0.6
     horizontal_wander_m: Annotated[NonNegative, Field(description="time-correlated error, m")] = 1.5
     vertical_wander_m: Annotated[NonNegative, Field(description="time-correlated error, m")] = 3.0
     correlation_s: Annotated[float, Field(gt=0.0, description="correlation time, s")] = 300.0
-    latency_s: Annotated[float, Field(ge=0.0, le=10.0, description="from a fix to its delivery, s")] = 0.1
+    latency_s: Annotated[float, Field(ge=0.0, le=10.0, description="delay from fix to delivery, s")] = 0.1
     clock: ClockParameters = ClockParameters()
 
 
-#: Carrier phases post-processed with precise orbits, in flight (the class of GIPSY-OASIS II).
+#: Carrier-phase positions, post-processed with precise orbits (class of GIPSY-OASIS II).
 POST_PROCESSED = GpsParameters(
     rate_hz=1.0, horizontal_noise_m=0.02, vertical_noise_m=0.03, horizontal_wander_m=0.05, vertical_wander_m=0.1,
     correlation_s=600.0, latency_s=0.0,
@@ -46,7 +46,7 @@ POST_PROCESSED = GpsParameters(
 
 @dataclass(frozen=True)
 class Gps:
-    """A GPS receiver with its time-correlated error over a time span drawn."""
+    """A GPS receiver with time-correlated errors drawn for a time span."""
 
     parameters: GpsParameters
     sampling: Sampling
@@ -62,7 +62,7 @@ class Gps:
         return cls(p, sampling, clock, GaussMarkov.draw(sd, p.correlation_s, span_s, rng))
 
     def measure(self, trajectory: Trajectory, times_s: Times, rng: Generator) -> Readings:
-        """Measure one position per true time, world axes; it is delivered `latency_s` after that time."""
+        """Measure one position per true time, world axes; delivery is `latency_s` later."""
         p = self.parameters
         tags = self.clock.tags(times_s, rng)
         sd = np.array([p.horizontal_noise_m, p.horizontal_noise_m, p.vertical_noise_m])
@@ -74,7 +74,7 @@ class SolutionErrors(Parameters):
     """Errors of one type of solution, one standard deviation along east, north and up."""
 
     wander_m: Annotated[PerAxis, Field(description="time-correlated error, m")]
-    noise_m: Annotated[PerAxis, Field(description="new in every solution, m")]
+    noise_m: Annotated[PerAxis, Field(description="white noise per solution, m")]
     correlation_s: Annotated[Positive, Field(le=10000.0, description="correlation time, s")]
 
     @property
@@ -90,34 +90,34 @@ _FLOATING = SolutionErrors(wander_m=(0.42, 0.55, 0.8), noise_m=(0.03, 0.03, 0.05
 class Outage(Parameters):
     """An interval without solutions."""
 
-    start_s: Annotated[float, Field(description="true time at which it begins, s")]
-    duration_s: Annotated[Positive, Field(description="how long it lasts, s")]
+    start_s: Annotated[float, Field(description="true start time, s")]
+    duration_s: Annotated[Positive, Field(description="duration, s")]
 
 
 class RtkParameters(Parameters):
     """An RTK receiver of the class of NovAtel's RT2.
 
-    Fixed: 2 cm, the class's specification. Floating: within the deviations of the landing paper's Table II, 0.35 to
-    0.7 m. All other values are assumed.
+    Fixed: 2 cm, the specification of this class. Floating: within the deviations in Table II of the landing paper, 0.35
+    to 0.7 m. All other values are assumed.
     """
 
     rate_hz: Annotated[Positive, Field(le=100.0, description="solutions per second")] = 10.0
-    latency_s: Annotated[float, Field(ge=0.0, le=2.0, description="from a solution's time to its delivery, s")] = 0.07
+    latency_s: Annotated[float, Field(ge=0.0, le=2.0, description="delay from solution to delivery, s")] = 0.07
     fixed: SolutionErrors = _FIXED
     floating: SolutionErrors = _FLOATING
     float_fraction: Annotated[Fraction, Field(description="fraction of the time with a floating solution")] = 0.1
     float_s: Annotated[Positive, Field(description="mean duration of a floating solution, s")] = 60.0
-    velocity_noise_m_s: Annotated[PerAxis, Field(description="of velocity, new in every solution")] = (0.03, 0.03, 0.05)
+    velocity_noise_m_s: Annotated[PerAxis, Field(description="velocity noise per solution")] = (0.03, 0.03, 0.05)
     velocity_wander_m_s: Annotated[PerAxis, Field(description="velocity wander, m/s")] = (0.01, 0.01, 0.02)
     velocity_correlation_s: Annotated[Positive, Field(description="correlation time of the velocity error, s")] = 10.0
-    reported_spread: Annotated[Fraction, Field(description="spread of log(reported / true deviation) per flight")] = 0.1
+    reported_spread: Annotated[Fraction, Field(description="sd of log(reported / true deviation)")] = 0.1
     outages: Annotated[tuple[Outage, ...], Field(description="times without solutions")] = ()
     clock: ClockParameters = ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0002)
 
     @model_validator(mode="after")
     def _check_fixed_duration(self) -> RtkParameters:
         if 0.0 < self.float_fraction < 1.0 and self.float_s * (1.0 / self.float_fraction - 1.0) < 1.0 / self.rate_hz:
-            raise ValueError(f"a float_fraction of {self.float_fraction} leaves fixed solutions less than one reading")
+            raise ValueError(f"float_fraction {self.float_fraction} makes fixed solutions shorter than one reading")
         return self
 
 
@@ -126,7 +126,7 @@ class RtkSolutions:
     """Solutions of an RTK receiver, delivered `latency_s` after their time.
 
     - positions_m, velocities_m_s: world axes; NaN during an outage
-    - reported_m: the receiver's own estimate of its position's standard deviation, east, north and up
+    - reported_m: standard deviation of the position reported by the receiver, east, north and up
     - fixed: whether the solution is fixed
     """
 
@@ -139,9 +139,9 @@ class RtkSolutions:
 
 @dataclass(frozen=True)
 class RtkReceiver:
-    """An RTK receiver with its time-correlated errors over a time span drawn.
+    """An RTK receiver with time-correlated errors drawn for a time span.
 
-    - first_floating, changes_s: whether the first solution floats, and the true times of the changes
+    - starts_floating, changes_s: whether the first solution is floating, and true times of the type changes
     - reported_factor: ratio of the reported to the true standard deviation
     """
 
@@ -151,7 +151,7 @@ class RtkReceiver:
     fixed_wander: GaussMarkov
     floating_wander: GaussMarkov
     velocity_wander: GaussMarkov
-    first_floating: bool
+    starts_floating: bool
     changes_s: Times = field(repr=False)
     reported_factor: float
 
@@ -160,9 +160,9 @@ class RtkReceiver:
         """Draw the errors for use within a time span."""
         p = parameters
         floating = bool(rng.random() < p.float_fraction)
-        fixed, unfixed, velocity = (
-            GaussMarkov.draw(np.array(sd), time, span_s, rng)
-            for sd, time in (
+        fixed_wander, floating_wander, velocity_wander = (
+            GaussMarkov.draw(np.array(sd), correlation_s, span_s, rng)
+            for sd, correlation_s in (
                 (p.fixed.wander_m, p.fixed.correlation_s),
                 (p.floating.wander_m, p.floating.correlation_s),
                 (p.velocity_wander_m_s, p.velocity_correlation_s),
@@ -171,40 +171,40 @@ class RtkReceiver:
         sampling, clock = Sampling.draw(p.rate_hz, rng), Clock.draw(p.clock, rng)
         changes = _draw_changes(p, floating, span_s, rng)
         factor = float(np.exp(p.reported_spread * rng.standard_normal()))
-        return cls(p, sampling, clock, fixed, unfixed, velocity, floating, changes, factor)
+        return cls(p, sampling, clock, fixed_wander, floating_wander, velocity_wander, floating, changes, factor)
 
-    def floats(self, times_s: Times) -> Bool[np.ndarray, "n"]:
-        """Return whether the solution floats at true times."""
-        changed = np.searchsorted(self.changes_s, times_s, side="right") % 2 == 1
-        return np.asarray(changed != self.first_floating)
+    def is_floating(self, times_s: Times) -> Bool[np.ndarray, "n"]:
+        """Return whether the solution is floating at true times."""
+        is_odd_change = np.searchsorted(self.changes_s, times_s, side="right") % 2 == 1
+        return np.asarray(is_odd_change != self.starts_floating)
 
     def measure(self, trajectory: Trajectory, times_s: Times, rng: Generator) -> RtkSolutions:
         """Compute one solution per true time."""
         p = self.parameters
-        motion, floating = trajectory.motion(times_s), self.floats(times_s)[:, None]
+        motion, floating = trajectory.motion(times_s), self.is_floating(times_s)[:, None]
         tags = self.clock.tags(times_s, rng)
         shocks = rng.standard_normal((times_s.size, 6))
         wander = np.where(floating, self.floating_wander.at(times_s), self.fixed_wander.at(times_s))
         noise = np.where(floating, p.floating.noise_m, p.fixed.noise_m)
         positions = motion.positions_m + wander + noise * shocks[:, :3]
         velocities = motion.velocities_m_s + self.velocity_wander.at(times_s) + p.velocity_noise_m_s * shocks[:, 3:]
-        for one in p.outages:
-            missing = (times_s >= one.start_s) & (times_s < one.start_s + one.duration_s)
+        for outage in p.outages:
+            missing = (times_s >= outage.start_s) & (times_s < outage.start_s + outage.duration_s)
             positions[missing], velocities[missing] = np.nan, np.nan
         reported = self.reported_factor * np.where(floating, p.floating.total_m, p.fixed.total_m)
         return RtkSolutions(tags, positions, velocities, reported, ~floating[:, 0])
 
 
 def _draw_changes(p: RtkParameters, floating: bool, span_s: tuple[float, float], rng: Generator) -> Times:
-    """Draw the times at which the type of solution changes: exponential durations, a stationary process."""
+    """Draw the times at which the type of solution changes: a stationary process with exponential durations."""
     if p.float_fraction in (0.0, 1.0):
         return np.zeros(0)
-    means = {True: p.float_s, False: p.float_s * (1.0 / p.float_fraction - 1.0)}
+    mean_durations = {True: p.float_s, False: p.float_s * (1.0 / p.float_fraction - 1.0)}
     times: list[float] = []
-    now = span_s[0]
+    time = span_s[0]
     while True:
-        now += means[floating] * float(rng.standard_exponential())
-        if now > span_s[1]:
+        time += mean_durations[floating] * float(rng.standard_exponential())
+        if time > span_s[1]:
             return np.array(times)
-        times.append(now)
+        times.append(time)
         floating = not floating

@@ -1,9 +1,9 @@
-"""Magnetic compass with inclinometers: heading and direction upwards.
+"""Magnetic compass with inclinometers: heading and up direction.
 
-The inclinometers are damped pendulums that follow the specific force with a lag: they show gravity only without
-acceleration of the vehicle. The compass levels the magnetic field by the inclinometers: in an inclined field every
-tilt error causes a heading error. Iron on board adds errors that vary with the heading: with its sine for magnetised
-(hard) iron, with the sine of twice the heading for magnetisable (soft) iron.
+The inclinometers are damped pendulums that follow the specific force with a lag: they measure the direction of gravity
+only if the vehicle does not accelerate. The compass levels the magnetic field with the inclinometers: in an inclined
+field each tilt error causes a heading error. Iron in the vehicle adds errors that vary with the heading: with its sine
+for magnetised (hard) iron, and with the sine of twice the heading for magnetisable (soft) iron.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from marsyard.sim.sensor.imu import Vectors
 from marsyard.sim.sensor.instrument import Clock, ClockParameters, Sampling, Times
 
 Degrees = Annotated[NonNegative, Field(le=90.0)]
-LAG_STEPS_PER_S = 100.0  #: Steps of the lag per second: twenty within the default time constant.
+LAG_STEPS_PER_S = 100.0  #: Steps of the lag filter per second: twenty per default time constant.
 SETTLED = 12.0  #: Settling time in time constants: a residual of 6e-6.
 Readings = Float64[np.ndarray, "n *one"]
 
@@ -31,19 +31,19 @@ class TiltCompassParameters(Parameters):
     """A unit of the class of Precision Navigation's TCM2; spreads are one standard deviation.
 
     Specification of the class: 0.2 deg in tilt, 1 deg in heading, 16 readings per second, counts of 0.1 deg. Assumed:
-    their split into error terms, the lag and the vehicle's effects.
+    the split into error terms, the lag and the effects of the vehicle.
     """
 
     rate_hz: Annotated[float, Field(gt=0.0, le=100.0, description="readings per second")] = 16.0
-    tilt_bias_deg: Annotated[Degrees, Field(description="constant error of each inclinometer, mounting included")] = 0.2
-    tilt_noise_deg: Annotated[Degrees, Field(description="of each inclinometer, new in every reading")] = 0.15
+    tilt_bias_deg: Annotated[Degrees, Field(description="inclinometer bias, mounting included")] = 0.2
+    tilt_noise_deg: Annotated[Degrees, Field(description="inclinometer noise per reading")] = 0.15
     lag_s: Annotated[float, Field(gt=0.0, le=5.0, description="time constant of the inclinometers, s")] = 0.2
-    heading_bias_deg: Annotated[Degrees, Field(description="constant error, mounting and declination included")] = 0.8
-    hard_iron_deg: Annotated[Degrees, Field(description="amplitude of the error once round, per component")] = 0.5
-    soft_iron_deg: Annotated[Degrees, Field(description="amplitude of the error twice round, per component")] = 0.25
-    heading_noise_deg: Annotated[Degrees, Field(description="new in every reading")] = 0.3
-    dip_deg: Annotated[float, Field(ge=-85.0, le=85.0, description="of the magnetic field below the horizon")] = 59.0
-    count_deg: Annotated[Degrees, Field(description="of the heading, deg; 0: no rounding")] = 0.1
+    heading_bias_deg: Annotated[Degrees, Field(description="heading bias, mounting and declination included")] = 0.8
+    hard_iron_deg: Annotated[Degrees, Field(description="amplitude per sine and cosine of heading")] = 0.5
+    soft_iron_deg: Annotated[Degrees, Field(description="same for twice the heading")] = 0.25
+    heading_noise_deg: Annotated[Degrees, Field(description="heading noise per reading")] = 0.3
+    dip_deg: Annotated[float, Field(ge=-85.0, le=85.0, description="magnetic field below the horizon, deg")] = 59.0
+    count_deg: Annotated[Degrees, Field(description="heading resolution, deg; 0: no rounding")] = 0.1
     heading_stuck_s: Annotated[float | None, Field(description="true time after which the heading is stuck")] = None
     tilt_stuck_s: Annotated[float | None, Field(description="true time after which the inclinometers are stuck")] = None
     clock: ClockParameters = ClockParameters(offset_sd_s=0.005, jitter_sd_s=0.002)
@@ -53,7 +53,7 @@ class TiltCompassParameters(Parameters):
 class TiltCompassReadings:
     """Readings of a tilt compass.
 
-    - up_body: direction upwards by the inclinometers, unit vectors in body axes
+    - up_body: up direction from the inclinometers, unit vectors in body axes
     - headings_rad: azimuth of the body's x axis, clockwise from north, in [0, 2 pi)
     """
 
@@ -64,10 +64,10 @@ class TiltCompassReadings:
 
 @dataclass(frozen=True)
 class TiltCompass:
-    """A tilt compass with its constant errors drawn.
+    """A tilt compass with its constant errors.
 
-    - tilt_bias_rad: error of the x and y components of the direction upwards
-    - iron_rad: amplitudes of the sine and cosine of the heading, then of twice the heading
+    - tilt_bias_rad: error of the x and y components of the up direction
+    - iron_rad: amplitudes of sine and cosine of the heading, and of sine and cosine of twice the heading
     """
 
     parameters: TiltCompassParameters
@@ -92,31 +92,31 @@ class TiltCompass:
         )
 
     def measure(self, trajectory: Trajectory, times_s: Times, rng: np.random.Generator) -> TiltCompassReadings:
-        """Measure one reading per true time; times must not decrease. The unit is settled at the trajectory's start."""
+        """Measure one reading per true time (non-decreasing); pendulums are settled at the start of the trajectory."""
         p = self.parameters
         lagged = self._lagged_up(trajectory, times_s)
         tags = self.clock.tags(times_s, rng)
-        shocks = rng.standard_normal((times_s.size, 3))
+        noise = rng.standard_normal((times_s.size, 3))
         levelled = _add_offset(lagged, self.tilt_bias_rad)
-        # azimuths from the magnetic field, levelled by the measured directions
+        # azimuths from the magnetic field, levelled with the measured up directions
         dip = np.radians(p.dip_deg)
         attitudes = trajectory.motion(times_s).attitudes
         magnetic = attitudes.inv().apply(np.array([0.0, np.cos(dip), -np.sin(dip)]))
         north = _normalize(magnetic - np.sum(magnetic * levelled, axis=1)[:, None] * levelled)
         azimuths = np.arctan2(np.cross(north, levelled)[:, 0], north[:, 0])
-        headings = azimuths + self.deviation_rad(azimuths) + np.radians(p.heading_noise_deg) * shocks[:, 2]
+        headings = azimuths + self.deviation_rad(azimuths) + np.radians(p.heading_noise_deg) * noise[:, 2]
         if p.count_deg > 0.0:
             headings = np.radians(p.count_deg) * np.rint(headings / np.radians(p.count_deg))
-        up = _hold(_add_offset(levelled, np.radians(p.tilt_noise_deg) * shocks[:, :2]), times_s, p.tilt_stuck_s)
+        up = _hold(_add_offset(levelled, np.radians(p.tilt_noise_deg) * noise[:, :2]), times_s, p.tilt_stuck_s)
         return TiltCompassReadings(tags, up, _hold(np.mod(headings, 2.0 * np.pi), times_s, p.heading_stuck_s))
 
     def deviation_rad(self, azimuths_rad: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
-        """Noise-free heading error of a level unit at rest, at true azimuths."""
+        """Compute the noise-free heading error of a level unit at rest, at true azimuths."""
         harmonics = np.stack([f(k * azimuths_rad) for k in (1.0, 2.0) for f in (np.sin, np.cos)])
         return np.asarray(self.heading_bias_rad + self.iron_rad @ harmonics)
 
     def _lagged_up(self, trajectory: Trajectory, times_s: Times) -> Vectors:
-        """Directions of the pendulums: the specific force's with a lag."""
+        """Compute the directions of the pendulums: specific force with a lag."""
         if times_s.size == 0:
             return np.zeros((0, 3))
         lag = self.parameters.lag_s
@@ -126,10 +126,10 @@ class TiltCompass:
         force = _normalize(trajectory.motion(grid).specific_forces_m_s2)
         if grid.size == 1:
             return np.repeat(force, times_s.size, axis=0)
-        # exact for a force that is constant in each step
+        # exact for a specific force that is constant in each step
         decay = np.exp(-(grid[1] - grid[0]) / lag)
-        middle = 0.5 * (force[1:] + force[:-1])
-        filtered, _ = scipy.signal.lfilter([1.0 - decay], [1.0, -decay], middle, axis=0, zi=decay * force[:1])
+        mean_force = 0.5 * (force[1:] + force[:-1])
+        filtered, _ = scipy.signal.lfilter([1.0 - decay], [1.0, -decay], mean_force, axis=0, zi=decay * force[:1])
         filtered = np.concatenate([force[:1], filtered])
         return _normalize(np.stack([np.interp(times_s, grid, column) for column in filtered.T], axis=1))
 
@@ -145,10 +145,10 @@ def _add_offset(up: Vectors, offset: Float64[np.ndarray, "*any 2"]) -> Vectors:
 
 
 def _hold(values: Readings, times_s: Times, stuck_s: float | None) -> Readings:
-    """Repeat the last value before a time (or the first) at all later times."""
+    """Repeat the last value before `stuck_s` (or the first value) at all later times."""
     if stuck_s is None or values.size == 0:
         return values
-    held = values.copy()
+    stuck_values = values.copy()
     last = max(int(np.searchsorted(times_s, stuck_s, side="right")) - 1, 0)
-    held[last:] = values[last]
-    return held
+    stuck_values[last:] = values[last]
+    return stuck_values

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes.binning import View, build_view
 from marsyard.algorithms.dimes.details import PairDetails, Track
-from marsyard.algorithms.dimes.estimator import conclude
+from marsyard.algorithms.dimes.estimator import combine_pairs
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.validity import (
     TrackMetrics,
@@ -54,7 +54,7 @@ def combine_tracks(
     pairs = [
         pair_of(*(track(p, k, v) for k, v in enumerate(velocities))) for p, velocities in enumerate((first, second))
     ]
-    return conclude((pairs[0], pairs[1]), interval_velocities, THRESHOLD)
+    return combine_pairs((pairs[0], pairs[1]), interval_velocities, THRESHOLD)
 
 
 def test_combinations_are_sorted_by_consistency() -> None:
@@ -89,10 +89,10 @@ def test_invalid_tracks_are_ignored(broken: int) -> None:
         pair_of(track(p, 0, bad, (ValidityCheck.PEAK_HEIGHT,)), track(p, 1, good if p != broken else bad))
         for p in range(2)
     ]
-    answer = conclude((pairs[0], pairs[1]), np.zeros((2, 3)), THRESHOLD)
+    answer = combine_pairs((pairs[0], pairs[1]), np.zeros((2, 3)), THRESHOLD)
     assert answer.outcome is VelocityOutcome.IMU_MISMATCH
     invalid = pair_of(track(0, 0, good, (ValidityCheck.CONTRAST,)))
-    answer = conclude((invalid, pairs[1]), np.zeros((2, 3)), THRESHOLD)
+    answer = combine_pairs((invalid, pairs[1]), np.zeros((2, 3)), THRESHOLD)
     assert answer.outcome is VelocityOutcome.NO_VALID_TRACK
 
 

@@ -97,5 +97,5 @@ def test_binning_averages_blocks_and_rejects_indivisible_sizes() -> None:
     np.testing.assert_allclose(bin_mean(image, 4, 2)[0, 0], image[:2, :4].mean())
     assert bin_factors((256, 1024), (256, 256)) == (4, 1)
     assert bin_factors((1024, 1024), (256, 256)) == (4, 4)
-    with pytest.raises(ValueError, match="1000 x 256 pixels does not bin to 256 x 256"):
+    with pytest.raises(ValueError, match="1000 x 256 pixels cannot be binned to 256 x 256"):
         bin_factors((256, 1000), (256, 256))

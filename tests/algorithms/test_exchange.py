@@ -132,7 +132,7 @@ def test_other_format_version_is_rejected(measurements: DescentMeasurements, tmp
     write_case(tmp_path, measurements)
     path = tmp_path / "case.json"
     path.write_text(path.read_text().replace('"exchange": 1', '"exchange": 2'))
-    with pytest.raises(ValueError, match="version 2 of the exchange; this program reads 1"):
+    with pytest.raises(ValueError, match="version 2 is not supported; supported: 1"):
         read_case(tmp_path)
 
 
@@ -171,7 +171,7 @@ def test_program_answer_and_log_are_stored(measurements: DescentMeasurements, tm
         (f"print({ANSWER}.replace('1.5', '[1.5]'))", Fault.BAD_ANSWER, "velocity_m_s"),
         (f"print({ANSWER}.replace('4]', '-4]'))", Fault.BAD_ANSWER, "not positive definite"),
         (f"print({ANSWER}.replace('covariance', 'kovariance'))", Fault.BAD_ANSWER, "unknown key 'kovariance_m2_s2'"),
-        ('print(\'{"exchange": 1, "outcome": "VALID"}\')', Fault.BAD_ANSWER, "of velocity_m_s none is given"),
+        ('print(\'{"exchange": 1, "outcome": "VALID"}\')', Fault.BAD_ANSWER, "velocity_m_s is missing"),
     ],
 )
 def test_program_errors_are_reported_as_faults(
@@ -237,7 +237,7 @@ def test_late_second_answer_is_not_used_for_next_case(
     first = run_program(spec, measurements).velocity_m_s
     assert first is not None
     time.sleep(0.5)  # the second line is now in the pipe
-    with pytest.raises(AlgorithmError, match="before it was asked it wrote") as caught:
+    with pytest.raises(AlgorithmError, match="before the request; expected one line") as caught:
         run_program(spec, measurements)
     assert caught.value.fault is Fault.BAD_ANSWER
     # a new process answers the next case
@@ -286,10 +286,10 @@ def test_persistent_program_must_report_ready(measurements: DescentMeasurements,
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        ("exec:", "names no program"),
-        ("exec:./nothing --here", "is not there, or may not be run"),
+        ("exec:", "contains no program"),
+        ("exec:./nothing --here", "does not exist or is not executable"),
         ("exec:nothing-of-this-name", "not on the PATH"),
-        ("exec:'unclosed", "cannot be read"),
+        ("exec:'unclosed", "cannot be parsed"),
     ],
 )
 def test_missing_programs_are_reported(spec: str, message: str) -> None:

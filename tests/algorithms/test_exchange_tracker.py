@@ -161,12 +161,12 @@ for answer in ANSWERS:
         ("['{}']", "exchange is None; allowed: 1"),
         ("['{\"exchange\": 1}']", "state is None; allowed: NO_TARGET, NORMAL"),
         # the reported fault depends on how soon the process ends
-        ("[]", "its output ended before it had answered|it reads no more cases"),
+        ("[]", "its output ended without an answer|it closed its input"),
         ('[OK, \'{"exchange": 1, "aim": 3}\']', "aim is 3; allowed: null"),
-        ('[OK, \'{"exchange": 1, "aim": {"azimuth_rad": 0}}\']', "aim lacks an angle"),
+        ('[OK, \'{"exchange": 1, "aim": {"azimuth_rad": 0}}\']', "an angle of aim is missing"),
         ("[OK, AIM.replace('BOX', '[0, 0, 1024, 1024]')]", r"left is \[0, 0, 1024, 1024\]; allowed"),
         ("[OK, AIM.replace('_rad\": 0', '_rad\": 9')]", "azimuth_rad is 9.0; allowed"),
-        ("[OK, AIM.replace('BOX', WIDE)]", "allowed: a part of the frame"),
+        ("[OK, AIM.replace('BOX', WIDE)]", "allowed: whole pixels inside the frame"),
         ('[OK, SEEN, \'{"exchange": 1, "state": "FOUND"}\']', "state is 'FOUND'"),
         ('[OK, SEEN, \'{"exchange": 1, "state": "NORMAL"}\']', "position_rover is None"),
         (
@@ -208,7 +208,7 @@ def test_tracker_inputs_round_trip(tmp_path: Path) -> None:
     reported = aim.aim(trackers.pose(0.0), mast)
     assert reported is not None
     rotated = RigidTransform.from_components([1.0, 2.0, 3.0], Rotation.from_rotvec([0.1, -0.2, 0.3]))
-    stop = replace(trackers.take_pictures(reported, trackers.pose(0.0)), world_from_rover=rotated)
+    stop = replace(trackers.take_images(reported, trackers.pose(0.0)), world_from_rover=rotated)
     write_stop(tmp_path, stop)
     back = read_stop(tmp_path, camera_pair)
     np.testing.assert_array_equal(back.left.counts, stop.left.counts)
@@ -218,9 +218,9 @@ def test_tracker_inputs_round_trip(tmp_path: Path) -> None:
     assert "true" not in (tmp_path / "stop.json").read_text()
     for path in ("mast.json", "stop.json"):
         (tmp_path / path).write_text("{}")
-    with pytest.raises(ValueError, match=r"mast\.json is no mast"):
+    with pytest.raises(ValueError, match=r"mast\.json is not a valid mast file"):
         read_mast(tmp_path)
-    with pytest.raises(ValueError, match=r"stop\.json is no stop"):
+    with pytest.raises(ValueError, match=r"stop\.json is not a valid stop file"):
         read_stop(tmp_path, mast)
 
 

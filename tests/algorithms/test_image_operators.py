@@ -146,7 +146,7 @@ def test_cubic_sampling_equals_scipys(shape: tuple[int, int]) -> None:
 
 def test_pixels_are_clamped_to_the_image() -> None:
     pixels = np.array([[[-3.0, 5.0], [12.5, 99.0]], [[np.nan, np.nan], [31.0, 2.0]]])
-    extent = cubic.hold(pixels, np.array([[True, True], [False, True]]), 20, 10)
+    extent = cubic.clamp(pixels, np.array([[True, True], [False, True]]), 20, 10)
     np.testing.assert_array_equal(pixels, [[[0.0, 5.0], [12.5, 9.0]], [[0.0, 0.0], [19.0, 2.0]]])
     assert extent == (0.0, 19.0, 0.0, 9.0)
 

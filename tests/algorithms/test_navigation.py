@@ -97,7 +97,7 @@ def test_obstacle_is_passed_with_clearance(aside: float, yaw_deg: float) -> None
     goal = turn @ np.array([7.0, 0.0])
     positions = _drive_to_goal(terrain, _make_pose(0.0, 0.0, yaw_deg), goal, 0.5)
     assert positions[-1] == pytest.approx(goal, abs=0.02)
-    closest = np.hypot(*(positions - rock.place_m).T).min()
+    closest = np.hypot(*(positions - rock.position_m).T).min()
     # Paths are sampled every 0.1 m: between samples the clearance may be 0.01 m smaller.
     assert closest > OPTIONS.half_width_m + OPTIONS.margin_m + rock.radius_m - 0.01
     way = np.hypot(*np.diff(positions, axis=0).T).sum()

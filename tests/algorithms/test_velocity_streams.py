@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.algorithms.answers import AlgorithmError, Fault, check_velocity
+from marsyard.algorithms.answers import AlgorithmError, Fault, StreamedEstimator, check_and_set_span, check_velocity
 from marsyard.algorithms.dimes import DimesEstimator
 from marsyard.algorithms.exchange import (
     ExecutableLimits,
@@ -23,7 +23,6 @@ from marsyard.algorithms.exchange import (
 )
 from marsyard.algorithms.exchange.serving import end_persistent
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
-from marsyard.algorithms.streams import StreamedEstimator, set_span
 from marsyard.scenarios.algorithm_run import hash_inputs
 from marsyard.scenarios.conformance import inputs
 from marsyard.sim.measurements import DescentFrame, DescentMeasurements
@@ -94,15 +93,15 @@ def test_selected_images_keep_intermediate_motion() -> None:
 
 
 def test_three_image_estimator_rejects_more_images() -> None:
-    with pytest.raises(ValueError, match="5 pictures are given; this estimator takes 3"):
+    with pytest.raises(ValueError, match="5 images are given; this estimator requires 3"):
         DimesEstimator().estimate(inputs.descent(5))
 
 
 @pytest.mark.parametrize(
     ("span", "message"),
     [
-        ((1.0, 2.5), r"span_s is \(1.0, 2.5\); allowed: within the pictures' tags, 0.0 to 2.0 s"),
-        ((-0.1, 1.0), "within the pictures' tags"),
+        ((1.0, 2.5), r"span_s is \(1.0, 2.5\); allowed: within the images' time tags, 0.0 to 2.0 s"),
+        ((-0.1, 1.0), "within the images' time tags"),
         ((1.0, 0.5), "the first not after the second"),
         ((float("nan"), 1.0), "finite"),
         ([0.0, 1.0], "a tuple of two time tags, or None"),
@@ -118,11 +117,11 @@ def test_invalid_spans_are_rejected(span: object, message: str) -> None:
 
 
 def test_missing_span_defaults_to_last_interval() -> None:
-    assert set_span(make_estimate(), (0.0, 1.0, 3.0)).span_s == (1.0, 3.0)
-    assert set_span(make_estimate(2.0, 2.0), (0.0, 3.0)).span_s == (2.0, 2.0)
-    assert set_span(NOTHING, (0.0,)).span_s is None
-    with pytest.raises(AlgorithmError, match="of one picture there is no last interval"):
-        set_span(make_estimate(), (0.0,))
+    assert check_and_set_span(make_estimate(), (0.0, 1.0, 3.0)).span_s == (1.0, 3.0)
+    assert check_and_set_span(make_estimate(2.0, 2.0), (0.0, 3.0)).span_s == (2.0, 2.0)
+    assert check_and_set_span(NOTHING, (0.0,)).span_s is None
+    with pytest.raises(AlgorithmError, match="one image has no last interval"):
+        check_and_set_span(make_estimate(), (0.0,))
 
 
 def test_stream_cannot_set_its_own_history() -> None:
@@ -149,7 +148,7 @@ def test_frame_files_round_trip(tmp_path: Path, altitude_m: float) -> None:
     assert (back.attitude.world_from_body.inv() * frame.attitude.world_from_body).magnitude() < 1e-14
     path = tmp_path / "frame.json"
     path.write_text(path.read_text().replace('"exchange": 1', '"exchange": 2'))
-    with pytest.raises(ValueError, match="is no picture of a descent: it has version 2 of the exchange"):
+    with pytest.raises(ValueError, match="is not a valid descent image file: exchange format version 2"):
         read_frame(tmp_path)
 
 
@@ -207,7 +206,7 @@ NONE_YET = '{"exchange": 1, "outcome": null}'
 @pytest.mark.parametrize(
     ("answers", "message"),
     [
-        (['{"exchange": 1, "outcome": "NO_VALID_TRACK"}'], "start is answered with an outcome"),
+        (['{"exchange": 1, "outcome": "NO_VALID_TRACK"}'], "the answer to 'start' has an outcome"),
         ([NONE_YET, "3"], "not one JSON object"),
         ([NONE_YET, '{"exchange": 1}'], "outcome is None; allowed: VALID"),
         ([NONE_YET, '{"exchange": 1, "outcome": null, "span_s": [1, 2]}'], "unknown key 'span_s'"),
@@ -215,8 +214,8 @@ NONE_YET = '{"exchange": 1, "outcome": null}'
             [NONE_YET, NONE_YET, '{"exchange": 1, "outcome": "VALID", "velocity_m_s": [1, 2], "span_s": [0, 1]}'],
             r"span_s is \(0.0, 1.0\); allowed: within",
         ),
-        ([NONE_YET] * 5, "finish is answered with the outcome null"),
-        ([NONE_YET] * 2, "its output ended before it had answered|it reads no more cases"),
+        ([NONE_YET] * 5, "the answer to 'finish' has the outcome null"),
+        ([NONE_YET] * 2, "its output ended without an answer|it closed its input"),
     ],
 )
 def test_invalid_answers_are_reported_as_faults(tmp_path: Path, answers: list[str], message: str) -> None:

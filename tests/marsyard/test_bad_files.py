@@ -71,9 +71,9 @@ DETECTOR = '[parameters.detector]\nfile = "{}"'
     ("table", "name", "write", "message"),
     [
         (TERRAIN, "projection.tif", lambda path: write_dtm(path, crs=DEGREES), "is in degrees; project it to metres"),
-        (TERRAIN, "nodata.tif", lambda path: write_dtm(path, nodata=None), "states no nodata value"),
-        (TERRAIN, "units.tif", lambda path: write_dtm(path, unit="ft"), "its heights are in 'ft'; metres are needed"),
-        (TERRAIN, "huge.tif", lambda path: write_dtm(path, side=16384), "has 16384 x 16384 values; at most 5461"),
+        (TERRAIN, "nodata.tif", lambda path: write_dtm(path, nodata=None), "has no nodata value"),
+        (TERRAIN, "units.tif", lambda path: write_dtm(path, unit="ft"), "its heights are in 'ft'; allowed: metres"),
+        (TERRAIN, "huge.tif", lambda path: write_dtm(path, side=16384), "16384 x 16384 values; allowed: at most 5461"),
         (TERRAIN, "empty.tif", write_empty, "is empty (0 bytes)"),
         (FLIGHT, "nan.csv", lambda path: write_flight(path, 9, 2, np.nan), "pose 10: y_m is not finite"),
         (
@@ -99,7 +99,7 @@ DETECTOR = '[parameters.detector]\nfile = "{}"'
             lambda path: write_gigabyte(path, b"PDS_VERSION_ID = PDS3\r\n"),
             "END: missing in the first",
         ),
-        (MESH, "empty.stl", write_empty, "holds no triangle"),
+        (MESH, "empty.stl", write_empty, "contains no triangle"),
         (MESH, "huge.stl", write_gigabyte, "is larger than 256 MiB"),
         (DETECTOR, "empty_sheet.toml", write_empty, "pixel_pitch_um: Field required"),
         (DETECTOR, "huge_sheet.toml", write_gigabyte, "larger than 1 MiB"),

@@ -74,7 +74,7 @@ def test_run_prints_table_verdict_and_report(finished: Path) -> None:
     assert (finished / "report.html").stat().st_size > 1000
     assert json.loads((finished / "campaign.json").read_text())["exit_code"] == 3
     progress = (finished.parent / "stderr.txt").read_text()
-    assert re.search(r"^cases: 6/6, [\d.]+ (/s|s each), [\d.]+ s$", progress, re.MULTILINE)
+    assert re.search(r"^cases: 6/6, [\d.]+ (/s|s per item), [\d.]+ s$", progress, re.MULTILINE)
     assert "\x1b" not in out + progress
 
 
@@ -148,7 +148,7 @@ def test_killed_campaign_is_reported_and_resumed(tmp_path: Path, marsyard: Comma
     reported = marsyard("report", tmp_path / "run")
     assert (reported.status, reported.err) == (3, "")
     message = re.search(
-        r"INCOMPLETE: (\d+) of 40 cases; it was killed; to continue: marsyard resume (\S+)", reported.out
+        r"INCOMPLETE: (\d+) of 40 cases; the campaign was killed; to continue: marsyard resume (\S+)", reported.out
     )
     assert message
     assert message[2] == str(tmp_path / "run")
@@ -162,7 +162,7 @@ def test_killed_campaign_is_reported_and_resumed(tmp_path: Path, marsyard: Comma
     appended = marsyard("append", tmp_path / "run", 20, "--jobs", 1, "--allow-changed")
     assert appended.status == 3
     assert "of 60" in appended.out
-    assert "takes at least 230 cases without a failure, and 60 are asked for" in appended.out
+    assert "takes at least 230 cases without a failure; the campaign has 60" in appended.out
 
 
 def test_dry_run_only_estimates(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,13 +221,13 @@ def test_configuration_error_precedes_failed_cases(tmp_path: Path, marsyard: Com
         (["run", "{file}", "--jobs", "0"], "--jobs 0: at least one worker process is needed"),
         (["run", "{file}", "--set", "altitude_m=-2"], "parameters.altitude_m: input should be greater than 0, got -2"),
         (["run", "{file}", "--set", "altitud_m=2"], "unknown key (did you mean 'altitude_m'?)"),
-        (["run", "{file}", "--out", "{run}"], "already holds a campaign"),
+        (["run", "{file}", "--out", "{run}"], "contains a campaign"),
         (["run", "{file}", "--out", "{file}/run"], "cannot be written: Not a directory"),
         (["run", "{file}", "--out", "/proc/run"], "cannot be written"),
         (["run", "{file}", "--case-time", "0"], "--set limits.case_time_s=0.0: limits.case_time_s: input should be gr"),
-        (["run", "{file}", "--jobs", "2", "--cluster", "local:2"], "exclude one another"),
+        (["run", "{file}", "--jobs", "2", "--cluster", "local:2"], "cannot be combined"),
         (["run", "{file}", "--dry-run", "--jobs", "-1"], "at least one worker process is needed"),
-        (["resume", "{folder}"], "does not hold a campaign"),
+        (["resume", "{folder}"], "does not contain a campaign"),
         (["resume", "{folder}/none"], "none: no such folder"),
         (
             ["resume", "{run}", "--retry", "crased"],
@@ -235,16 +235,16 @@ def test_configuration_error_precedes_failed_cases(tmp_path: Path, marsyard: Com
         ),
         (["resume", "{run}", "--case-time", "-1"], "--case-time -1.0: input should be greater than 0"),
         (["append", "{run}", "0"], "Invalid value for 'N'"),
-        (["append", "{folder}", "3"], "does not hold a campaign"),
+        (["append", "{folder}", "3"], "does not contain a campaign"),
         (["run"], "Missing argument"),
         (["run", "{file}", "--job", "1"], "No such option"),
         (["fly"], "No such command 'fly'"),
         (["show", "dimes-smok"], "unknown campaign 'dimes-smok'"),
         (["report", "{folder}/none"], "none: no such folder"),
-        (["report", "{folder}"], "does not hold a campaign"),
+        (["report", "{folder}"], "does not contain a campaign"),
         (["replay", "{run}", "6"], "has no case 6; allowed: 0 to 5"),
         (["replay", "{run}", "x"], "Invalid value for 'CASE'"),
-        (["replay", "{folder}", "0"], "does not hold a campaign"),
+        (["replay", "{folder}", "0"], "does not contain a campaign"),
         (["replay", "{run}", "0", "--out", "{file}/x"], "cannot be written"),
     ],
 )
@@ -314,7 +314,7 @@ def test_help_is_fast() -> None:
     )
     elapsed = time.perf_counter() - start_s
     assert result.returncode == 0
-    assert "Exit status: 0 every requirement met" in re.sub(r"[\s│]+", " ", result.stdout)
+    assert "Exit status: 0 all requirements met" in re.sub(r"[\s│]+", " ", result.stdout)
     # loose limit for a busy machine; no heavy package may be imported
     assert elapsed < 3.0
     for package in ("numpy", "pandas", "scipy", "joblib", "pydantic", "matplotlib"):
@@ -351,5 +351,5 @@ def test_terminal_shows_a_progress_bar(tmp_path: Path) -> None:
     result = subprocess.run(command, capture_output=True, text=True, env=environment)
     assert result.returncode == 0, result.stderr
     assert "2/2" in result.stderr
-    assert "in all" in result.stderr
+    assert "total 0:" in result.stderr
     assert "━" in result.stderr

@@ -26,5 +26,5 @@ def test_compiled_systems_are_skipped(tmp_path: Path, monkeypatch: pytest.Monkey
     result = CliRunner().invoke(app, ["compile"])
     assert (result.exit_code, result.output) == (
         0,
-        "descent: compiled before\nrover: compiled before\nlanding: compiled before\n",
+        "descent: already compiled\nrover: already compiled\nlanding: already compiled\n",
     )

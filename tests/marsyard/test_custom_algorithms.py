@@ -52,7 +52,7 @@ def test_conformance_survives_crashes_and_hangs(tmp_path: Path, monkeypatch: pyt
     assert "CRASHED: the worker process died: SIGABRT (-6)" in result.output
     assert "FAIL saturated" in result.output
     assert "TIMED_OUT: took longer than its limit of 11 s" in result.output
-    assert "next: no picture may make it hang" in result.output
+    assert "to fix: no picture may make it hang" in result.output
     assert "7 of 9 checks passed" in result.output
 
 
@@ -80,9 +80,9 @@ def test_conformance_reports_changed_process_state(tmp_path: Path, monkeypatch: 
     result = CliRunner().invoke(app, ["conformance", "leaving_here:Leaving"])
     assert result.exit_code == 1, result.output
     assert result.output.count("it changed the state of its process: the working folder") == 3
-    assert "child processes that it left running (python)" in result.output
-    assert "threads that it left running (Thread-" in result.output
-    assert "next: set it back before returning" in result.output
+    assert "child processes that are still running (python)" in result.output
+    assert "threads that are still running (Thread-" in result.output
+    assert "to fix: set it back before returning" in result.output
     assert "6 of 9 checks passed" in result.output
 
 
@@ -105,8 +105,8 @@ def test_conformance_is_printed_as_json() -> None:
         (["vt"], "unknown algorithm 'vt'"),
         (["vtt", "--task", "flying"], "--task flying: unknown; allowed: velocity, tracking, landing"),
         (["dimes", "--task", "landing"], "unknown algorithm 'dimes'"),
-        (["nowhere:Nothing"], "no algorithm at 'nowhere:Nothing'"),
-        (["exec:./nothing"], "is not there, or may not be run"),
+        (["nowhere:Nothing"], "cannot import algorithm 'nowhere:Nothing'"),
+        (["exec:./nothing"], "does not exist or is not executable"),
     ],
 )
 def test_unknown_algorithms_are_rejected(arguments: list[str], message: str) -> None:
@@ -120,7 +120,7 @@ def test_exported_cases_are_scored(tmp_path: Path) -> None:
     campaign.write_text(CAMPAIGN)
     result = CliRunner().invoke(app, ["export", str(campaign), "--out", str(cases), "--jobs", "1"])
     assert result.exit_code == 0, result.output
-    assert f"their truth, not to be handed away: {cases}-truth" in result.output
+    assert f"ground truth (do not distribute with the cases): {cases}-truth" in result.output
     assert len(list((cases / "cases").iterdir())) == 2
     table.write_text("case,velocity_east_m_s,velocity_north_m_s\n0,12.5,-7\n")
     result = CliRunner().invoke(app, ["score", str(cases), str(table)])

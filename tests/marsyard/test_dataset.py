@@ -117,7 +117,7 @@ def test_samples_contain_pixel_truth_and_are_reproducible(tmp_path: Path) -> Non
     assert [path.read_bytes() for path in shards] == before
     status, output = run_dataset(tmp_path, "--seed", "4")
     assert status == 2
-    assert "holds another data set (configuration_sha256 differs)" in output
+    assert "contains another data set (configuration_sha256 differs)" in output
 
 
 def test_descent_sample_has_three_images(tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ def test_descent_sample_has_three_images(tmp_path: Path) -> None:
     campaign = load_campaign("dimes-smoke", settings)
     parameters = campaign.parameters(0)
     assert isinstance(parameters, DescentScenarioParameters)
-    surface = World.of(parameters).surface
+    surface = World.from_parameters(parameters).surface
     path = tmp_path / "camera.cahvor"
     for number in range(3):
         sample = json.loads(files[f"0000000-{number}.json"])
@@ -152,7 +152,7 @@ def test_descent_sample_has_three_images(tmp_path: Path) -> None:
 def test_scenarios_without_samples_are_rejected(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["dataset", "vtt-montecarlo", "--out", str(tmp_path / "set")])
     assert result.exit_code == 2
-    assert "gives no samples to learn from; allowed: descent, landing" in result.output
+    assert "provides no training samples; allowed: descent, landing" in result.output
 
 
 @pytest.mark.parametrize("words", [("--shard", "0"), ("--jobs", "0")])

@@ -21,7 +21,7 @@ from rich.console import Console
 from marsyard import doctor, gl_probe
 from marsyard.doctor import Check, Probe, Verdict
 
-WORKING = Probe({"renderer": "r", "version": "v", "depth_error_m": 1e-5, "offset_px": [0.0, 0.0], "lit": True})
+WORKING = Probe({"renderer": "r", "version": "v", "depth_error_m": 1e-5, "offset_px": [0.0, 0.0], "has_colour": True})
 ABSENT = Probe(None, "ImportError: no library")
 
 
@@ -34,13 +34,13 @@ def run_doctor(*, as_json: bool = False) -> tuple[int, str]:
 
 @pytest.fixture
 def set_check(monkeypatch: pytest.MonkeyPatch) -> Callable[[Check], None]:
-    return lambda check: monkeypatch.setattr(doctor, "examine", lambda: iter([check]))
+    return lambda check: monkeypatch.setattr(doctor, "run_checks", lambda: iter([check]))
 
 
 def test_all_checks_pass_on_this_machine() -> None:
     status, text = run_doctor()
     assert status == 0, text
-    assert "depth right to" in text
+    assert "depth error" in text
     assert "A campaign can run here." in text
 
 
@@ -64,15 +64,15 @@ def test_only_failures_change_the_exit_status(
 def test_depth_error_of_a_plane_is_small() -> None:
     # the backend of this test process
     probe = doctor.probe_backend(os.environ["MARSYARD_GL"])
-    assert probe.measured is not None, probe.fault
+    assert probe.measurements is not None, probe.error
     # a 24-bit depth buffer between 40 and 400 m resolves 1e-5 m at 100 m, 2e-4 m at 400 m
-    assert probe.measured["depth_error_m"] < 2e-4
+    assert probe.measurements["depth_error_m"] < 2e-4
 
 
 def test_missing_backend_has_a_fault_message() -> None:
     probe = doctor.probe_backend("nonesuch")
-    assert probe.measured is None
-    assert probe.fault
+    assert probe.measurements is None
+    assert probe.error
 
 
 @pytest.mark.parametrize(
@@ -96,8 +96,8 @@ def test_verdict_of_the_selected_backend(
 
 
 def test_backend_with_wrong_depth_fails() -> None:
-    assert WORKING.measured is not None
-    wrong = Probe({**WORKING.measured, "depth_error_m": 0.5})
+    assert WORKING.measurements is not None
+    wrong = Probe({**WORKING.measurements, "depth_error_m": 0.5})
     first, *_, last = doctor.check_rendering({"osmesa": wrong})
     assert first.verdict is Verdict.WARN
     assert last.verdict is Verdict.FAIL
@@ -135,7 +135,7 @@ def test_conflicting_packages_are_reported(monkeypatch: pytest.MonkeyPatch) -> N
 def test_dependencies_are_checked_by_import_name() -> None:
     # installed metadata may be older than the file in a development environment
     needs = tomllib.loads((doctor.ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
-    modules = [doctor._module(canonicalize_name(Requirement(need).name)) for need in needs]
+    modules = [doctor._import_name(canonicalize_name(Requirement(need).name)) for need in needs]
     assert [module for module in modules if importlib.util.find_spec(module) is None] == []
 
 
@@ -161,7 +161,7 @@ def test_module_that_exits_does_not_hide_other_failures(monkeypatch: pytest.Monk
     (tmp_path / "deadly.py").write_text("import os; os._exit(3)")
     (tmp_path / "faulty.py").write_text("import nonesuch")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    failures = doctor.import_failures(["json", "deadly", "faulty", "math"])
+    failures = doctor.find_import_failures(["json", "deadly", "faulty", "math"])
     assert failures == {
         "deadly": "the process ended with status 3",
         "faulty": "ModuleNotFoundError: No module named 'nonesuch'",
@@ -169,7 +169,7 @@ def test_module_that_exits_does_not_hide_other_failures(monkeypatch: pytest.Monk
 
 
 def test_python_without_assertions_fails() -> None:
-    assert doctor.check_optimisation(assertions=False).verdict is Verdict.FAIL
+    assert doctor.check_optimisation(enabled=False).verdict is Verdict.FAIL
 
 
 def test_more_threads_than_cores_give_a_warning() -> None:

@@ -149,7 +149,7 @@ def test_appended_blocks_are_in_the_command(folder: Path) -> None:
 
     run = read_run(folder / "run")
     configuration = {**run.record["configuration"], "appended": [20]}
-    changed = type(run)(run.directory, run.frame, run.whole, {**run.record, "configuration": configuration}, ())
+    changed = type(run)(run.directory, run.frame, run.all_cases, {**run.record, "configuration": configuration}, ())
     assert rerun_commands(changed)[-1] == "marsyard append runs/own-campaign-again 20"
 
 

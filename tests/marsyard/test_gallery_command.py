@@ -13,8 +13,17 @@ import pytest
 
 from marsyard.cli import app as cli
 from marsyard.cli import gallery as gallery_command
-from marsyard.cli.gallery import PAGE, PLATES, SHEET, SHEET_BYTES, SvgFigure, contact_sheet, map_to_grey, write_gallery
-from marsyard.cli.pictures import Shot
+from marsyard.cli.gallery import (
+    PAGE,
+    SHEET,
+    SHEET_BYTES,
+    VIEWS,
+    GalleryImage,
+    draw_contact_sheet,
+    map_to_grey,
+    write_gallery,
+)
+from marsyard.cli.pictures import ImageRequest
 from marsyard.sim.sensor import PRESETS
 from marsyard.sim.terrain import sites
 
@@ -31,30 +40,30 @@ class _Links(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def figures() -> list[SvgFigure]:
+def figures() -> list[GalleryImage]:
     """Figures of white noise, the worst case for compression."""
     rng = np.random.default_rng(1)
     return [
-        SvgFigure(
-            Shot.usual(site, camera, **settings),
+        GalleryImage(
+            ImageRequest.from_defaults(site, camera, **settings),
             rng.integers(0, 256, (480, 640), dtype=np.uint8),
             f"{number}-{site}.jpg",
         )
-        for number, (site, camera, settings) in enumerate(PLATES)
+        for number, (site, camera, settings) in enumerate(VIEWS)
     ]
 
 
-def test_every_site_and_camera_is_shown(figures: list[SvgFigure]) -> None:
-    assert {figure.shot.site for figure in figures} == set(sites())
-    assert {figure.shot.camera for figure in figures} == set(PRESETS)
+def test_every_site_and_camera_is_shown(figures: list[GalleryImage]) -> None:
+    assert {figure.request.site for figure in figures} == set(sites())
+    assert {figure.request.camera for figure in figures} == set(PRESETS)
     for figure in figures:
-        site = sites()[figure.shot.site]
+        site = sites()[figure.request.site]
         assert site.descent is None or any(
-            other.shot.scale == "descent" for other in figures if other.shot.site == site.name
+            other.request.scale == "descent" for other in figures if other.request.site == site.name
         )
 
 
-def test_page_links_only_to_its_images(figures: list[SvgFigure], tmp_path: Path) -> None:
+def test_page_links_only_to_its_images(figures: list[GalleryImage], tmp_path: Path) -> None:
     page = write_gallery(figures, tmp_path / "new" / "gallery")
     links = _Links()
     text = page.read_text()
@@ -71,16 +80,16 @@ def test_page_links_only_to_its_images(figures: list[SvgFigure], tmp_path: Path)
         assert "--camera" in command
 
 
-def test_contact_sheet_is_small(figures: list[SvgFigure]) -> None:
+def test_contact_sheet_is_small(figures: list[GalleryImage]) -> None:
     smooth = np.linspace(0.0, 255.0, 640 * 480).reshape(480, 640)
     rng = np.random.default_rng(2)
     pictures = [
-        SvgFigure(
-            figure.shot, np.clip(smooth + rng.normal(0.0, 6.0, smooth.shape), 0, 255).astype(np.uint8), figure.file
+        GalleryImage(
+            figure.request, np.clip(smooth + rng.normal(0.0, 6.0, smooth.shape), 0, 255).astype(np.uint8), figure.file
         )
         for figure in figures
     ]
-    sheet = contact_sheet(pictures)
+    sheet = draw_contact_sheet(pictures)
     assert len(sheet) <= SHEET_BYTES
     decoded = cv2.imdecode(np.frombuffer(sheet, np.uint8), cv2.IMREAD_UNCHANGED)
     assert decoded is not None
@@ -111,10 +120,10 @@ def test_existing_gallery_is_kept(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / name).write_text("mine")
-    monkeypatch.setattr(gallery_command, "PLATES", ())
+    monkeypatch.setattr(gallery_command, "VIEWS", ())
     monkeypatch.setattr(sys, "argv", ["marsyard", "gallery", "--out", str(tmp_path)])
     with pytest.raises(SystemExit) as raised:
         cli.main()
     assert raised.value.code == 2
-    assert f"{tmp_path / name}: there already" in capfd.readouterr().err
+    assert f"{tmp_path / name}: the file exists" in capfd.readouterr().err
     assert (tmp_path / name).read_text() == "mine"

@@ -38,7 +38,7 @@ def test_ingested_images_are_run_and_reported(tmp_path: Path) -> None:
     report = json.loads((run / "report.json").read_text())
     assert np.isclose(report["sections"]["agreement"]["median_of_medians_px"], frame["residual_median_px"][0])
     page = (run / "report.html").read_text()
-    assert "Pictures against measured poses" in page
+    assert "Pictures compared with measured poses" in page
     assert 'aria-label="Pictures 1 and 2: ' in page
     status, output = run_command("replay", str(run), "0", "--out", str(tmp_path / "again"))
     assert (status, "the row equals the stored one" in output) == (0, True)
@@ -96,7 +96,7 @@ def test_summed_rows_are_inferred_from_the_camera(tmp_path: Path) -> None:
     (folder / "ingest.toml").write_text(text.replace(f"rows_summed = {rows_summed}\n", ""))
     status, output = run_command("ingest", str(folder), "--out", str(tmp_path / "inferred"))
     assert status == 0
-    assert f"rows_summed = {rows_summed}: taken from the camera" in output
+    assert f"rows_summed = {rows_summed}: computed from the camera" in output
     detectors = [
         json.loads((tmp_path / name / "cases.json").read_text())["detector"] for name in ("stated", "inferred")
     ]

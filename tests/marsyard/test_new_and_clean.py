@@ -79,7 +79,7 @@ def test_new_campaign_without_failures_passes(working_folder: Path) -> None:
 
 def test_limits_of_the_evidence_are_reported_before_a_run(working_folder: Path) -> None:
     """`new` and `--dry-run` report too few cases, too few terrains and designs without independent draws."""
-    assert "takes at least 230 cases without a failure, and 24 are asked for" in run_command("new", "few")[1]
+    assert "takes at least 230 cases without a failure; the campaign has 24" in run_command("new", "few")[1]
     assert evidence_limits(load_campaign("few.toml", cases=230)) == []
     cases, terrains = evidence_limits(load_campaign("dimes-smoke"))
     assert cases.startswith("DIMES-VEL: 99 % at 90 % confidence takes at least 230 cases")
@@ -115,7 +115,7 @@ def test_camera_file_is_used_in_the_new_campaign(working_folder: Path) -> None:
         ),
         (("--system", "velocity", "--camera", "absent.yaml"), "absent.yaml: file: cannot be read"),
         (("--system", "tracking", "--camera", "cam.yaml"), "see camera.preset"),
-        (("--system", "landing", "--flight", "flight.csv"), "only descents fly"),
+        (("--system", "landing", "--flight", "flight.csv"), "only descents accept"),
     ],
 )
 def test_invalid_options_write_no_campaign(working_folder: Path, words: tuple[str, ...], message: str) -> None:
@@ -135,7 +135,7 @@ def test_invalid_answers_are_rejected_in_the_dialogue(working_folder: Path, monk
         "unknown answer 'velocty' (did you mean 'velocity'?); allowed: landing, tracking, velocity",
         "unknown answer 'venus'; allowed: ",
         "absent.yaml",
-        "absent.csv: no such file; allowed: the path of a file, or nothing",
+        "absent.csv: no such file; allowed: the path of a file, or an empty answer",
         "'-3' is not allowed; allowed: a number above 0",
         "'many' is not allowed",
     ):
@@ -147,7 +147,7 @@ def test_existing_campaign_file_is_kept(working_folder: Path) -> None:
     (working_folder / "mine.toml").write_text("precious")
     status, output = run_command("new", "mine", "--system", "tracking")
     assert status == 2
-    assert "mine.toml: there already; --overwrite" in output
+    assert "mine.toml: the file exists; use --overwrite" in output
     assert run_command("new", "mine", "--system", "tracking", "--site", "venus", "--overwrite")[0] == 2
     assert (working_folder / "mine.toml").read_text() == "precious"
 

@@ -14,7 +14,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli import app as cli
 from marsyard.cli import nightly_plan
-from marsyard.cli.nightly_plan import PLAN_FILE, campaign_definition, night_seed, read_plan
+from marsyard.cli.nightly_plan import PLAN_FILE, hash_definition, night_seed, read_plan
 from tests.campaigns.fake_campaign import DISPERSIONS, REQUIREMENT, write_campaign
 
 pytestmark = [
@@ -47,7 +47,7 @@ def test_regression_is_reported_with_its_metric(
     nightly: Nightly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     status, first_report = nightly()
-    assert "No figure has a history" in first_report
+    assert "No metric has a history" in first_report
     assert (tmp_path / "out" / "site" / "index.html").is_file()
     record = json.loads((tmp_path / "out" / "runs" / "night-00001-fake" / "campaign.json").read_text())
     assert record["exit_code"] == status
@@ -84,7 +84,7 @@ def test_killed_night_is_shown_and_not_compared(
         raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(nightly_plan, "run_planned", kill)
+        patch.setattr(nightly_plan, "run_scheduled_campaign", kill)
         with pytest.raises(Killed):
             nightly()
     assert (tmp_path / "out" / "nightly.md").read_text().startswith("# Night 1: RUNNING")
@@ -92,9 +92,9 @@ def test_killed_night_is_shown_and_not_compared(
     assert page.startswith("# Night 2:")
     assert "Night 1, begun" in page
     assert "was interrupted" in page
-    assert "No figure has a history" in page
+    assert "No metric has a history" in page
     with monkeypatch.context() as patch:
-        patch.setattr(nightly_plan, "run_planned", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(nightly_plan, "run_scheduled_campaign", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         status, page = nightly()
     assert (status, page.splitlines()[0]) == (130, "# Night 3: INTERRUPTED")
 
@@ -103,8 +103,8 @@ def test_seeds_differ_between_nights(tmp_path: Path) -> None:
     assert len({night_seed(seed, night) for seed in range(20) for night in range(50)}) == 1000
     path = write_campaign(tmp_path)
     campaign, other = (load_campaign(str(path), seed=seed) for seed in (1, 2))
-    assert campaign_definition(campaign) == campaign_definition(other)
-    assert campaign_definition(campaign) != campaign_definition(load_campaign(str(path), ["altitude_m=1500"]))
+    assert hash_definition(campaign) == hash_definition(other)
+    assert hash_definition(campaign) != hash_definition(load_campaign(str(path), ["altitude_m=1500"]))
 
 
 def test_campaigns_of_the_shipped_plan_load() -> None:

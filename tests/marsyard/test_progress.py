@@ -51,14 +51,14 @@ def test_time_left_follows_the_rate_of_the_stage() -> None:
         clock.now_s += seconds
         bars.step()
     first, second = (line for line in _render_bars(bars, clock) if line.strip())
-    assert "5.0 s each" in first
-    assert "0:00:10 in all" in first
-    # 7 remaining cases at 33.3 s each
-    assert "33.3 s each" in second
+    assert "5.0 s per item" in first
+    assert "total 0:00:10" in first
+    # 7 remaining cases at 33.3 s per item
+    assert "33.3 s per item" in second
     assert "0:03:53 left" in second
     clock.now_s += 1000.0
-    assert "0:00:10 in all" in _render_bars(bars, clock)[0]
-    assert "5.0 s each" in _render_bars(bars, clock)[0]
+    assert "total 0:00:10" in _render_bars(bars, clock)[0]
+    assert "5.0 s per item" in _render_bars(bars, clock)[0]
 
 
 def test_unfinished_stage_stops_its_clock() -> None:
@@ -69,7 +69,7 @@ def test_unfinished_stage_stops_its_clock() -> None:
     bars.step()
     bars.begin("showcase", 1)
     clock.now_s += 60.0
-    assert "4.0 s each" in _render_bars(bars, clock)[0]
+    assert "4.0 s per item" in _render_bars(bars, clock)[0]
 
 
 def test_lines_print_time_left_at_the_printed_rate(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,7 +82,7 @@ def test_lines_print_time_left_at_the_printed_rate(monkeypatch: pytest.MonkeyPat
     lines.step()
     file = console.file
     assert isinstance(file, io.StringIO)
-    assert file.getvalue().splitlines()[-1] == "cases: 1/8, 12.5 s each, 88 s left"
+    assert file.getvalue().splitlines()[-1] == "cases: 1/8, 12.5 s per item, 88 s left"
 
 
 def test_compilation_is_reported_until_first_case_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

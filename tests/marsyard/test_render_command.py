@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.cli import app as cli
-from marsyard.cli.pictures import ENDINGS
+from marsyard.cli.pictures import SUFFIXES
 from marsyard.sim.camera import read_cahvor
 
 Command = Callable[..., tuple[int, str]]
@@ -119,16 +119,16 @@ def test_invalid_options_are_rejected(
 def test_missing_folder_is_reported(marsyard: Command, tmp_path: Path) -> None:
     status, error = marsyard("render", "gusev", "--camera", "xc-55", "--out", tmp_path / "no" / "x")
     assert status == 2
-    assert "there is no folder" in error
+    assert "does not exist" in error
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("ending", SUFFIXES)
 def test_existing_files_are_kept(marsyard: Command, tmp_path: Path, ending: str) -> None:
     existing = tmp_path / f"x{ending}"
     existing.write_text("mine")
     status, error = marsyard("render", "gusev", "--camera", "xc-55", "--out", tmp_path / "x")
     assert status == 2
-    assert f"{existing}: there already" in error
+    assert f"{existing}: files exist" in error
     assert existing.read_text() == "mine"
 
 

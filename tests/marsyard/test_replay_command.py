@@ -64,7 +64,7 @@ def test_missing_scenario_is_reported_and_changes_nothing(
     for command in (("replay", stored, 0), ("resume", stored, "--allow-changed")):
         status, output = run_command(*command)
         assert status == 2
-        assert "no scenario at 'my_scenario:Mine': No module named 'my_scenario'" in output
+        assert "cannot import scenario 'my_scenario:Mine': No module named 'my_scenario'" in output
         assert "Traceback" not in output
     assert {name: text for name, text in _read_files(stored).items() if name != "campaign.lock"} == {
         name: text for name, text in before.items() if name != "campaign.lock"
@@ -87,7 +87,7 @@ def test_missing_algorithm_is_reported_and_changes_nothing(tmp_path: Path, monke
     before = _read_files(folder)
     status, output = run_command("replay", folder, 0)
     assert status == 2
-    assert "no algorithm at 'my_absent_module:Estimator'" in output
+    assert "cannot import algorithm 'my_absent_module:Estimator'" in output
     assert _read_files(folder) == before
 
 
@@ -104,7 +104,7 @@ def test_products_are_kept_if_the_replayed_case_fails(
     status, output = run_command("replay", copy, 0)
     assert status == 1
     assert "case 0: CRASHED" in output
-    assert "keeps the products that it had" in output
+    assert "keeps its previous products" in output
     assert _read_files(copy / "cases") == before
     (copy / "campaign.json").write_text(text)
     assert run_command("replay", copy, 0)[0] == 0

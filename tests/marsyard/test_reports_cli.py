@@ -22,7 +22,7 @@ from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.store import record
 from marsyard.cli import app as cli
-from marsyard.cli.outcome import run_until_decided, server
+from marsyard.cli.outcome import create_server, run_until_decided
 from marsyard.reports.evaluation import next_look
 from marsyard.reports.presentation import notable_cases
 from marsyard.reports.sampling_design import SamplingDesign
@@ -91,7 +91,7 @@ def test_stored_rows_are_evaluated_again(make_run: MakeRun, marsyard: Command, t
     assert (len(rows), list(rows)) == (40, COLUMNS)
     requirements.write_text(REQUIREMENTS.replace("dimes-*", "vtt-*"))
     status, _, err = marsyard("report", directory, "--requirements", requirements)
-    assert (status, "no requirement names the campaign" in err) == (2, True)
+    assert (status, "no requirement lists the campaign" in err) == (2, True)
 
 
 def test_pdf_is_written(make_run: MakeRun, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,7 +111,7 @@ def test_two_campaigns_are_compared(make_run: MakeRun, marsyard: Command) -> Non
     status, out, err = marsyard("compare", *both)
     assert (status, err) == (0, "")
     assert "came to an end" in out
-    assert "draws of their own" in out
+    assert "different draws" in out
     reported = json.loads(marsyard("compare", *both, "--json")[1])
     assert (reported["second"], reported["paired"]) == (str(both[1]), False)
     figures = {figure["name"]: figure for figure in reported["figures"]}
@@ -125,7 +125,7 @@ def test_dashboard_is_written_and_served_locally(make_run: MakeRun, marsyard: Co
     assert marsyard("dashboard", tmp_path / "none")[0] == 2
     (tmp_path / "secret.txt").write_text("secret")
     (tmp_path / "site" / "way-out").symlink_to(tmp_path / "secret.txt")
-    with server(tmp_path / "site", "127.0.0.1", 0) as http_server:
+    with create_server(tmp_path / "site", "127.0.0.1", 0) as http_server:
         assert http_server.server_address[0] == "127.0.0.1"
         threading.Thread(target=http_server.serve_forever, daemon=True).start()
         root = f"http://127.0.0.1:{http_server.server_port}"
@@ -195,9 +195,9 @@ def test_gallery_repeats_its_cases_once(tmp_path: Path, marsyard: Command) -> No
     _, out, err = marsyard("report", directory, "--gallery")
     stored = {int(folder.name) for folder in (directory / "cases").iterdir()}
     assert (expected - stored, err) == (set(), "")
-    assert out.count("ran again for its pictures") == len(expected - {json.loads(_read_record(directory))["showcase"]})
+    assert out.count("rerun for its images") == len(expected - {json.loads(_read_record(directory))["showcase"]})
     # stored cases are not repeated
-    assert "ran again" not in marsyard("report", directory, "--gallery")[1]
+    assert "rerun for" not in marsyard("report", directory, "--gallery")[1]
 
 
 def _read_record(directory: Path) -> str:
@@ -209,5 +209,5 @@ def test_undecidable_requirements_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(CampaignError, match="no requirement that is decided"):
         run_until_decided(campaign, tmp_path / "run", ExecutorConfig(jobs=1), RecordingWatch())
     latin = write_campaign(tmp_path, more='[design]\nkind = "latin-hypercube"\n')
-    with pytest.raises(CampaignError, match="only independent random draws"):
+    with pytest.raises(CampaignError, match="only independent random samples"):
         run_until_decided(load_campaign(str(latin)), tmp_path / "run", ExecutorConfig(jobs=1), RecordingWatch())

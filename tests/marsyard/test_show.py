@@ -96,14 +96,14 @@ def test_every_dispersion_is_reported(campaign: Path) -> None:
     result = marsyard("show", campaign)
     assert (result.status, result.err) == (0, "")
     for text in (
-        "sampling: Latin hypercube at each point of a grid over error_scale; case 0 is the nominal one",
+        "sampling: Latin hypercube at each point of a grid over error_scale; case 0 is the nominal case",
         "normal(mean=5.0, sd=3.0)",
         "flown",
         "to the north",
         "gamma(truncate=[1500.0, 3000.0], a=3.0, loc=1500.0, scale=100 + 2 *",
         "by formula",
         "0.5 to 1.5",
-        "not stated",
+        "no source",
         "covariance",
         "dispersed; nominal 2000.0",
     ):
@@ -143,10 +143,10 @@ def test_draws_are_shown_as_table_json_and_figure(campaign: Path, tmp_path: Path
         (["--draw", "0"], "--draw 0: the campaign has 25 cases; allowed: 1 to 25"),
         (["--draw", "26"], "allowed: 1 to 25"),
         (["--figure", "x.svg"], "give the number of cases with --draw N"),
-        (["--draw", "3", "--figure", "x.pdf"], "--figure x.pdf: unknown kind of picture; allowed: .svg, .png"),
-        (["--draw", "1", "--figure", "x.png"], "nothing is drawn in 1 case"),
+        (["--draw", "3", "--figure", "x.pdf"], "--figure x.pdf: unknown file format; allowed: .svg, .png"),
+        (["--draw", "1", "--figure", "x.png"], "no parameter is drawn in 1 case"),
         (["--draw", "3", "--figure", "/no/x.png"], "/no/x.png: cannot be written"),
-        (["--set", "cases=26"], "--set cases=26: cases: 25 cases behind the nominal one cannot be laid out: the grid"),
+        (["--set", "cases=26"], "--set cases=26: cases: 25 cases after the nominal case do not fit"),
     ],
 )
 def test_invalid_options_are_rejected(campaign: Path, arguments: list[str], message: str) -> None:

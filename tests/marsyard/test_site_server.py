@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.cli.outcome import server
+from marsyard.cli.outcome import create_server
 
 
 @pytest.fixture
 def port(tmp_path: Path) -> Iterator[int]:
     (tmp_path / "index.html").write_text("the site")
-    with server(tmp_path, "127.0.0.1", 0) as http_server:
+    with create_server(tmp_path, "127.0.0.1", 0) as http_server:
         threading.Thread(target=http_server.serve_forever, daemon=True).start()
         yield http_server.server_port
         http_server.shutdown()

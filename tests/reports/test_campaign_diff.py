@@ -10,12 +10,12 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.comparison import (
-    Contrast,
-    Figure,
+    Metric,
+    MetricComparison,
     build_sample,
     campaign_diff_grid,
     compare_campaigns,
-    list_figures,
+    list_metrics,
 )
 from marsyard.reports.statistics.changes import difference_p
 from marsyard.reports.stored import StoredRun, read_run
@@ -24,7 +24,7 @@ Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
 
 
-def _compare(first: Path, second: Path) -> tuple[bool, dict[str, Contrast]]:
+def _compare(first: Path, second: Path) -> tuple[bool, dict[str, MetricComparison]]:
     paired, contrasts = compare_campaigns(read_run(first), read_run(second))
     return paired, {contrast.name: contrast for contrast in contrasts}
 
@@ -37,7 +37,7 @@ def test_same_draws_are_compared_in_pairs(make_rows: Rows, make_run: MakeRun) ->
     # errors larger by 2 %: the paired test detects them in spite of the large scatter
     assert contrasts["velocity error (m/s)"].p_value < 1e-9
     assert contrasts["answered"].p_value == 1.0
-    assert contrasts["came to an end"].second.level == 1.0
+    assert contrasts["came to an end"].second.summary_value == 1.0
     # with four terrains the sign test has p = 2 / 2^4, times 4 for the number of figures
     few = make_rows(200)
     worse = few.assign(velocity_error_m_s=few["velocity_error_m_s"] * 1.02)
@@ -73,8 +73,8 @@ def test_terrains_of_different_sites_are_not_paired(make_rows: Rows, make_run: M
     assert difference_p(first_sample, second_sample) < 1e-3
 
 
-def _select_errors(run: StoredRun) -> tuple[pd.DataFrame, Figure]:
-    frame, figures = list_figures(run)
+def _select_errors(run: StoredRun) -> tuple[pd.DataFrame, Metric]:
+    frame, figures = list_metrics(run)
     return frame, next(figure for figure in figures if figure.name == "velocity error (m/s)")
 
 

@@ -157,7 +157,7 @@ def test_small_report_contains_the_main_results(
 def test_report_without_requirements_has_exit_code_0(make_rows: Rows, make_run: MakeRun) -> None:
     text, page, twin = _write_and_read(make_run(make_rows(24)[FULL_COLUMNS], []))
     _check_page(text, page)
-    assert "asks for no requirement" in text
+    assert "has no requirement" in text
     assert (twin["exit_code"], twin["verdicts"]) == (0, [])
     assert "velocity error (m/s)" in text
 
@@ -170,7 +170,7 @@ def test_requirement_met_by_rate_has_its_own_symbol(
     text, _, twin = _write_and_read(directory)
     assert '<div class="headline status-met-by-rate">' in text
     assert ".status-met-by-rate { --status: var(--rate)" in text
-    assert "(decided by rate)." in text
+    assert "(evaluated by observed rate)." in text
     diamond = "M12 1L23 12 12 23 1 12z"
     assert diamond in text.split("<span>MET BY RATE</span>")[0].rsplit("<svg", 1)[1]
     assert (twin["verdict"], twin["exit_code"]) == ("MET BY RATE", 3)
@@ -257,3 +257,14 @@ def test_report_is_reproducible(make_rows: Rows, make_run: MakeRun) -> None:
     directory = make_run(make_rows(24)[[*MIN_COLUMNS, "off_nadir_max_deg", "terrain"]])
     first = write_report(directory).read_bytes()
     assert write_report(directory).read_bytes() == first
+
+
+def test_wrong_answers_are_counted_in_the_unit_of_the_metric(make_run: MakeRun, make_rows: Rows) -> None:
+    """A requirement may scale its metric: 60 times 0.05 is above 2, 60 times 0.01 is not."""
+    frame = make_rows(24).assign(velocity_error_m_s=np.where(np.arange(24) < 6, 0.05, 0.01), answered=True)
+    requirement = {"id": "SCALED", "metric": "velocity_error_m_s", "bound": 2.0, "scale": 60.0}
+    _, _, report = _write_and_read(
+        make_run(frame=frame, requirements=[requirement | {"probability": 0.9, "confidence": 0.9}])
+    )
+    wrong = next(fraction for name, fraction in report["sections"]["answers"].items() if name.startswith("wrong"))
+    assert (wrong["hits"], wrong["n"]) == (6, 24)

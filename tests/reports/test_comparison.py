@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from marsyard.reports.common_sections import consistencies, consistency
-from marsyard.reports.comparison import comparison, select_algorithm
+from marsyard.reports.common_sections import evaluate_consistencies, evaluate_consistency
+from marsyard.reports.comparison import compare_algorithms, select_algorithm
 
 
 def make_paired_rows(first_errors: list[float], other_errors: list[float]) -> pd.DataFrame:
@@ -22,7 +22,9 @@ def make_paired_rows(first_errors: list[float], other_errors: list[float]) -> pd
 
 def test_paired_comparison_counts_and_mean_difference() -> None:
     nan = float("nan")
-    contenders, (difference,) = comparison(make_paired_rows([1, 2, 3, 9], [2, 3, nan, 4]), "velocity_error_m_s", 5.0)
+    contenders, (difference,) = compare_algorithms(
+        make_paired_rows([1, 2, 3, 9], [2, 3, nan, 4]), "velocity_error_m_s", 5.0
+    )
     assert [
         (contender.name, contender.answered, contender.failed, contender.succeeded) for contender in contenders
     ] == [("dimes", 4, 0, 3), ("other", 3, 1, 3)]
@@ -33,15 +35,15 @@ def test_paired_comparison_counts_and_mean_difference() -> None:
 def test_p_values_are_corrected_for_the_number_of_algorithms() -> None:
     frame = make_paired_rows([1.0] * 12, [2.0] * 12)
     third = frame.filter(like="other.").rename(columns=lambda name: name.replace("other.", "third."))
-    (single,) = comparison(frame, "velocity_error_m_s", 1.5)[1]
-    both = comparison(pd.concat([frame, third], axis=1), "velocity_error_m_s", 1.5)[1]
+    (single,) = compare_algorithms(frame, "velocity_error_m_s", 1.5)[1]
+    both = compare_algorithms(pd.concat([frame, third], axis=1), "velocity_error_m_s", 1.5)[1]
     assert [difference.success_p for difference in both] == pytest.approx([2.0 * single.success_p] * 2)
     assert [difference.error_p for difference in both] == pytest.approx([2.0 * single.error_p] * 2)
 
 
 def test_single_algorithm_gives_no_comparison() -> None:
     frame = make_paired_rows([1, 2], [1, 2])[["case", "algorithm", "outcome", "answered", "velocity_error_m_s"]]
-    assert comparison(frame, "velocity_error_m_s", 5.0) == ([], [])
+    assert compare_algorithms(frame, "velocity_error_m_s", 5.0) == ([], [])
 
 
 def test_columns_of_a_compared_algorithm_are_selected() -> None:
@@ -53,14 +55,14 @@ def test_columns_of_a_compared_algorithm_are_selected() -> None:
 
 def test_correct_covariances_are_consistent_at_95_percent() -> None:
     rng = np.random.default_rng(7)
-    words = [consistency(stats.chi2.rvs(2, size=50, random_state=rng))["word"] for _ in range(400)]
+    words = [evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng))["word"] for _ in range(400)]
     assert 0.91 <= words.count("consistent") / 400 <= 0.985  # 0.95, minus 4 and plus 3 standard deviations
-    overconfident = consistency(stats.chi2.rvs(2, size=50, random_state=rng) * 4.0)
+    overconfident = evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng) * 4.0)
     assert overconfident["word"] == "too sure"
-    assert consistency(stats.chi2.rvs(2, size=50, random_state=rng) / 4.0)["word"] == "too cautious"
+    assert evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng) / 4.0)["word"] == "too cautious"
 
 
 def test_consistency_covers_all_algorithms_with_covariances() -> None:
     frame = make_paired_rows([1, 2], [3, 4]).assign(**{"other.velocity_nees": [2.0, 2.0]})
-    ((name, values),) = consistencies(frame).items()
+    ((name, values),) = evaluate_consistencies(frame).items()
     assert (name, values["n"], values["mean"], values["word"]) == ("other", 2, 2.0, "consistent")

@@ -8,18 +8,20 @@ import numpy as np
 from matplotlib.collections import PathCollection
 from matplotlib.patches import Rectangle
 
-from marsyard.reports.draws import Drawn, draws_figure, save_figure
+from marsyard.reports.draws import ParameterSample, draws_figure, save_figure
 
 
-def _make_draws() -> list[Drawn]:
+def _make_draws() -> list[ParameterSample]:
     rng = np.random.default_rng(1)
     x = rng.normal(size=300)
     return [
-        Drawn("wind.east_m_s", x.tolist(), rng.normal(size=1000).tolist()),
-        Drawn("wind.north_m_s", (0.9 * x + 0.1 * rng.normal(size=300)).tolist()),
-        Drawn("heights_m.1", rng.uniform(size=300).tolist()),
-        Drawn("kind", [["rough", "plain", {"a": 1}][k % 3] for k in range(300)], ["rough", "plain", {"a": 1}]),
-        Drawn("sleep_s", [0.0] * 300),
+        ParameterSample("wind.east_m_s", x.tolist(), rng.normal(size=1000).tolist()),
+        ParameterSample("wind.north_m_s", (0.9 * x + 0.1 * rng.normal(size=300)).tolist()),
+        ParameterSample("heights_m.1", rng.uniform(size=300).tolist()),
+        ParameterSample(
+            "kind", [["rough", "plain", {"a": 1}][k % 3] for k in range(300)], ["rough", "plain", {"a": 1}]
+        ),
+        ParameterSample("sleep_s", [0.0] * 300),
     ]
 
 

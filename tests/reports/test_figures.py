@@ -28,7 +28,7 @@ METRIC = "velocity_error_m_s"
 def _draw_all_figures(frame: pd.DataFrame, bound: float | None) -> list[Figure | None]:
     return [
         error_scatter(frame, METRIC, bound),
-        error_scatter(frame, METRIC, bound, close=True),
+        error_scatter(frame, METRIC, bound, enlarged=True),
         error_histogram(frame, METRIC, bound),
         error_distribution(frame, METRIC, bound),
         error_scatter_against(frame, METRIC, "off_nadir_max_deg", bound),

@@ -10,10 +10,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.reports.evaluation import overall
+from marsyard.reports.evaluation import combine_verdicts
 from marsyard.reports.hda.sections import MAP_EFFECTS, distance_grid
 from marsyard.reports.kinds import correlation_text
-from marsyard.reports.sections import driver_plates
+from marsyard.reports.sections import driver_figures
 from marsyard.reports.traceability import junit_xml
 from marsyard.reports.wording import NOTHING, number
 
@@ -22,10 +22,10 @@ METRIC = "velocity_error_m_s"
 
 
 def test_rank_correlations_have_intervals_and_need_enough_cases(make_rows: Rows) -> None:
-    few_captions = [figure.caption for figure in driver_plates(make_rows(12, answered=1.0), METRIC, 5.0)]
+    few_captions = [figure.caption for figure in driver_figures(make_rows(12, answered=1.0), METRIC, 5.0)]
     assert few_captions
     assert not [caption for caption in few_captions if "correlation" in caption]
-    captions = [figure.caption for figure in driver_plates(make_rows(60, answered=1.0), METRIC, 5.0)]
+    captions = [figure.caption for figure in driver_figures(make_rows(60, answered=1.0), METRIC, 5.0)]
     pattern = r"rank correlation −?\d\.\d{3} \(−?\d\.\d{3} to −?\d\.\d{3} at 90 % confidence\)"
     assert all(re.search(pattern, caption) for caption in captions)
 
@@ -55,5 +55,5 @@ def test_rounding_errors_are_printed_as_zero() -> None:
 
 def test_single_crashed_case_is_written_in_singular(make_rows: Rows) -> None:
     frame = make_rows(8, crashed=1)
-    suite = Xml.fromstring(junit_xml("one", [], overall([], frame)))  # noqa: S314
+    suite = Xml.fromstring(junit_xml("one", [], combine_verdicts([], frame)))  # noqa: S314
     assert [failure.get("message") for failure in suite.iter("failure")] == ["1 case crashed"]

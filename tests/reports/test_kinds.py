@@ -64,7 +64,7 @@ def make_rows_of_two_altitudes() -> pd.DataFrame:
 def test_declared_section_shows_its_parts_in_order() -> None:
     section = ALTITUDE(make_subject(make_rows_of_two_altitudes()))
     assert section is not None
-    assert [len(block.plates) for block in section.blocks] == [0, 1, 0, 1, 0, 1, 0]
+    assert [len(block.figures) for block in section.blocks] == [0, 1, 0, 1, 0, 1, 0]
     assert section.blocks[-1].note == "Made up."
     low, is_high = section.data["by_condition"]
     assert (low["altitude_m"], low["answered"]["hits"], low["answered"]["n"]) == (400.0, 20, 20)
@@ -85,11 +85,11 @@ def test_missing_columns_give_no_section() -> None:
 
 def test_cumulative_curve_rises_or_falls() -> None:
     values = {"ours": np.array([1.0, 2.0, 3.0, 4.0])}
-    for falling, at_two in ((False, 0.5), (True, 0.5)):
-        (line,) = cumulative_figure(values, ("", ""), falling=falling).axes[0].get_lines()
+    for complementary, at_two in ((False, 0.5), (True, 0.5)):
+        (line,) = cumulative_figure(values, ("", ""), complementary=complementary).axes[0].get_lines()
         heights = dict(np.column_stack([np.asarray(line.get_xdata()), np.asarray(line.get_ydata())]).tolist())
         assert heights[2.0] == at_two
-        assert heights[4.0] == (0.0 if falling else 1.0)
+        assert heights[4.0] == (0.0 if complementary else 1.0)
 
 
 def test_bins_contain_each_finite_value_once() -> None:
@@ -161,7 +161,7 @@ def test_invalid_report_of_a_system_gives_a_warning(
 ) -> None:
     other_system(report)
     try:
-        with pytest.warns(UserWarning, match=f"system 'altitude'.*{message}.*are left out"):
+        with pytest.warns(UserWarning, match=f"system 'altitude'.*{message}.*are omitted"):
             assert presentations() == ()
     finally:
         presentations.cache_clear()

@@ -18,8 +18,8 @@ from marsyard.reports.history import (
     History,
     NightCampaign,
     NightFigure,
-    changes,
-    compare_night,
+    find_changes,
+    list_comparisons,
     night_text,
 )
 from marsyard.reports.statistics.changes import Sample
@@ -55,7 +55,7 @@ def _detect_changes(
         before = [_draw_night(rng, pool) for _ in range(7)]
         for index, figure in enumerate(_draw_night(rng, pool, factor)):
             comparisons.append(Comparison(campaign, figure, [night[index].sample for night in before]))
-    return changes(comparisons)
+    return find_changes(comparisons)
 
 
 def test_noise_is_not_reported() -> None:
@@ -112,9 +112,9 @@ def test_nights_are_compared_with_finished_nights_of_the_campaign(tmp_path: Path
         night = _add_night(history, 4)
         states = {entry.night: entry.state for entry in history.nights()}
         assert states == {1: FINISHED, 2: FINISHED, 3: FINISHED, 4: INTERRUPTED, 5: FINISHED, night: RUNNING}
-        comparisons = compare_night(history, night)
+        comparisons = list_comparisons(history, night)
         assert {len(entry.before) for entry in comparisons} == {3}
-        assert changes(comparisons) == []
+        assert find_changes(comparisons) == []
 
 
 def test_reported_change_restarts_the_history(tmp_path: Path) -> None:
@@ -122,16 +122,16 @@ def test_reported_change_restarts_the_history(tmp_path: Path) -> None:
         for seed in range(4):
             history.finish(_add_night(history, seed), FINISHED)
         night = _add_night(history, 5, error_factor=3.0)
-        regressions = changes(compare_night(history, night))
+        regressions = find_changes(list_comparisons(history, night))
         assert "error (m)" in {entry.figure for entry in regressions}
         history.finish(
             night, FINISHED, [(entry.campaign, entry.figure, entry.p_value, entry.worse) for entry in regressions]
         )
         # after a reported change, later nights are compared with that night only
         next_night = _add_night(history, 6, error_factor=3.0)
-        n_compared = {entry.figure.figure: len(entry.before) for entry in compare_night(history, next_night)}
+        n_compared = {entry.figure.figure: len(entry.before) for entry in list_comparisons(history, next_night)}
         assert n_compared["error (m)"] == 1
-        assert changes(compare_night(history, next_night)) == []
+        assert find_changes(list_comparisons(history, next_night)) == []
 
 
 def test_failed_write_adds_no_figures(tmp_path: Path) -> None:
@@ -146,7 +146,7 @@ def test_failed_write_adds_no_figures(tmp_path: Path) -> None:
 def test_invalid_history_files_are_rejected(tmp_path: Path) -> None:
     path = tmp_path / "history.sqlite"
     path.write_bytes(b"nothing of the kind, and long enough to be looked at" * 10)
-    with pytest.raises(StoreError, match="no history"):
+    with pytest.raises(StoreError, match="not a history of nights"):
         History(path)
     other = tmp_path / "other.sqlite"
     connection = sqlite3.connect(other)
@@ -168,11 +168,11 @@ def test_page_lists_regressions_and_interrupted_nights(tmp_path: Path) -> None:
     ]
     text = night_text(later, [earlier], [NightCampaign(hostile, "d", "x", "FAIL", 1, hostile)], changes_of_night, 6)
     assert text.startswith("# Night 2: 1 FAIL, 1 regression\n")
-    assert "- **first: DIMES-VEL**: 95.00 % in 7 nights before, 70.00 % now (p = 2e-06)" in text
+    assert "- **first: DIMES-VEL**: 95.00 % in 7 earlier nights, 70.00 % now (p = 2e-06)" in text
     assert text.index("## Regressions") < text.index("DIMES-VEL") < text.index("## Improvements")
     assert "Night 1, begun" in text
     assert "<script>" not in text
     assert "| a&#124;b \\# &#60;script&#62;\\`\\* | FAIL |" in text
     unchanged_text = night_text(later, [], [_make_campaign()], [], 6)
-    assert "None has changed." in unchanged_text
+    assert "No metric has changed." in unchanged_text
     assert "no history" not in unchanged_text

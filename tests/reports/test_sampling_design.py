@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 
 from marsyard.reports.campaign import write_report
-from marsyard.reports.evaluation import exit_code, overall
+from marsyard.reports.evaluation import combine_verdicts, exit_code
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design
 from marsyard.reports.tables import verdict_table
 from marsyard.reports.verdicts import Status, evaluate_requirements
@@ -25,7 +25,7 @@ MakeRun = Callable[..., Path]
 
 GRID = {"a": {"distribution": "grid", "values": [1, 2]}, "b": {"distribution": "uniform", "low": 0, "high": 1}}
 DESIGNS = [
-    ({"design": {"kind": "latin-hypercube"}}, "the design is Latin hypercube, and only independent random draws"),
+    ({"design": {"kind": "latin-hypercube"}}, "the design is Latin hypercube, and only independent random samples"),
     ({"design": {"kind": "sobol"}}, "the design is scrambled Sobol, and only"),
     ({"dispersions": GRID}, "the design is random draws at each point of a grid over a, and only"),
 ]
@@ -55,7 +55,7 @@ def test_designs_report_rates_without_confidence(
         assert verdict.further_cases is None
         assert message in verdict.note
     verdicts = evaluate_requirements(frame, requirements, design)
-    summary = overall(verdicts, frame, design)
+    summary = combine_verdicts(verdicts, frame, design)
     assert (summary.word, message in summary.sentence) == ("INSUFFICIENT", True)
     assert exit_code(verdicts, crashed=False) == 3
     assert exit_code(verdicts, crashed=True) == 1
@@ -81,17 +81,17 @@ def test_rate_of_a_design_decides_by_estimate(
     assert message in met.note
     assert exit_code([met], crashed=False) == 3
     assert exit_code([met, missed], crashed=False) == 1
-    summary = overall([met, missed], frame, design)
+    summary = combine_verdicts([met, missed], frame, design)
     assert summary.word == "FAIL"
     assert summary.sentence.startswith("1 of 2 requirements met by the rate of these cases. No probability statement: ")
     empty = evaluate_requirements(frame.assign(answered=False), [{**requirements[0], "population": "valid"}], design)
     assert empty[0].status is Status.INSUFFICIENT
-    assert not overall(empty, frame, design).sentence.startswith("0 of")
+    assert not combine_verdicts(empty, frame, design).sentence.startswith("0 of")
 
 
 def test_design_without_requirements_has_no_verdict(make_rows: Rows) -> None:
     frame = make_rows(5)
-    assert overall([], frame, SamplingDesign("sobol")).status is None
+    assert combine_verdicts([], frame, SamplingDesign("sobol")).status is None
     assert exit_code([], crashed=False) == 0
 
 
@@ -117,10 +117,10 @@ def test_page_and_json_describe_the_design(make_rows: Rows, make_run: MakeRun) -
     page = write_report(run).read_text()
     twin = json.loads((run / "report.json").read_text())
     for text in (
-        "The cases are no independent random draws: Latin hypercube; case 0 is the nominal one.",
+        "The cases are not independent random samples: Latin hypercube; case 0 is the nominal case.",
         "velocity error (m/s) 77.0",
         "No probability statement: the design is Latin hypercube",
-        "% seen",
+        "% observed",
     ):
         assert text in page, text
     assert "Additional cases needed</th>" in page
@@ -132,7 +132,7 @@ def test_page_and_json_describe_the_design(make_rows: Rows, make_run: MakeRun) -
         "first_look": None,
         "terrains": None,
         "independent": False,
-        "text": "Latin hypercube; case 0 is the nominal one",
+        "text": "Latin hypercube; case 0 is the nominal case",
     }
     assert (twin["cases"], twin["exit_code"]) == (60, 3)
     assert 0 not in [int(case) for case in twin["worst_cases"]]

@@ -12,9 +12,9 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.campaign import write_report
-from marsyard.reports.common_sections import FAULT_OUTCOMES, answer_shares, faults_section
-from marsyard.reports.conditions import conditions_section, cuts, terrain_spread
-from marsyard.reports.dimes.sections import FIRING, LANDING, rank_effects, sensitivity_section
+from marsyard.reports.common_sections import FAULT_OUTCOMES, answer_fractions, faults_section
+from marsyard.reports.conditions import bin_conditions, conditions_section, terrain_variance
+from marsyard.reports.dimes.sections import FIRING, LANDING, estimate_effects, sensitivity_section
 from marsyard.reports.section import Section, Subject
 from marsyard.reports.stored import StoredRun
 
@@ -51,20 +51,20 @@ def test_answer_rates_have_clopper_pearson_intervals() -> None:
     frame = pd.DataFrame(
         {"answered": answered, "feasible_overlap": has_overlap, METRIC: magnitude, "terrain": np.arange(n) // 2}
     )
-    rates = list(answer_shares(make_subject(frame)).values())
+    rates = list(answer_fractions(make_subject(frame)).values())
     assert [(rate.hits, rate.n) for rate in rates] == [(170, 200), (170, 180), (20, 200), (1, 170)]
     # 1 of 170, two-sided Clopper-Pearson at 90 %: BetaInv(0.05; 1, 170) and BetaInv(0.95; 2, 169)
     assert (rates[3].lower, rates[3].upper) == pytest.approx((0.000302, 0.027594), abs=2e-5)
     # the two cases of a terrain fail together, so the interval for shared terrains is wider
     assert rates[0].shared_lower is not None
     assert rates[0].shared_lower < rates[0].lower
-    assert answer_shares(make_subject(frame.drop(columns="answered"))) == {}
+    assert answer_fractions(make_subject(frame.drop(columns="answered"))) == {}
 
 
 def test_crashed_cases_of_unknown_overlap_count_as_failures(make_rows: Rows) -> None:
     frame = make_rows(50, answered=1.0, crashed=5)
     has_overlap: list[bool | None] = [True] * 45 + [None] * 5
-    rates = answer_shares(make_subject(frame.assign(feasible_overlap=pd.Series(has_overlap, dtype=object))))
+    rates = answer_fractions(make_subject(frame.assign(feasible_overlap=pd.Series(has_overlap, dtype=object))))
     assert [(rate.hits, rate.n) for rate in rates.values()] == [(45, 50), (45, 50), (0, 45), (0, 45)]
 
 
@@ -75,7 +75,7 @@ def test_condition_bins_have_correct_error_statistics() -> None:
     frame = pd.DataFrame({"answered": rng.random(n) < 0.9, "attitude_rate_max_deg_s": rate, "site": ["a", "b"] * 500})
     # x: a bias proportional to the rate; y: noise with standard deviation 2
     frame = assign_errors(frame, np.column_stack([0.1 * rate, rng.normal(0.0, 2.0, n)]))
-    by_column = dict(cuts(frame))
+    by_column = dict(bin_conditions(frame))
     assert list(by_column) == ["attitude_rate_max_deg_s", "site"]
     for bins in by_column.values():
         np.testing.assert_array_equal(np.sum([is_in_bin for _, is_in_bin in bins], axis=0), 1)
@@ -94,10 +94,10 @@ def test_condition_bins_have_correct_error_statistics() -> None:
 
 def test_constant_conditions_are_omitted(make_rows: Rows) -> None:
     frame = make_rows(60).assign(sun_elevation_deg=40.0)
-    assert "sun_elevation_deg" not in dict(cuts(frame))
+    assert "sun_elevation_deg" not in dict(bin_conditions(frame))
     assert conditions_section(make_subject(frame[["answered", METRIC]])) is None
     # too few cases per category
-    assert "site" not in dict(cuts(frame.assign(site=[f"site {k % 10}" for k in range(60)])))
+    assert "site" not in dict(bin_conditions(frame.assign(site=[f"site {k % 10}" for k in range(60)])))
 
 
 def test_variance_between_terrains_is_estimated() -> None:
@@ -106,17 +106,17 @@ def test_variance_between_terrains_is_estimated() -> None:
     # standard deviations 3 within and 2 between terrains: 4/13 of the variance, standard error about 0.035
     error = 2.0 * rng.standard_normal(200)[terrain] + 3.0 * rng.standard_normal(1000)
     frame = pd.DataFrame({"answered": True, "terrain": terrain, METRIC: error})
-    spread = terrain_spread(frame, METRIC)
+    spread = terrain_variance(frame, METRIC)
     assert spread is not None
     assert spread["share"] == pytest.approx(4.0 / 13.0, abs=0.1)
     assert spread["within_sd"] == pytest.approx(3.0, rel=0.08)
     assert spread["between_sd"] == pytest.approx(2.0, rel=0.2)
     assert spread["p_value"] < 1e-6
-    uncorrelated = terrain_spread(frame.assign(**{METRIC: rng.standard_normal(1000)}), METRIC)
+    uncorrelated = terrain_variance(frame.assign(**{METRIC: rng.standard_normal(1000)}), METRIC)
     assert uncorrelated is not None
     assert uncorrelated["p_value"] > 0.01
-    assert terrain_spread(frame.assign(terrain=np.arange(1000)), METRIC) is None
-    assert terrain_spread(frame.drop(columns="terrain"), METRIC) is None
+    assert terrain_variance(frame.assign(terrain=np.arange(1000)), METRIC) is None
+    assert terrain_variance(frame.drop(columns="terrain"), METRIC) is None
 
 
 def test_firing_section_needs_the_firing_error(make_rows: Rows) -> None:
@@ -166,7 +166,9 @@ def make_sensitive_rows(n: int, terrains: int, seed: int = 3) -> pd.DataFrame:
 
 
 def test_sensitivity_finds_the_driver_and_bounds_the_others() -> None:
-    effects = {driver.column: driver for driver in rank_effects(make_subject(make_sensitive_rows(600, 600)), METRIC)}
+    effects = {
+        driver.column: driver for driver in estimate_effects(make_subject(make_sensitive_rows(600, 600)), METRIC)
+    }
     effect, low, high = effects["attitude_rate_max_deg_s"].effect
     assert effect == pytest.approx(1.0, abs=0.08)
     assert low < 1.0 < high
@@ -183,7 +185,7 @@ def test_sensitivity_intervals_have_90_percent_coverage() -> None:
     for seed in range(40):
         (driver,) = (
             candidate
-            for candidate in rank_effects(make_subject(make_sensitive_rows(120, 120, seed)), METRIC)
+            for candidate in estimate_effects(make_subject(make_sensitive_rows(120, 120, seed)), METRIC)
             if candidate.column == "attitude_rate_max_deg_s"
         )
         # true effect between this sample's quantiles: 1/54 m/s per deg/s

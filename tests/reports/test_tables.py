@@ -51,7 +51,7 @@ def test_verdict_table_is_complete_at_any_width(make_rows: Rows, velocity: dict[
 
 
 def test_verdict_table_without_requirements_is_marked() -> None:
-    assert "none asked" in _print_table(verdict_table([]), 80)
+    assert "no requirement" in _print_table(verdict_table([]), 80)
 
 
 def test_texts_are_not_interpreted_as_markup(make_rows: Rows, velocity: dict[str, Any]) -> None:
@@ -137,4 +137,4 @@ def test_rate_without_cases_has_the_interval_0_to_1() -> None:
     empty = fraction_of(np.zeros(0, dtype=np.bool_), pd.DataFrame())
     assert (empty.hits, empty.n) == (0, 0)
     assert math.isnan(empty.share)
-    assert empty.sound == (0.0, 1.0)
+    assert empty.clustered_interval == (0.0, 1.0)

@@ -12,7 +12,7 @@ from xml.etree import ElementTree as Xml
 import pandas as pd
 
 from marsyard.reports.campaign import write_report
-from marsyard.reports.evaluation import overall
+from marsyard.reports.evaluation import combine_verdicts
 from marsyard.reports.traceability import COLUMNS, junit_xml, requirement_evidence, verification_csv
 from marsyard.reports.verdicts import evaluate_requirements
 
@@ -58,7 +58,7 @@ def test_junit_lists_failures_and_undecided_requirements(make_rows: Rows, veloci
         by_rate,
     ]
     verdicts = evaluate_requirements(frame, requirements)
-    suite = Xml.fromstring(junit_xml(HOSTILE, verdicts, overall(verdicts, frame)))  # noqa: S314
+    suite = Xml.fromstring(junit_xml(HOSTILE, verdicts, combine_verdicts(verdicts, frame)))  # noqa: S314
     assert (suite.get("tests"), suite.get("failures"), suite.get("skipped")) == ("5", "2", "2")
     fails, undecided, passes, met, completed = suite
     assert _read_message(met, "skipped").startswith("MET BY RATE: ")

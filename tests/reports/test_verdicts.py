@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marsyard.reports.evaluation import exit_code, overall
+from marsyard.reports.evaluation import combine_verdicts, exit_code
 from marsyard.reports.sampling_design import SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
 from marsyard.reports.verdicts import Status, Verdict, evaluate_requirements
@@ -213,7 +213,7 @@ def test_crashed_cases_outside_the_population_prevent_a_pass(population: str) ->
     for rule in ("confidence", "estimate"):
         verdict = _evaluate(frame, criterion, population=population, decide_by=rule)
         assert (verdict.status, verdict.n, verdict.failures) == (Status.INSUFFICIENT, 40, 0)
-        assert "10 cases did not come to an end" in verdict.note
+        assert "10 cases did not finish" in verdict.note
     # too few crashes, or crashes outside the population, do not change the verdict
     few_crashes = _make_rows(200, 0).assign(near=True)
     few_crashes.loc[:1, "outcome"] = "CRASHED"
@@ -232,11 +232,11 @@ def test_estimate_decides_with_shared_terrains(velocity: dict[str, Any]) -> None
 def test_estimate_verdict_reports_the_confidence_verdict(velocity: dict[str, Any]) -> None:
     verdict = _evaluate(_make_rows(120, 1), velocity, decide_by="estimate")
     assert (verdict.status, verdict.confident_status) == (Status.MET_BY_RATE, Status.INSUFFICIENT)
-    assert "at 90 % confidence it would be INSUFFICIENT" in verdict.note
-    summary = overall([verdict], _make_rows(120, 1))
+    assert "at 90 % confidence the verdict would be INSUFFICIENT" in verdict.note
+    summary = combine_verdicts([verdict], _make_rows(120, 1))
     assert summary.word == "MET BY RATE"
-    assert "1 of 1 requirement met by the rate alone, not at the confidence" in summary.sentence
-    assert verdict.statement.endswith("(decided by rate).")
+    assert "1 of 1 requirement met by the rate only, not at the required confidence" in summary.sentence
+    assert verdict.statement.endswith("(evaluated by observed rate).")
 
 
 def test_rate_without_confidence_never_passes(velocity: dict[str, Any]) -> None:
@@ -245,7 +245,7 @@ def test_rate_without_confidence_never_passes(velocity: dict[str, Any]) -> None:
     few = _evaluate(_make_rows(8, 0), harm)
     # 334 = 1 / 0.003 cases, of which one may fail
     assert (few.status, few.further_cases) == (Status.INSUFFICIENT, 334 - 8)
-    assert "takes 334 cases or more" in few.note
+    assert "needs at least 334 cases" in few.note
     assert _evaluate(_make_rows(333, 0), harm).status is Status.INSUFFICIENT
     assert _evaluate(_make_rows(334, 1), harm).status is Status.MET_BY_RATE
     assert _evaluate(_make_rows(334, 2), harm).status is Status.FAIL
@@ -255,8 +255,8 @@ def test_rate_without_confidence_never_passes(velocity: dict[str, Any]) -> None:
     assert exit_code([by_rate], crashed=False) == 3
     assert exit_code([_evaluate(_make_rows(334, 1), harm, accept_rate=True)], crashed=False) == 0
     passing = _evaluate(_make_rows(230, 0), velocity)
-    assert overall([passing, by_rate], _make_rows(334, 1)).word == "MET BY RATE"
-    assert overall([passing, by_rate, few], _make_rows(334, 1)).word == "INSUFFICIENT"
+    assert combine_verdicts([passing, by_rate], _make_rows(334, 1)).word == "MET BY RATE"
+    assert combine_verdicts([passing, by_rate, few], _make_rows(334, 1)).word == "INSUFFICIENT"
 
 
 @pytest.mark.parametrize(("probability", "min_cases"), [(0.5, 2), (0.9, 10), (0.92, 13), (0.95, 20), (0.99, 100)])
@@ -303,7 +303,7 @@ def test_consumer_risk_at_the_minimum_number_of_cases(velocity: dict[str, Any]) 
     # ten cases on each of 230 terrains count as 230 cases
     verdict = _evaluate(_make_rows(2300, 0).assign(terrain=np.arange(2300) // 10), velocity)
     assert verdict.consumer_risk == pytest.approx(0.99**230)
-    assert "the design effect taken for 10" in verdict.note
+    assert "the design effect assumed to be 10" in verdict.note
 
 
 def test_missing_answered_column_is_noted(velocity: dict[str, Any]) -> None:
@@ -360,12 +360,12 @@ def test_advice_names_the_limiting_number_of_terrains(velocity: dict[str, Any]) 
     (verdict,) = evaluate_requirements(frame, [velocity], design)
     assert (verdict.status, verdict.further_cases) == (Status.INSUFFICIENT, None)
     message = (
-        "The campaign draws from 8 terrains (location.bank = 8); 99 % at 90 % confidence takes at least 230 terrains: "
+        "The campaign draws from 8 terrains (location.bank = 8); 99 % at 90 % confidence needs at least 230 terrains: "
         "run the campaign again with --set location.bank=2300 -n 254."
     )
     assert message in verdict.note
-    assert message in overall([verdict], frame).sentence
-    assert "would do" not in overall([verdict], frame).sentence
+    assert message in combine_verdicts([verdict], frame).sentence
+    assert "would do" not in combine_verdicts([verdict], frame).sentence
     # 254 draws of 2300 terrains have 230 different terrains in more than 99 % of campaigns
     rng = np.random.default_rng(3)
     assert np.mean([np.unique(rng.integers(0, 2300, 254)).size >= 230 for _ in range(1000)]) > 0.99
@@ -414,11 +414,11 @@ def test_overall_verdict_is_the_worst(velocity: dict[str, Any]) -> None:
     frame = _make_rows(230, 0)
     passing, failing = _evaluate(frame, velocity), _evaluate(frame, velocity, bound=0.5)
     undecided = _evaluate(frame, velocity, probability=0.999)
-    assert overall([passing], frame).word == "PASS"
-    assert overall([passing, undecided], frame).word == "INSUFFICIENT"
-    assert overall([passing, undecided, failing], frame).word == "FAIL"
-    assert overall([], frame).status is None
-    assert "1 of 3 requirements not met" in overall([passing, undecided, failing], frame).sentence
+    assert combine_verdicts([passing], frame).word == "PASS"
+    assert combine_verdicts([passing, undecided], frame).word == "INSUFFICIENT"
+    assert combine_verdicts([passing, undecided, failing], frame).word == "FAIL"
+    assert combine_verdicts([], frame).status is None
+    assert "1 of 3 requirements not met" in combine_verdicts([passing, undecided, failing], frame).sentence
 
 
 def test_exit_code_follows_the_worst_verdict(velocity: dict[str, Any]) -> None:
@@ -434,6 +434,6 @@ def test_exit_code_follows_the_worst_verdict(velocity: dict[str, Any]) -> None:
 
 
 def test_crashed_cases_are_counted_in_the_summary(make_rows: Rows) -> None:
-    summary = overall([], make_rows(24, crashed=2))
+    summary = combine_verdicts([], make_rows(24, crashed=2))
     assert summary.crashed == 2
     assert "2 cases crashed" in summary.sentence

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.campaigns.running.replay import examine
+from marsyard.campaigns.running.replay import run_conformance_checks
 from marsyard.scenarios.conformance import Finding, Subject, check_names, determine_task, inputs, run_check, trackers
 from marsyard.scenarios.conformance.inputs import TexturedPlane
 from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY
@@ -71,11 +71,11 @@ def format_estimator(lines: str) -> str:
         ),
         ("answer", "return 1 / 0", "it raised ZeroDivisionError: division by zero (bad_"),
         ("answer", "m.images[0].counts[:] = m.images[0].counts\nreturn NOTHING", "read-only"),
-        ("featureless", "return VelocityEstimate(Outcome.VALID, np.zeros(2))", "it answers VALID to pictures that are"),
+        ("featureless", "return VelocityEstimate(Outcome.VALID, np.zeros(2))", "it answers VALID to images that are"),
         ("saturated", "return NOTHING if seen(m) else 1 / 0", "it raised ZeroDivisionError"),
         ("inputs", "m.images[0].counts[:] = 0\nreturn NOTHING", "it changed its input"),
         ("inputs", "m.interval_velocities_m_s[0] -= 1\nreturn NOTHING", "it changed its input"),
-        ("deterministic", "return VelocityEstimate(Outcome.VALID, np.random.random(2))", "answers differently"),
+        ("deterministic", "return VelocityEstimate(Outcome.VALID, np.random.random(2))", "differ between two calls"),
         (
             "deterministic",
             "global KEPT\nwas = globals().get('KEPT', 0.0)\nKEPT = m.images[0].counts.mean()\n"
@@ -112,15 +112,15 @@ MOVING = "return VelocityEstimate(Outcome.VALID, np.ones(2)) if len(self.kept) >
     [
         ("answer", "return 3.0", "return NOTHING", "BAD_ANSWER: the answer is a float"),
         ("answer", "return None", "return None", "BAD_ANSWER: the answer is a NoneType"),
-        ("answer", "return VelocityEstimate(Outcome.VALID, np.ones(2))", "return NOTHING", "there is no last interval"),
+        ("answer", "return VelocityEstimate(Outcome.VALID, np.ones(2))", "return NOTHING", "no last interval"),
         (
             "answer",
             "return VelocityEstimate(Outcome.VALID, np.ones(2), span_s=(99.0, 101.0))",
             "return NOTHING",
-            "within the pictures' tags, 100.0 to 100.0 s",
+            "within the images' time tags, 100.0 to 100.0 s",
         ),
         ("answer", "return None", "return VelocityEstimate(Outcome.VALID, np.ones(2), span_s=(105.0, 101.0))", "first"),
-        ("saturated", "return None", MOVING, "it answers VALID to pictures that are saturated"),
+        ("saturated", "return None", MOVING, "it answers VALID to images that are saturated"),
         ("inputs", "frame.image.counts[:] = 0", "return NOTHING", "it changed its input"),
         (
             "inputs",
@@ -134,7 +134,7 @@ MOVING = "return VelocityEstimate(Outcome.VALID, np.ones(2)) if len(self.kept) >
             "return None",
             "t = self.kept[-1].image.time_s if self.kept else 0.0\n"
             "        return VelocityEstimate(Outcome.VALID, np.ones(2), span_s=(t, t))",
-            "it answers VALID to no picture",
+            "it answers VALID to no image",
         ),
         ("number", "return None", "first, second, third = self.kept[:3]\n        return NOTHING", "not enough values"),
     ],
@@ -156,7 +156,7 @@ def test_state_kept_between_descents_is_reported(tmp_path: Path, monkeypatch: py
     """
     result = run_suite(write_bad_module(tmp_path, monkeypatch, body), "deterministic", "start", "time")
     assert result["deterministic"].problem == "its answer depends on earlier cases"
-    assert result["start"].problem == "started again after two pictures, it answers differently"
+    assert result["start"].problem == "after a restart in the middle of a descent, its answer differs"
     assert result["time"].passed
 
 
@@ -180,11 +180,11 @@ def test_estimator_state_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyP
     [
         ("answer", "def update(self, m): return None", "BAD_ANSWER: the answer is a NoneType; allowed: a TargetUpdate"),
         ("answer", "def aim(self, pose, mast): return (0.0, 0.0)", "the aim is a tuple; allowed: a MastAim, or None"),
-        ("states", "def clear(self): pass", "its state once it is cleared is TrackingState.NORMAL"),
+        ("states", "def clear(self): pass", "its state after clear is TrackingState.NORMAL"),
         (
             "deterministic",
             "def clear(self): pass\n    def designate(self, t, p): self.track or super().designate(t, p)",
-            "cleared and given the target again, it answers differently",
+            "after clear and a second designation of the target, its answer differs",
         ),
         ("inputs", "def update(self, m): m.left.counts[:] = 0; return super().update(m)", "it changed its input"),
         (
@@ -216,7 +216,7 @@ def test_changed_process_state_is_reported(
     """Each check runs in a process whose state is compared afterwards."""
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     spec = write_bad_module(tmp_path, monkeypatch, format_estimator(f"{lines}\nreturn NOTHING"))
-    first = next(iter(examine(Subject(spec, "velocity", 60.0))))
+    first = next(iter(run_conformance_checks(Subject(spec, "velocity", 60.0))))
     assert (first.check, first.passed) == ("answer", False)
     assert problem in first.problem
     assert first.next_step
@@ -234,7 +234,7 @@ def test_task_is_inferred_from_name_and_methods(tmp_path: Path, monkeypatch: pyt
     assert determine_task(write_bad_module(tmp_path, monkeypatch, format_estimator("return NOTHING"))) == "velocity"
     with pytest.raises(ValueError, match="unknown algorithm 'vt'"):
         determine_task("vt")
-    with pytest.raises(ValueError, match="no algorithm at 'nowhere:Nothing'"):
+    with pytest.raises(ValueError, match="cannot import algorithm 'nowhere:Nothing'"):
         determine_task("nowhere:Nothing")
 
 
@@ -245,9 +245,9 @@ def test_rendered_plane_has_correct_parallax() -> None:
     plane = TexturedPlane(np.zeros(3), np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), 0.02)
     before = plane.radiance(camera)
     # 0.02 m at 10 m is 1 px: the image shifts by one column.
-    moved = TexturedPlane(np.array([0.02, 0.0, 0.0]), plane.along, plane.step_m)
+    moved = TexturedPlane(np.array([0.02, 0.0, 0.0]), plane.axes, plane.step_m)
     assert np.allclose(moved.radiance(camera)[:, 1:], before[:, :-1], atol=1e-6)
-    away = TexturedPlane(np.array([0.0, 0.0, 20.0]), plane.along, plane.step_m)
+    away = TexturedPlane(np.array([0.0, 0.0, 20.0]), plane.axes, plane.step_m)
     assert np.ptp(away.radiance(camera)) == 0.0
 
 
@@ -261,4 +261,4 @@ def test_inputs_are_physically_consistent() -> None:
     assert abs(landing.apriori_site_world[2]) < 1e-9
     blank = inputs.blank_pictures(descent, inputs.BLANKS["saturated"])
     assert {int(one.counts.min()) for one in blank.images} == {4095}
-    assert trackers.take_pictures(trackers.aim_ahead(), trackers.pose(0.0)).left.counts.std() > 100
+    assert trackers.take_images(trackers.aim_ahead(), trackers.pose(0.0)).left.counts.std() > 100

@@ -124,7 +124,7 @@ def test_triples_match_their_category() -> None:
         rotated = len(set(run.pictures.direction[numbers].tolist())) > 1
         if triple.category is Category.SHORT_TIME:
             assert np.array_equal(np.diff(numbers), [1, 1])
-            assert len(set(run.pictures.flown[numbers].tolist())) == 1
+            assert len(set(run.pictures.pass_number[numbers].tolist())) == 1
         else:
             assert np.all((-np.diff(heights) >= 150.0) & (-np.diff(heights) <= 390.0))
             assert rotated is (triple.category is Category.OPPOSITE_DIRECTION)
@@ -168,7 +168,7 @@ def test_sun_moves_while_rocks_are_fixed() -> None:
 
 def test_too_many_triples_are_rejected() -> None:
     runs = [run.model_dump() for run in make_parameters().runs[4:]]
-    with pytest.raises(ValueError, match="5000 triples 'short time' are asked for"):
+    with pytest.raises(ValueError, match="5000 triples 'short time' are requested"):
         simulate_run(RunKey(make_parameters(runs=[{**runs[0], "short_time": 5000}]), 0, 5, "test"))
 
 

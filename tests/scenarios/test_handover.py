@@ -19,7 +19,7 @@ from marsyard.algorithms.interface import (
     VelocityOutcome,
 )
 from marsyard.reports.verdicts import Status, evaluate_requirements
-from marsyard.scenarios.algorithm_run import Handover
+from marsyard.scenarios.algorithm_run import InputCopy
 from marsyard.scenarios.conformance.inputs import descent
 from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by
 from marsyard.scenarios.systems import scenario
@@ -83,7 +83,7 @@ def test_algorithm_cannot_change_measurements_of_the_next(name: str, spoiler: st
     result = run_small_case(name, spoiler, (spy,))
     assert (result.outcome, result.answered) == ("BAD_ANSWER", False)
     assert result.failure is not None
-    assert "changed the measurements" in result.failure.error
+    assert "changed its measurements" in result.failure.error
     inputs = next(one for one in spies.GIVEN if not isinstance(one, tuple))
     assert all(counts.mean() > 1.0 for counts in list_images(inputs))
     assert result.row[f"{spy}.error"] == ""
@@ -99,7 +99,7 @@ def test_writing_to_an_image_is_an_algorithm_error() -> None:
 
 def test_copies_are_equal_and_independent() -> None:
     inputs = descent()
-    first, second = Handover(inputs).given, Handover(inputs).given
+    first, second = InputCopy(inputs).inputs, InputCopy(inputs).inputs
     assert first.images[0].counts.tobytes() == inputs.images[0].counts.tobytes()
     assert first.attitudes[0].world_from_body.as_quat().tobytes() == (
         inputs.attitudes[0].world_from_body.as_quat().tobytes()

@@ -26,7 +26,7 @@ from marsyard.scenarios.measured.layout import (
 )
 from marsyard.scenarios.measured.store import CasesFile
 from marsyard.scenarios.meshes import MAX_BYTES, MeshFileError, read_mesh
-from marsyard.scenarios.offline import VELOCITY_FORM, read_answers
+from marsyard.scenarios.offline import VELOCITY_FORMAT, read_answers
 from marsyard.sim.camera import read_cameras
 from marsyard.sim.dynamics.recorded import COLUMNS, MAX_ROWS, TrajectoryFileError, read_poses
 from marsyard.sim.sensor import read_datasheet
@@ -48,7 +48,7 @@ def test_archives_are_rejected_as_meshes(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"rock.{ending}"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("rock.stl", b"solid\n" + b" " * 10_000_000)
-    with pytest.raises(MeshFileError, match="is no format of meshes; allowed: "):
+    with pytest.raises(MeshFileError, match="is not a supported mesh format; allowed: "):
         read_mesh(str(path))
 
 
@@ -107,7 +107,7 @@ def test_flat_field_size_is_checked_before_expansion(tmp_path: Path) -> None:
     path = tmp_path / "flat.npy"
     with path.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**6)})
-    with pytest.raises(IngestError, match=r"flat.npy: is no flat field: holds an array of shape \(1000000, 1000000\)"):
+    with pytest.raises(IngestError, match=r"not a valid flat field: contains an array of shape \(1000000, 1000000\)"):
         read_flat_field(path)
 
 
@@ -118,7 +118,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "flight.csv": read_poses,
     "flight.spice.toml": read_poses,
     "rock.stl": lambda path: read_mesh(str(path)),
-    "answers.csv": lambda path: read_answers(path, VELOCITY_FORM),
+    "answers.csv": lambda path: read_answers(path, VELOCITY_FORMAT),
     "ingest.toml": lambda path: read_ingest_file(path.parent),
     "pictures.csv": lambda path: read_table(path, VELOCITY),
     "cases.json": lambda path: CasesFile.file_hash(str(path)),

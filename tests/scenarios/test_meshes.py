@@ -33,7 +33,7 @@ def write_box(folder: Path, name: str = "box.stl", extents: tuple[float, float, 
 def test_mesh_formats_give_the_same_box(tmp_path: Path, surface: Surface, ending: str) -> None:
     file = write_box(tmp_path, f"box.{ending}")
     stated = MeshParameters(file=file, kind="lander", east_m=20.0, north_m=30.0, sink_m=0.1, sha256=None)
-    own = stated.standing(surface, (25.0, 25.0))
+    own = stated.place_on_ground(surface, (25.0, 25.0))
     corners = own.triangles.reshape(-1, 3)
     ground = float(surface.height(20.0, 30.0))
     assert np.allclose(corners.min(axis=0), [19.0, 29.5, ground - 0.1], atol=1e-6)
@@ -50,14 +50,14 @@ def test_mesh_formats_give_the_same_box(tmp_path: Path, surface: Surface, ending
 def test_size_heading_and_up_axis_are_applied(tmp_path: Path, surface: Surface) -> None:
     file = write_box(tmp_path, extents=(2.0, 0.5, 1.0))  # y axis up
     own = MeshParameters(file=file, up="y", size_m=4.0, heading_deg=90.0, east_m=20.0, north_m=30.0)
-    extent = np.ptp(own.standing(surface, (20.0, 30.0)).triangles.reshape(-1, 3), axis=0)
+    extent = np.ptp(own.place_on_ground(surface, (20.0, 30.0)).triangles.reshape(-1, 3), axis=0)
     assert np.allclose(extent, [2.0, 4.0, 1.0], atol=1e-6)
 
 
 def test_rocks_have_smooth_normals(tmp_path: Path, surface: Surface) -> None:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
     ball.export(tmp_path / "ball.stl")  # separate triangles: each corner is stored three times
-    own = MeshParameters(file=str(tmp_path / "ball.stl")).standing(surface, (0.0, 0.0))
+    own = MeshParameters(file=str(tmp_path / "ball.stl")).place_on_ground(surface, (0.0, 0.0))
     corners = own.triangles.reshape(-1, 3)
     radial = corners - (corners.min(axis=0) + corners.max(axis=0)) / 2.0
     radial /= np.linalg.norm(radial, axis=1, keepdims=True)
@@ -66,7 +66,7 @@ def test_rocks_have_smooth_normals(tmp_path: Path, surface: Surface) -> None:
 
 def test_meshes_repeat_with_the_terrain_period(tmp_path: Path, surface: Surface) -> None:
     one = MeshParameters(file=write_box(tmp_path), east_m=2.0, north_m=60.0)
-    corners = one.standing(surface, (65.0, 3.0)).triangles.reshape(-1, 3)
+    corners = one.place_on_ground(surface, (65.0, 3.0)).triangles.reshape(-1, 3)
     assert np.allclose((corners.min(axis=0) + corners.max(axis=0))[:2] / 2.0, [66.0, -4.0])
 
 
@@ -75,7 +75,7 @@ def test_meshes_are_hazards_for_landers(tmp_path: Path, surface: Surface) -> Non
     # The edges lie between grid points.
     one = MeshParameters(file=write_box(tmp_path), east_m=20.02, north_m=30.02)
     low, high = np.array([15.0, 25.0]), np.array([25.0, 35.0])
-    bare, raised = (Relief.of(ground, low, high, 0.05, meshes) for meshes in ((), (one,)))
+    bare, raised = (Relief.from_ground(ground, low, high, 0.05, meshes) for meshes in ((), (one,)))
     higher = raised.heights_m - bare.heights_m
     assert higher.max() == pytest.approx(0.5, abs=1e-6)
     assert np.count_nonzero(higher > 0.25) * 0.05**2 == pytest.approx(2.0, rel=0.06)
@@ -87,7 +87,7 @@ def test_campaigns_store_mesh_and_detect_changes(tmp_path: Path) -> None:
     stored = p.model_dump(mode="json", round_trip=True)
     assert LandingScenarioParameters.model_validate(stored) == p
     write_box(tmp_path, extents=(1.0, 1.0, 1.0))
-    with pytest.raises(ValidationError, match="has changed since the campaign was made"):
+    with pytest.raises(ValidationError, match="has changed since the campaign was created"):
         LandingScenarioParameters.model_validate(stored)
 
 
@@ -99,11 +99,11 @@ def test_mesh_faults_are_reported(tmp_path: Path) -> None:
 
     expect_error(tmp_path / "absent.stl", "cannot be read")
     (tmp_path / "text.txt").write_text("hello")
-    expect_error(tmp_path / "text.txt", "is no format of meshes; allowed: .*stl")
+    expect_error(tmp_path / "text.txt", "is not a supported mesh format; allowed: .*stl")
     (tmp_path / "broken.ply").write_text("ply\nnot at all")
-    expect_error(tmp_path / "broken.ply", "cannot be read as a mesh|holds no triangle")
+    expect_error(tmp_path / "broken.ply", "cannot be read as a mesh|contains no triangle")
     (tmp_path / "empty.obj").write_text("# nothing\n")
-    expect_error(tmp_path / "empty.obj", "cannot be read as a mesh|holds no triangle")
+    expect_error(tmp_path / "empty.obj", "cannot be read as a mesh|contains no triangle")
     flat = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
     flat.export(tmp_path / "flat.stl")
     expect_error(tmp_path / "flat.stl", "is flat")

@@ -6,16 +6,16 @@ import hashlib
 
 import numpy as np
 
-from marsyard.scenarios.conditions import hash_images, picture_columns
+from marsyard.scenarios.conditions import hash_images, image_columns
 from marsyard.sim.kernel_cache import processor_features
 from marsyard.sim.render.backend import default_backend
 
 
 def test_image_hash_does_not_depend_on_memory_layout() -> None:
     first, second = (np.arange(start, start + 12, dtype=np.uint16).reshape(3, 4) for start in (0, 50))
-    columns = picture_columns(default_backend(), hash_images([first, second]))
+    columns = image_columns(default_backend(), hash_images([first, second]))
     assert columns["image_hash"] == hashlib.sha256(first.tobytes() + second.tobytes()).hexdigest()
-    assert picture_columns(default_backend(), hash_images([np.asfortranarray(first), second])) == columns
-    assert picture_columns(default_backend(), hash_images([second, first]))["image_hash"] != columns["image_hash"]
+    assert image_columns(default_backend(), hash_images([np.asfortranarray(first), second])) == columns
+    assert image_columns(default_backend(), hash_images([second, first]))["image_hash"] != columns["image_hash"]
     assert (columns["gl_backend"], columns["processor_features"]) == (default_backend(), processor_features())
     assert columns["gl_version"]

@@ -137,31 +137,31 @@ def test_external_scenario_code_is_part_of_the_identity(install: Install, tmp_pa
             _format_system("mine", ", catalogue=HERE / 'hda-*.toml'"),
             "the system 'hda' already has the campaign 'hda-map'",
         ),
-        (_format_system("mine", ", columns=HERE / 'none.toml'"), "it names what is not there: "),
-        (_format_system("mine", ", catalogue=HERE / 'none-*.toml'"), "it names what is not there: "),
+        (_format_system("mine", ", columns=HERE / 'none.toml'"), "these files do not exist: "),
+        (_format_system("mine", ", catalogue=HERE / 'none-*.toml'"), "these files do not exist: "),
     ],
 )
 def test_invalid_system_does_not_affect_others(install: Install, source: str, reason: str) -> None:
     install("mine", source, **{"hda-map": ""})
     install("sound", _format_system("sound"))
     (message,) = problems()
-    assert message.startswith("system 'mine' (mine:SYSTEM) is left out: ")
+    assert message.startswith("system 'mine' (mine:SYSTEM) is omitted: ")
     assert reason in message
     assert [one.name for one in systems()[len(BUILT_IN) :]] == ["sound"]
     ended = CliRunner().invoke(app, ["list"])
     assert (ended.exit_code, ended.stderr) == (0, f"warning: {message}\n")
     assert "dimes-smoke" in ended.stdout
     checks = list(check_systems())
-    assert checks[0].finding.endswith("of other packages: sound")
+    assert checks[0].finding.endswith("from other packages: sound")
     assert [one.finding for one in checks if one.verdict is Verdict.WARN] == [message]
-    with pytest.raises(UnknownScenarioError, match="is left out"):
+    with pytest.raises(UnknownScenarioError, match="is omitted"):
         scenario("unheard-of")
 
 
 def test_first_of_two_entry_points_is_used(install: Install) -> None:
     install("mine", _format_system("mine"), "a", "b")
     assert [one.name for one in systems()].count("mine") == 1
-    assert problems() == ("system 'b' (mine:SYSTEM) is left out: the system 'mine' already has the name 'mine'",)
+    assert problems() == ("system 'b' (mine:SYSTEM) is omitted: the system 'mine' already has the name 'mine'",)
 
 
 def test_invalid_requirements_file_is_reported(install: Install, tmp_path: Path) -> None:
@@ -180,6 +180,6 @@ def test_invalid_columns_stop_only_campaigns_of_the_system(install: Install, tmp
     install(
         "mine", _format_system("mine", ", columns=HERE / 'columns.toml'").replace("x:Y", scenario_path), columns="x = ["
     )
-    with pytest.raises(ValueError, match=r"columns\.toml: states no columns: TOMLDecodeError"):
+    with pytest.raises(ValueError, match=r"columns\.toml: invalid columns: TOMLDecodeError"):
         row_columns("mine-case")
     assert row_columns("descent") is not None

@@ -78,20 +78,20 @@ def test_dtm_and_orthoimage_pass(tmp_path: Path) -> None:
 
 FAULTS: list[tuple[dict[str, Any], str]] = [
     ({"crs": CRS.from_string("+proj=longlat +R=3396190 +no_defs")}, r"is in degrees; project it to metres"),
-    ({"crs": None}, "states no projection"),
-    ({"crs": CRS.from_string("+proj=geocent +R=3396190 +units=m +no_defs")}, "coordinates are no map projection's"),
+    ({"crs": None}, "has no projection"),
+    ({"crs": CRS.from_string("+proj=geocent +R=3396190 +units=m +no_defs")}, "are not those of a map projection"),
     (
         {"crs": CRS.from_epsg(3857), "transform": Affine(1.0, 0.0, 1_000_000.0, 0.0, -1.0, 8_399_738.0)},
         r"stretches lengths by 2\.000 to 2\.000",
     ),
     ({"transform": Affine(1.0, 0.1, 0.0, -0.1, -1.0, 0.0)}, "rotated or oblong cells"),
     ({"transform": Affine(1.0, 0.0, 0.0, 0.0, -2.0, 0.0)}, "rotated or oblong cells"),
-    ({"values": np.full((3, 40), 1.0, dtype=np.float32)}, "has 40 x 3 values; at least 4 x 4"),
+    ({"values": np.full((3, 40), 1.0, dtype=np.float32)}, "has 40 x 3 values; allowed: at least 4 x 4"),
     ({"values": np.full((8, 6000), 1.0, dtype=np.float32)}, "at most 5461 along a side"),
-    ({"values": np.full((50, 40), 120, dtype=np.uint8), "nodata": None}, "8-bit values, which are a picture's"),
+    ({"values": np.full((50, 40), 120, dtype=np.uint8), "nodata": None}, "8-bit values, as in a picture"),
     ({"values": np.full((50, 40), -32767.0, dtype=np.float32)}, "has no valid height at all"),
-    ({"tags": {"units": ("ft",)}}, "heights are in 'ft'; metres are needed"),
-    ({"tags": {"scales": (0.1,)}}, "states scale 0.1 and offset 0; apply them"),
+    ({"tags": {"units": ("ft",)}}, "heights are in 'ft'; allowed: metres"),
+    ({"tags": {"scales": (0.1,)}}, "has scale 0.1 and offset 0; apply them"),
 ]
 
 
@@ -161,18 +161,18 @@ def write_npz(folder: Path, **arrays: Any) -> Path:
 
 NPZ_FAULTS: list[tuple[dict[str, Any], str]] = [
     ({"dem": np.full((20, 30), np.nan)}, "has no valid height at all"),
-    ({"dem": np.full((20, 30), "high")}, "dem holds values of type <U4; allowed: real numbers"),
-    ({"dem": np.zeros((20, 30), dtype=complex)}, "dem holds values of type complex128"),
-    ({"dem": np.zeros((20, 30, 3))}, r"dem has a grid of shape \(20, 30, 3\); two dimensions"),
-    ({"dem": np.full((20, 30), 1e300)}, r"holds heights of 1e\+300 m"),
-    ({"dem": np.where(np.eye(20, 30) > 0, -32767.0, 5.0)}, "holds heights of -32767 m"),
-    ({"dem": np.array([[{}] * 30] * 20, dtype=object)}, "dem holds values of type object"),
-    ({"dem_gsd": np.array("one")}, "dem_gsd holds values of type <U3"),
-    ({"dem_gsd": np.array([1.0, 1.0])}, r"dem_gsd has the shape \(2,\); one number is needed"),
+    ({"dem": np.full((20, 30), "high")}, "dem contains values of type <U4; allowed: real numbers"),
+    ({"dem": np.zeros((20, 30), dtype=complex)}, "dem contains values of type complex128"),
+    ({"dem": np.zeros((20, 30, 3))}, r"dem has a grid of shape \(20, 30, 3\); allowed: two dimensions"),
+    ({"dem": np.full((20, 30), 1e300)}, r"contains heights of 1e\+300 m"),
+    ({"dem": np.where(np.eye(20, 30) > 0, -32767.0, 5.0)}, "contains heights of -32767 m"),
+    ({"dem": np.array([[{}] * 30] * 20, dtype=object)}, "dem contains values of type object"),
+    ({"dem_gsd": np.array("one")}, "dem_gsd contains values of type <U3"),
+    ({"dem_gsd": np.array([1.0, 1.0])}, r"dem_gsd has the shape \(2,\); allowed: one number"),
     ({"dem_gsd": -1.0}, "dem_gsd is -1.0; allowed: metres between posts, above 0"),
-    ({"ortho": np.zeros((20, 30))}, "has an ortho, but lacks ortho_gsd"),
+    ({"ortho": np.zeros((20, 30))}, "has an ortho, but no ortho_gsd"),
     ({"ortho": np.zeros((20, 30)), "ortho_gsd": np.nan}, "ortho_gsd is nan"),
-    ({"ortho": np.ones((20, 30)), "ortho_gsd": 1.0, "ortho_valid": np.ones((4, 4), dtype=bool)}, "another shape"),
+    ({"ortho": np.ones((20, 30)), "ortho_gsd": 1.0, "ortho_valid": np.ones((4, 4), dtype=bool)}, "different shapes"),
 ]
 
 
@@ -205,7 +205,7 @@ def test_named_pipe_is_rejected(tmp_path: Path, name: str) -> None:
 def test_missing_nodata_is_detected_from_implausible_heights(tmp_path: Path) -> None:
     values = np.full((50, 40), -4450.0, dtype=np.float32)
     values[10, 10] = -32767.0
-    with pytest.raises(TerrainFileError, match=r"holds heights of -32767 m; .*it states no nodata value"):
+    with pytest.raises(TerrainFileError, match=r"contains heights of -32767 m; .*it has no nodata value"):
         check_source(RealTerrain(dtm=write_tif(tmp_path, values=values, nodata=None)))
     check_source(RealTerrain(dtm=write_tif(tmp_path, "stated.tif", values=values)))
 
@@ -213,7 +213,7 @@ def test_missing_nodata_is_detected_from_implausible_heights(tmp_path: Path) -> 
 def test_image_with_another_projection_is_rejected(tmp_path: Path) -> None:
     other = CRS.from_string(MARS.replace("lon_0=0", "lon_0=137"))
     picture = write_tif(tmp_path, "ortho.tif", values=np.full((100, 80), 120, dtype=np.uint8), nodata=0, crs=other)
-    with pytest.raises(TerrainFileError, match=r"ortho.tif: its projection is not that of .*dtm.tif"):
+    with pytest.raises(TerrainFileError, match=r"ortho.tif: its projection differs from that of .*dtm.tif"):
         check_source(RealTerrain(dtm=write_tif(tmp_path), ortho=picture))
 
 
@@ -224,7 +224,7 @@ def test_oversized_image_is_rejected_from_its_header(tmp_path: Path) -> None:
     position = {"crs": CRS.from_string(MARS), "transform": Affine(0.25, 0.0, 0.0, 0.0, -0.25, 0.0)}
     with rasterio.open(path, "w", **profile, **position):
         pass
-    with pytest.raises(TerrainFileError, match=r"huge.tif: has 32768 x 32768 values; at most 8192 along a side"):
+    with pytest.raises(TerrainFileError, match=r"huge.tif: has 32768 x 32768 values; allowed: at most 8192"):
         check_source(RealTerrain(dtm=write_tif(tmp_path), ortho=path))
 
 
@@ -232,8 +232,8 @@ def test_oversized_image_is_rejected_from_its_header(tmp_path: Path) -> None:
     ("name", "contents", "fault"),
     [
         ("empty.tif", b"", "is empty"),
-        ("no.tif", b"hello", "is no GeoTIFF"),
-        ("no.npz", b"hello", "is no .npz archive"),
+        ("no.tif", b"hello", "is not a valid GeoTIFF"),
+        ("no.npz", b"hello", "is not a valid .npz archive"),
         ("empty.npz", b"", "is empty"),
     ],
 )
@@ -247,7 +247,7 @@ def test_invalid_files_are_rejected(tmp_path: Path, name: str, contents: bytes, 
 
 def test_campaigns_reject_invalid_terrain_on_load(tmp_path: Path) -> None:
     path = write_tif(tmp_path, crs=None)
-    with pytest.raises(ValidationError, match=r"dtm.tif: states no projection"):
+    with pytest.raises(ValidationError, match=r"dtm.tif: has no projection"):
         DescentScenarioParameters.model_validate({"terrain": {"source": {"dtm": str(path)}}})
 
 

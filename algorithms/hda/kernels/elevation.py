@@ -1,4 +1,4 @@
-"""Points spread over a grid, and least-median-of-squares planes of its parts."""
+"""Bilinear accumulation of points on a grid, and least-median-of-squares planes of parts of the grid."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: An upper quantile of a normal distribution, and what makes the median of absolute values its standard deviation.
+#: Inlier limit in standard deviations, and ratio of standard deviation to median absolute value (normal distribution).
 INLIER_DEVIATIONS = 2.5
-DEVIATION_OF_MEDIAN = 1.4826
+SIGMA_PER_MEDIAN = 1.4826
 
 
 @njit(cache=True)
-def spread(rows: Array, columns: Array, values: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """Sums of weighted values and of weights: each value goes to the four cells about it by bilinear weights."""
+def accumulate_bilinear(rows: Array, columns: Array, values: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
+    """Sums of weighted values and of weights; each value is distributed to four cells with bilinear weights."""
     sums = np.zeros(shape)
     weights = np.zeros(shape)
     for k in range(values.size):
@@ -35,23 +35,23 @@ def spread(rows: Array, columns: Array, values: Array, shape: tuple[int, int]) -
 
 @njit(cache=True)
 def _plane_through(x: Array, y: Array, z: Array, i: int, j: int, k: int) -> tuple[float, float, float]:
-    """Value at (0, 0) and slopes of the plane through three points; NaN where they are in line."""
+    """Value at (0, 0) and slopes of the plane through three points; NaN if they are collinear."""
     ux, uy, uz = x[j] - x[i], y[j] - y[i], z[j] - z[i]
     vx, vy, vz = x[k] - x[i], y[k] - y[i], z[k] - z[i]
     determinant = ux * vy - uy * vx
     if abs(determinant) < 0.5:
         return math.nan, math.nan, math.nan
-    by_x = (uz * vy - uy * vz) / determinant
-    by_y = (ux * vz - uz * vx) / determinant
-    return z[i] - by_x * x[i] - by_y * y[i], by_x, by_y
+    slope_x = (uz * vy - uy * vz) / determinant
+    slope_y = (ux * vz - uz * vx) / determinant
+    return z[i] - slope_x * x[i] - slope_y * y[i], slope_x, slope_y
 
 
 @njit(cache=True)
-def _least_squares(x: Array, y: Array, z: Array, used: NDArray[np.bool_]) -> tuple[float, float, float]:
-    """Value at (0, 0) and slopes of the least-squares plane of the points used; NaN where they are in line."""
+def _least_squares(x: Array, y: Array, z: Array, mask: NDArray[np.bool_]) -> tuple[float, float, float]:
+    """Value at (0, 0) and slopes of the least-squares plane of the points in `mask`; NaN if they are collinear."""
     n, mx, my, mz = 0, 0.0, 0.0, 0.0
     for i in range(x.size):
-        if used[i]:
+        if mask[i]:
             n += 1
             mx += x[i]
             my += y[i]
@@ -63,7 +63,7 @@ def _least_squares(x: Array, y: Array, z: Array, used: NDArray[np.bool_]) -> tup
     mz /= n
     xx, yy, xy, xz, yz = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(x.size):
-        if used[i]:
+        if mask[i]:
             dx, dy, dz = x[i] - mx, y[i] - my, z[i] - mz
             xx += dx * dx
             yy += dy * dy
@@ -73,17 +73,17 @@ def _least_squares(x: Array, y: Array, z: Array, used: NDArray[np.bool_]) -> tup
     determinant = xx * yy - xy * xy
     if determinant < 1e-9 * (xx + yy) ** 2 or determinant <= 0.0:
         return math.nan, math.nan, math.nan
-    by_x = (xz * yy - yz * xy) / determinant
-    by_y = (yz * xx - xz * xy) / determinant
-    return mz - by_x * mx - by_y * my, by_x, by_y
+    slope_x = (xz * yy - yz * xy) / determinant
+    slope_y = (yz * xx - xz * xy) / determinant
+    return mz - slope_x * mx - slope_y * my, slope_x, slope_y
 
 
 @njit(cache=True)
 def robust_plane(x: Array, y: Array, z: Array, triples: Array, refine: bool) -> tuple[float, float, float]:
-    """Value at (0, 0) and slopes of the least-median-of-squares plane over planes through random triples.
+    """Value at (0, 0) and slopes of the least-median-of-squares plane, the best of planes through random triples.
 
-    `triples` are uniform numbers in [0, 1), one row a trial. x and y are whole numbers of cells. The median is that of
-    Rousseeuw & Leroy (1987): the (n / 2 + 2)-th smallest for a plane's three unknowns.
+    `triples` are uniform numbers in [0, 1), one row per trial. x and y are integers (cells). The median is that of
+    Rousseeuw & Leroy (1987): the (n / 2 + 2)-th smallest value for the three unknowns of a plane.
     """
     n = x.size
     order = min(n // 2 + 2, n) - 1
@@ -98,25 +98,25 @@ def robust_plane(x: Array, y: Array, z: Array, triples: Array, refine: bool) -> 
         low, high = min(i, j), max(i, j)
         k += k >= low
         k += k >= high
-        value, by_x, by_y = _plane_through(x, y, z, i, j, k)
+        value, slope_x, slope_y = _plane_through(x, y, z, i, j, k)
         if math.isnan(value):
             continue
-        nearer = 0
+        closer_count = 0
         for m in range(n):
-            distance = abs(z[m] - value - by_x * x[m] - by_y * y[m])
+            distance = abs(z[m] - value - slope_x * x[m] - slope_y * y[m])
             distances[m] = distance
-            nearer += distance < best
-        # The median is below the best so far only if enough of the distances are.
-        if nearer > order:
+            closer_count += distance < best
+        # The median is below the best one only if enough distances are.
+        if closer_count > order:
             best = np.partition(distances, order)[order]
-            plane = (value, by_x, by_y)
+            plane = (value, slope_x, slope_y)
     if not refine or math.isinf(best):
         return plane
-    limit = INLIER_DEVIATIONS * DEVIATION_OF_MEDIAN * (1.0 + 5.0 / max(n - 3, 1)) * best
-    used = np.empty(n, dtype=np.bool_)
+    limit = INLIER_DEVIATIONS * SIGMA_PER_MEDIAN * (1.0 + 5.0 / max(n - 3, 1)) * best
+    inliers = np.empty(n, dtype=np.bool_)
     for m in range(n):
-        used[m] = abs(z[m] - plane[0] - plane[1] * x[m] - plane[2] * y[m]) <= limit
-    refined = _least_squares(x, y, z, used)
+        inliers[m] = abs(z[m] - plane[0] - plane[1] * x[m] - plane[2] * y[m]) <= limit
+    refined = _least_squares(x, y, z, inliers)
     return plane if math.isnan(refined[0]) else refined
 
 
@@ -125,13 +125,13 @@ def footprint_planes(
     elevation: Array, first_rows: NDArray[np.int64], first_columns: NDArray[np.int64], side: int, min_cells: int,
     triples: Array, refine: bool,
 ) -> Array:  # fmt: skip
-    """Planes of the squares of `side` cells at first rows and columns, shape (rows, columns, 3).
+    """Planes of squares of `side` cells with these first rows and columns, shape (rows, columns, 3).
 
-    Value at the square's middle, slopes per column and per row; NaN where fewer than `min_cells` cells are known.
+    Value at the square's centre, slopes per column and per row; NaN if fewer than `min_cells` cells are valid.
     """
     planes = np.full((first_rows.size, first_columns.size, 3), np.nan)
     x, y, z = np.empty(side * side), np.empty(side * side), np.empty(side * side)
-    middle = (side - 1) // 2
+    centre = (side - 1) // 2
     for a in range(first_rows.size):
         for b in range(first_columns.size):
             n = 0
@@ -139,49 +139,49 @@ def footprint_planes(
                 for j in range(side):
                     value = elevation[first_rows[a] + i, first_columns[b] + j]
                     if not math.isnan(value):
-                        x[n], y[n], z[n] = j - middle, i - middle, value
+                        x[n], y[n], z[n] = j - centre, i - centre, value
                         n += 1
             if n < min_cells:
                 continue
-            value, by_x, by_y = robust_plane(x[:n], y[:n], z[:n], triples, refine)
-            shift = 0.5 * (side - 1) - middle
-            planes[a, b, 0] = value + shift * (by_x + by_y)
-            planes[a, b, 1] = by_x
-            planes[a, b, 2] = by_y
+            value, slope_x, slope_y = robust_plane(x[:n], y[:n], z[:n], triples, refine)
+            shift = 0.5 * (side - 1) - centre
+            planes[a, b, 0] = value + shift * (slope_x + slope_y)
+            planes[a, b, 1] = slope_x
+            planes[a, b, 2] = slope_y
     return planes
 
 
 @njit(cache=True)
-def under_lander(
+def evaluate_footprints(
     elevation: Array, rows: NDArray[np.int64], columns: NDArray[np.int64], offsets: NDArray[np.int64],
-    fitted: NDArray[np.int64], min_cells: int, triples: Array, refine: bool,
+    fit_offsets: NDArray[np.int64], min_cells: int, triples: Array, refine: bool,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Slope per cell of the robust plane through each footprint, and the maximum distance of a cell from it.
 
-    `offsets` are a footprint's cells from its middle (row, column), `fitted` those that the plane is fitted to. NaN
-    where fewer than `min_cells` of the latter are known.
+    `offsets` are a footprint's cells relative to its centre (row, column), `fit_offsets` those used for the plane fit.
+    NaN if fewer than `min_cells` of the latter are valid.
     """
     count = rows.size
     slopes, roughness = np.full(count, np.nan), np.full(count, np.nan)
-    n = fitted.shape[0]
+    n = fit_offsets.shape[0]
     x, y, z = np.empty(n), np.empty(n), np.empty(n)
     for k in range(count):
-        count_known = 0
+        known_count = 0
         for m in range(n):
-            i, j = rows[k] + fitted[m, 0], columns[k] + fitted[m, 1]
+            i, j = rows[k] + fit_offsets[m, 0], columns[k] + fit_offsets[m, 1]
             if 0 <= i < elevation.shape[0] and 0 <= j < elevation.shape[1] and not math.isnan(elevation[i, j]):
-                x[count_known], y[count_known], z[count_known] = fitted[m, 1], fitted[m, 0], elevation[i, j]
-                count_known += 1
-        if count_known < min_cells:
+                x[known_count], y[known_count], z[known_count] = fit_offsets[m, 1], fit_offsets[m, 0], elevation[i, j]
+                known_count += 1
+        if known_count < min_cells:
             continue
-        value, by_x, by_y = robust_plane(x[:count_known], y[:count_known], z[:count_known], triples, refine)
+        value, slope_x, slope_y = robust_plane(x[:known_count], y[:known_count], z[:known_count], triples, refine)
         max_distance = 0.0
         for m in range(offsets.shape[0]):
             i, j = rows[k] + offsets[m, 0], columns[k] + offsets[m, 1]
             if 0 <= i < elevation.shape[0] and 0 <= j < elevation.shape[1] and not math.isnan(elevation[i, j]):
                 max_distance = max(
-                    max_distance, abs(elevation[i, j] - value - by_x * offsets[m, 1] - by_y * offsets[m, 0])
+                    max_distance, abs(elevation[i, j] - value - slope_x * offsets[m, 1] - slope_y * offsets[m, 0])
                 )
-        slopes[k] = math.hypot(by_x, by_y)
+        slopes[k] = math.hypot(slope_x, slope_y)
         roughness[k] = max_distance
     return slopes, roughness

@@ -1,4 +1,4 @@
-"""Correlation at whole pixels, its sub-pixel peak, and the searches: in a window, and along an epipolar segment."""
+"""Pixel correlation, sub-pixel peak fit, and searches in a window and along an epipolar segment."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 Array = NDArray[np.float64]
 
-#: Energy of a patch per pixel, squared counts, at or below which it is flat: rounding alone leaves less.
+#: Minimum energy per pixel (squared counts) of a textured patch; rounding errors alone stay below it.
 FLAT_ENERGY = 1e-6
 
 
 @njit(cache=True)
 def correlation(first: Image, second: Image, r1: int, c1: int, r2: int, c2: int, half: int) -> float:
-    """Eq. 3 of the patches about two pixels, each less its mean; both lie in their pictures."""
+    """Normalised correlation (Eq. 3) of two mean-free patches centred at (r1, c1) and (r2, c2), inside their images."""
     sa, sb, saa, sbb, sab = 0.0, 0.0, 0.0, 0.0, 0.0
-    # Less one value of each, so that the sums of squares are small and lose nothing when the means are taken off.
+    # Subtract the centre value first to avoid cancellation in the variances.
     base_a = np.float64(first[r1, c1])
     base_b = np.float64(second[r2, c2])
     for i in range(-half, half + 1):
@@ -33,16 +33,14 @@ def correlation(first: Image, second: Image, r1: int, c1: int, r2: int, c2: int,
             sab += a * b
     n = (2 * half + 1) ** 2
     energy = saa - sa * sa / n + sbb - sb * sb / n
-    if energy <= FLAT_ENERGY * n:
-        return 0.0
-    return 2.0 * (sab - sa * sb / n) / energy
+    return 0.0 if energy <= FLAT_ENERGY * n else 2.0 * (sab - sa * sb / n) / energy
 
 
 @njit(cache=True)
-def biquadratic_top(z: Array) -> tuple[float, float, float]:
-    """Row, column and value of the top of the quadric through 3 x 3 values, by least squares.
+def fit_biquadratic_peak(z: Array) -> tuple[float, float, float]:
+    """Row, column and value of the maximum of a least-squares quadratic fit to 3 x 3 values.
 
-    The place is held to [-1, 1]; the middle and its value where the quadric has no top.
+    The position is clamped to [-1, 1]. Returns the centre and its value if the quadratic has no maximum.
     """
     gr, gc, rr, cc, rc, mean = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(3):
@@ -59,26 +57,26 @@ def biquadratic_top(z: Array) -> tuple[float, float, float]:
         return 0.0, 0.0, z[1, 1]
     row = min(max(-(cc * gr - rc * gc) / determinant, -1.0), 1.0)
     column = min(max(-(rr * gc - rc * gr) / determinant, -1.0), 1.0)
-    middle = mean - (rr + cc) / 3.0
-    value = middle + gr * row + gc * column + 0.5 * (rr * row * row + cc * column * column) + rc * row * column
+    centre_value = mean - (rr + cc) / 3.0
+    value = centre_value + gr * row + gc * column + 0.5 * (rr * row * row + cc * column * column) + rc * row * column
     return row, column, value
 
 
 @njit(cache=True)
-def inside(image: Image, row: int, column: int, radius: int) -> bool:
-    """Whether the square of this radius about a pixel lies in the picture."""
+def window_fits(image: Image, row: int, column: int, radius: int) -> bool:
+    """Whether a window of half width `radius` around a pixel lies inside the image."""
     return bool(radius <= row < image.shape[0] - radius and radius <= column < image.shape[1] - radius)
 
 
 @njit(cache=True)
-def search(
+def search_window(
     first: Image, second: Image, r1: int, c1: int, row: int, column: int, half: int, radius: int
 ) -> tuple[int, int, float]:
-    """Position and value of highest correlation within `radius` pixels of (row, column); -2 where no window fits."""
+    """Position and value of the highest correlation within `radius` pixels of (row, column); -2 if no window fits."""
     best_row, best_column, best = row, column, -2.0
     for i in range(row - radius, row + radius + 1):
         for j in range(column - radius, column + radius + 1):
-            if inside(second, i, j, half):
+            if window_fits(second, i, j, half):
                 value = correlation(first, second, r1, c1, i, j, half)
                 if value > best:
                     best_row, best_column, best = i, j, value
@@ -86,38 +84,34 @@ def search(
 
 
 @njit(cache=True)
-def search_level(
+def search_windows(
     first: Image, second: Image, positions: NDArray[np.int64], shifts: NDArray[np.int64], half: int, radius: int
 ) -> tuple[NDArray[np.int64], Array]:
-    """Best shift of every position (row, column) within `radius` of the initial shift, and Eq. 3 there.
-
-    -2 where a template does not fit.
-    """
-    best_shifts = shifts.copy()
+    """Best shift of each position (row, column) within `radius` of its initial shift, and Eq. 3; -2 if none fits."""
+    new_shifts = shifts.copy()
     values = np.full(positions.shape[0], -2.0)
     for k in range(positions.shape[0]):
         r, c = positions[k, 0], positions[k, 1]
-        if not inside(first, r, c, half):
+        if not window_fits(first, r, c, half):
             continue
-        i, j, values[k] = search(first, second, r, c, r + shifts[k, 0], c + shifts[k, 1], half, radius)
-        best_shifts[k, 0], best_shifts[k, 1] = i - r, j - c
-    return best_shifts, values
+        i, j, values[k] = search_window(first, second, r, c, r + shifts[k, 0], c + shifts[k, 1], half, radius)
+        new_shifts[k, 0], new_shifts[k, 1] = i - r, j - c
+    return new_shifts, values
 
 
 @njit(cache=True)
-def refine(first: Image, second: Image, r1: int, c1: int, r2: int, c2: int, half: int) -> tuple[float, float, float]:
-    """Row and column of the biquadratic's top over the 3 x 3 positions about (r2, c2), and the correlation there.
-
-    NaN where a window does not fit.
-    """
-    if not inside(second, r2, c2, half + 1):
+def refine_peak(
+    first: Image, second: Image, r1: int, c1: int, r2: int, c2: int, half: int
+) -> tuple[float, float, float]:
+    """Row, column and correlation of the biquadratic peak around (r2, c2); NaN if a window does not fit."""
+    if not window_fits(second, r2, c2, half + 1):
         return math.nan, math.nan, math.nan
     z = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
             z[i, j] = correlation(first, second, r1, c1, r2 + i - 1, c2 + j - 1, half)
-    row, column, value = biquadratic_top(z)
-    # The quadric of least squares lies below a peak as sharp as a pixel.
+    row, column, value = fit_biquadratic_peak(z)
+    # A least-squares fit underestimates a peak that is one pixel wide.
     return r2 + row, c2 + column, max(value, z[1, 1])
 
 
@@ -125,12 +119,12 @@ def refine(first: Image, second: Image, r1: int, c1: int, r2: int, c2: int, half
 def refine_shifts(
     first: Image, second: Image, positions: NDArray[np.int64], shifts: NDArray[np.int64], half: int
 ) -> tuple[Array, Array]:
-    """Sub-pixel positions (u, v) in the second picture and the correlation there; NaN where a window does not fit."""
+    """Sub-pixel positions (u, v) in the second image and their correlations; NaN if a window does not fit."""
     pixels = np.empty((positions.shape[0], 2))
     values = np.empty(positions.shape[0])
     for k in range(positions.shape[0]):
         r, c = positions[k, 0], positions[k, 1]
-        row, column, values[k] = refine(first, second, r, c, r + shifts[k, 0], c + shifts[k, 1], half)
+        row, column, values[k] = refine_peak(first, second, r, c, r + shifts[k, 0], c + shifts[k, 1], half)
         pixels[k, 0], pixels[k, 1] = column, row
     return pixels, values
 
@@ -139,7 +133,7 @@ def refine_shifts(
 def absolute_differences(
     first: NDArray[np.uint16], second: NDArray[np.uint16], r1: int, c1: int, r2: int, c2: int, half: int, max_sum: int
 ) -> int:
-    """Eq. 9 of the windows about two pixels; the summation ends once it exceeds `max_sum`."""
+    """Sum of absolute differences (Eq. 9) of the windows around two pixels; stops when it exceeds `max_sum`."""
     width = 2 * half + 1
     total = 0
     for i in range(-half, half + 1):
@@ -163,11 +157,12 @@ def search_segments(
     ends: Array,
     half: int,
 ) -> NDArray[np.int64]:
-    """For every pixel (u, v) of the first picture the one on its segment in the second with the minimum of Eq. 9.
+    """Find the match of each pixel (u, v) of the first image on its epipolar segment in the second image.
 
-    Samples are one pixel apart along the longer axis, rounded to whole pixels. All windows must lie in the picture.
+    The match is the pixel that minimises the sum of absolute differences (Eq. 9). Samples are one pixel apart along the
+    longer axis, rounded to whole pixels. All windows must lie inside the image.
     """
-    best_shifts = np.empty_like(pixels)
+    best_pixels = np.empty_like(pixels)
     for k in range(pixels.shape[0]):
         du, dv = ends[k, 0] - starts[k, 0], ends[k, 1] - starts[k, 1]
         steps = max(math.ceil(max(abs(du), abs(dv))), 1)
@@ -178,5 +173,5 @@ def search_segments(
             value = absolute_differences(first, second, pixels[k, 1], pixels[k, 0], v, u, half, best)
             if value < best:
                 best = value
-                best_shifts[k, 0], best_shifts[k, 1] = u, v
-    return best_shifts
+                best_pixels[k, 0], best_pixels[k, 1] = u, v
+    return best_pixels

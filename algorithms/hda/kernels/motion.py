@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-LARGEST_DAMPING = 1e12
-#: Curvature added to each depth's, of the squared focal length: depths stay where they are when the camera stood still.
+MAX_DAMPING = 1e12
+#: Curvature added for each depth, fraction of the squared focal length: depths do not change without camera motion.
 DEPTH_FLOOR = 1e-14
 
 
 class Matches(NamedTuple):
-    """Features in both pictures, normalised image coordinates (n, 2); focal length and Cauchy's scale, px."""
+    """Features in both images, normalised image coordinates (n, 2); focal length and scale of Cauchy's cost, pixels."""
 
     first: Array
     second: Array
@@ -35,7 +35,7 @@ class Motion(NamedTuple):
 
 @njit(cache=True)
 def rotation_matrix(q: Array) -> Array:
-    """The matrix of a unit quaternion (w, x, y, z)."""
+    """Rotation matrix of a unit quaternion (w, x, y, z)."""
     w, x, y, z = q
     return np.array(
         [
@@ -63,7 +63,7 @@ def rotate_quaternion(q: Array, step: Array) -> Array:
 
 @njit(cache=True)
 def residuals(matches: Matches, motion: Motion) -> Array:
-    """Reprojection less measurement in the second picture, pixels, shape (n, 2); inf behind the camera."""
+    """Reprojection minus measurement in the second image, pixels, shape (n, 2); inf behind the camera."""
     first, second, focal, _ = matches
     q, t, inverse_depths = motion
     R = rotation_matrix(q)
@@ -92,7 +92,7 @@ def cauchy_cost(r: Array, scale: float) -> float:
 
 @njit(cache=True)
 def _jacobian(x: float, y: float, rho: float, focal: float, R: Array, t: Array, Jm: Array, Jd: Array) -> None:
-    """Derivatives of one residual by rotation (applied from the left) and translation, and by inverse depth."""
+    """Derivatives of one residual by rotation (from the left) and translation (`Jm`), and by inverse depth (`Jd`)."""
     ax = R[0, 0] * x + R[0, 1] * y + R[0, 2]
     ay = R[1, 0] * x + R[1, 1] * y + R[1, 2]
     az = R[2, 0] * x + R[2, 1] * y + R[2, 2]
@@ -115,9 +115,9 @@ def _jacobian(x: float, y: float, rho: float, focal: float, R: Array, t: Array, 
 
 @njit(cache=True)
 def _compute_step(matches: Matches, r: Array, motion: Motion, damping: float, with_depths: bool) -> tuple[Array, Array]:
-    """A damped Gauss-Newton step of rotation and translation (6,) and of inverse depths, by Schur's complement.
+    """Damped Gauss-Newton step of rotation and translation (6,) and of inverse depths, by the Schur complement.
 
-    NaN where the normal equations are not finite.
+    NaN if the normal equations are not finite.
     """
     first, focal, scale = matches.first, matches.focal, matches.scale
     n = first.shape[0]
@@ -154,10 +154,10 @@ def _compute_step(matches: Matches, r: Array, motion: Motion, damping: float, wi
 def solve(
     matches: Matches, start: Motion, with_depths: bool, iterations: int, tolerance: float
 ) -> tuple[Motion, float, bool, int]:
-    """Minimise Cauchy's cost from a start; the translation is in the unit that inverse depths are in.
+    """Minimise Cauchy's cost from an initial motion; translation and depths have the same unit.
 
-    Returns motion and depths, cost, whether it converged (a step below the tolerance, or none that lowers the cost) and
-    how many steps were tried.
+    Returns motion with inverse depths, cost, whether it converged (step length below the tolerance), and the number of
+    steps.
     """
     motion = start
     r = residuals(matches, motion)
@@ -165,12 +165,12 @@ def solve(
     damping = 1e-3
     for iteration in range(iterations):
         step, depth_steps = _compute_step(matches, r, motion, damping, with_depths)
-        tried = Motion(rotate_quaternion(motion.q, step[:3]), motion.t + step[3:], motion.inverse_depths + depth_steps)
-        new_r = residuals(matches, tried)
+        trial = Motion(rotate_quaternion(motion.q, step[:3]), motion.t + step[3:], motion.inverse_depths + depth_steps)
+        new_r = residuals(matches, trial)
         new_cost = cauchy_cost(new_r, matches.scale)
         size = math.sqrt(np.sum(step * step))
         if new_cost <= cost:
-            motion, r, cost = tried, new_r, new_cost
+            motion, r, cost = trial, new_r, new_cost
             damping = max(damping * 0.1, 1e-12)
             if size < tolerance:
                 return motion, cost, True, iteration + 1
@@ -178,6 +178,6 @@ def solve(
             return motion, cost, True, iteration + 1
         else:
             damping *= 10.0
-            if damping > LARGEST_DAMPING:
+            if damping > MAX_DAMPING:
                 return motion, cost, False, iteration + 1
     return motion, cost, False, iterations

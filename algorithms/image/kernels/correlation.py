@@ -1,7 +1,6 @@
-"""Compiled correlation; `marsyard.algorithms.image.correlation` and `.correlation` say what it is and check what they
-are given.
+"""Compiled correlation; definitions and input checks are in `marsyard.algorithms.image.correlation`.
 
-Images of the normalised one are float32, so that a vector register holds eight values; sums that are subtracted from
+Normalised correlation uses float32 images, so that a vector register holds eight values. Sums that are subtracted from
 each other are float64.
 """
 
@@ -16,27 +15,27 @@ from numpy.typing import NDArray
 Image = NDArray[np.float32]
 Array = NDArray[np.float64]
 
-#: Energy of a patch, relative to that of its largest value, below which it is rounding and counts as flat.
+#: Energy of a patch, relative to that of its largest value, below which the patch is flat: rounding errors only.
 FLAT_ENERGY = 1e-12
 
 
 @njit(cache=True)
 def subtract_mean(image: Image) -> tuple[Image, float]:
-    """The image less its mean; and its largest absolute value before."""
-    total, largest = 0.0, 0.0
+    """Subtract the mean of an image; also return the image's largest absolute value."""
+    total, max_abs = 0.0, 0.0
     for i in range(image.shape[0]):
         row = image[i]
         for j in range(image.shape[1]):
             total += row[j]
-            largest = max(largest, abs(row[j]))
+            max_abs = max(max_abs, abs(row[j]))
     mean = total / image.size
     result = np.empty_like(image)
     for i in range(image.shape[0]):
         row = image[i]
-        out = result[i]
+        result_row = result[i]
         for j in range(image.shape[1]):
-            out[j] = row[j] - mean
-    return result, largest
+            result_row[j] = row[j] - mean
+    return result, max_abs
 
 
 @njit(cache=True)
@@ -53,7 +52,7 @@ def energy(image: Image) -> float:
 
 @njit(cache=True)
 def ratio(cross: float, energy_a: float, energy_b: float, floor: float) -> float:
-    """Eq. 11 from its three sums; 0 where either patch is flat."""
+    """Eq. 11 from its three sums; 0 if either patch is flat."""
     if energy_a <= floor or energy_b <= floor:
         return 0.0
     return min(max(cross / math.sqrt(energy_a * energy_b), -1.0), 1.0)
@@ -61,9 +60,9 @@ def ratio(cross: float, energy_a: float, energy_b: float, floor: float) -> float
 
 @njit(cache=True)
 def surface(template: Image, window: Image, floor: float) -> Array:
-    """Eq. 11 at every place where the template fits; both are given less their means.
+    """Eq. 11 at every position where the template fits; template and window are given minus their means.
 
-    The products run along rows of the result, so that every pass is one multiplication of a row by a number.
+    The inner loop multiplies a row of the window by one number, for vector instructions.
     """
     n, m = template.shape
     rows, columns = window.shape[0] - n + 1, window.shape[1] - m + 1
@@ -81,9 +80,9 @@ def surface(template: Image, window: Image, floor: float) -> Array:
         for r in range(n):
             for c in range(m):
                 factor = template[r, c]
-                part = window[i + r, c : c + columns]
+                window_row = window[i + r, c : c + columns]
                 for j in range(columns):
-                    cross[j] += factor * part[j]
+                    cross[j] += factor * window_row[j]
         total, total_squares = 0.0, 0.0
         for c in range(m - 1):
             total += sums[c]
@@ -110,10 +109,10 @@ def _add_row(sums: Array, squares: Array, row: Image, sign: float) -> None:
 def search_near(
     template: Image, window: Image, positions: NDArray[np.int64], radius: int, floor: float
 ) -> tuple[NDArray[np.int64], Array]:
-    """For each position (row, column) the best one within `radius` rows and columns of it, and Eq. 11 there.
+    """Search the best position within `radius` rows and columns of each position (row, column).
 
-    Positions outside the window are moved to its border. The template is given less its mean, the window as it is: all
-    sums are float64 here.
+    Returns the best positions and Eq. 11 at each. Positions outside the window are moved to its border. The template is
+    given minus its mean, the window unchanged: all sums are float64.
     """
     n, m = template.shape
     last_row, last_column = window.shape[0] - n, window.shape[1] - m
@@ -129,11 +128,11 @@ def search_near(
             for j in range(max(column - radius, 0), min(column + radius, last_column) + 1):
                 cross, total, squares = 0.0, 0.0, 0.0
                 for r in range(n):
-                    ours = template[r]
-                    theirs = window[i + r, j : j + m]
+                    template_row = template[r]
+                    window_row = window[i + r, j : j + m]
                     for c in range(m):
-                        value = np.float64(theirs[c])
-                        cross += ours[c] * value
+                        value = np.float64(window_row[c])
+                        cross += template_row[c] * value
                         total += value
                         squares += value * value
                 score = ratio(cross, energy_a, squares - total * total / count, floor)
@@ -144,35 +143,35 @@ def search_near(
 
 
 @njit(cache=True)
-def pseudo_normalized(cross: Array, window: Array, side: tuple[int, int], energy_a: float, floor: float) -> Array:
-    """``2 cross / (energy_a + energy of the window's patch)`` at every place where a patch of `side` fits.
+def pseudo_normalized(cross: Array, window: Array, shape: tuple[int, int], energy_a: float, floor: float) -> Array:
+    """``2 cross / (energy_a + energy of the window's patch)`` at every position where a patch of `shape` fits.
 
-    0 where the two energies together are at most `floor`; held to [-1, 1].
+    0 where the sum of both energies is at most `floor`; clipped to [-1, 1].
     """
-    n, m = side
+    n, m = shape
     sums, squares = _integrals(window)
     result = np.empty((window.shape[0] - n + 1, window.shape[1] - m + 1))
     for i in range(result.shape[0]):
         for j in range(result.shape[1]):
             total = sums[i + n, j + m] - sums[i, j + m] - sums[i + n, j] + sums[i, j]
             total_squares = squares[i + n, j + m] - squares[i, j + m] - squares[i + n, j] + squares[i, j]
-            both = energy_a + max(total_squares - total * total / (n * m), 0.0)
-            result[i, j] = min(max(2.0 * cross[i, j] / both, -1.0), 1.0) if both > floor else 0.0
+            total_energy = energy_a + max(total_squares - total * total / (n * m), 0.0)
+            result[i, j] = min(max(2.0 * cross[i, j] / total_energy, -1.0), 1.0) if total_energy > floor else 0.0
     return result
 
 
 @njit(cache=True)
 def _integrals(image: Array) -> tuple[Array, Array]:
-    """Sums of the image and of its squares over all rows above and columns before, shapes (rows + 1, columns + 1)."""
+    """Integral images of the image and of its squares, shapes (rows + 1, columns + 1)."""
     rows, columns = image.shape
     sums, squares = np.zeros((rows + 1, columns + 1)), np.zeros((rows + 1, columns + 1))
-    down, down_squares = np.zeros(columns), np.zeros(columns)
+    column_sums, column_squares = np.zeros(columns), np.zeros(columns)
     for i in range(rows):
-        along, along_squares = 0.0, 0.0
+        row_sum, row_squares = 0.0, 0.0
         for j in range(columns):
-            down[j] += image[i, j]
-            down_squares[j] += image[i, j] * image[i, j]
-            along += down[j]
-            along_squares += down_squares[j]
-            sums[i + 1, j + 1], squares[i + 1, j + 1] = along, along_squares
+            column_sums[j] += image[i, j]
+            column_squares[j] += image[i, j] * image[i, j]
+            row_sum += column_sums[j]
+            row_squares += column_squares[j]
+            sums[i + 1, j + 1], squares[i + 1, j + 1] = row_sum, row_squares
     return sums, squares

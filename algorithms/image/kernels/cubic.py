@@ -1,4 +1,4 @@
-"""Compiled sampling of cubic splines at any places, from their coefficients, as SciPy's `map_coordinates` does it."""
+"""Compiled evaluation of cubic splines from their coefficients, equal to SciPy's `map_coordinates`."""
 
 from __future__ import annotations
 
@@ -13,40 +13,40 @@ Array = NDArray[np.float64]
 
 @njit(cache=True)
 def sample(coefficients: Array, pixels: Array, row: int, column: int, values: Array) -> None:
-    """Values of the spline at `pixels` (u, v), shape (n, m, 2), of which `coefficients` begin at (row, column).
+    """Evaluate the spline at `pixels` (u, v), shape (n, m, 2); the first coefficient is that of pixel (row, column).
 
-    All must lie in what the coefficients cover, the middles of its outermost pixels included; beyond those it mirrors.
+    All pixels must lie within the centres of the outermost coefficients; the spline is mirrored at these centres.
     """
     rows, columns = coefficients.shape
-    down, across = np.empty(4), np.empty(4)
+    weights_v, weights_u = np.empty(4), np.empty(4)
     for i in range(pixels.shape[0]):
         for j in range(pixels.shape[1]):
             y, x = pixels[i, j, 1] - row, pixels[i, j, 0] - column
             r, c = int(y) - 1, int(x) - 1
-            _weights(y - math.floor(y), down)
-            _weights(x - math.floor(x), across)
-            inside = r >= 0 and c >= 0 and r + 3 < rows and c + 3 < columns
+            _weights(y - math.floor(y), weights_v)
+            _weights(x - math.floor(x), weights_u)
+            is_inside = r >= 0 and c >= 0 and r + 3 < rows and c + 3 < columns
             total = 0.0
             for a in range(4):
-                line = coefficients[r + a if inside else _mirror_index(r + a, rows)]
+                line = coefficients[r + a if is_inside else _mirror_index(r + a, rows)]
                 for b in range(4):
-                    total += line[c + b if inside else _mirror_index(c + b, columns)] * down[a] * across[b]
+                    total += line[c + b if is_inside else _mirror_index(c + b, columns)] * weights_v[a] * weights_u[b]
             values[i, j] = total
 
 
 @njit(cache=True)
 def _weights(fraction: float, weights: Array) -> None:
-    """The cubic B-spline's four values about a point `fraction` beyond its pixel; their sum is 1."""
-    rest = 1.0 - fraction
-    weights[0] = rest * rest * rest / 6.0
+    """Weights of the four coefficients around a point at `fraction` after its pixel; their sum is 1."""
+    complement = 1.0 - fraction
+    weights[0] = complement * complement * complement / 6.0
     weights[1] = (fraction * fraction * (fraction - 2.0) * 3.0 + 4.0) / 6.0
-    weights[2] = (rest * rest * (rest - 2.0) * 3.0 + 4.0) / 6.0
+    weights[2] = (complement * complement * (complement - 2.0) * 3.0 + 4.0) / 6.0
     weights[3] = 1.0 - weights[0] - weights[1] - weights[2]
 
 
 @njit(cache=True)
 def _mirror_index(index: int, size: int) -> int:
-    """The index within 0 .. size - 1 that one beyond stands for."""
+    """Mirror an index outside 0 .. size - 1 into that range."""
     if size == 1:
         return 0
     index = abs(index) % (2 * size - 2)
@@ -54,10 +54,10 @@ def _mirror_index(index: int, size: int) -> int:
 
 
 @njit(cache=True)
-def hold(pixels: Array, visible: NDArray[np.bool_], columns: int, rows: int) -> tuple[float, float, float, float]:
-    """Brings pixels (u, v), shape (n, m, 2), into the picture, those not visible to its upper left corner.
+def clamp(pixels: Array, visible: NDArray[np.bool_], columns: int, rows: int) -> tuple[float, float, float, float]:
+    """Clamp pixels (u, v), shape (n, m, 2), to the image; invisible ones are moved to its upper left corner.
 
-    Returns the least and largest u and v then.
+    Returns the resulting limits (left, right, top, bottom).
     """
     left, right = math.inf, -math.inf
     top, bottom = math.inf, -math.inf

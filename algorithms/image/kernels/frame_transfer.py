@@ -1,4 +1,4 @@
-"""Compiled inversion of the frame transfer; see `marsyard.algorithms.image.frame_transfer`."""
+"""Compiled inversion of the frame transfer: equations in `marsyard.algorithms.image.frame_transfer`."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ Array = NDArray[np.float64]
 
 
 @njit(cache=True)
-def remove_frame_transfer(signal: Array, exposure: float, row_gain: float, before: float, of_total: float) -> Array:
-    """Return the signal of the exposure alone, where ``y_R = row_gain x_R + before P_R + of_total T`` is `signal`."""
+def remove_frame_transfer(signal: Array, exposure: float, row_gain: float, sum_gain: float, total_gain: float) -> Array:
+    """Solve ``y_R = row_gain x_R + sum_gain P_R + total_gain T`` for x, with y the signal; return exposure * x."""
     rows, columns = signal.shape
-    for_no_total = _sums(signal, row_gain, before)
-    per_total = _sums(np.full((rows, 1), of_total), row_gain, before)[:, 0]
-    total = for_no_total[rows] / (1.0 + per_total[rows])
+    zero_total_sums = _sums(signal, row_gain, sum_gain)
+    unit_total_sums = _sums(np.full((rows, 1), total_gain), row_gain, sum_gain)[:, 0]
+    total = zero_total_sums[rows] / (1.0 + unit_total_sums[rows])
     exposed = np.empty((rows, columns))
     for i in range(rows):
         for j in range(columns):
-            until = for_no_total[i, j] - per_total[i] * total[j]
-            after = for_no_total[i + 1, j] - per_total[i + 1] * total[j]
-            exposed[i, j] = exposure * (after - until)
+            sum_before = zero_total_sums[i, j] - unit_total_sums[i] * total[j]
+            sum_after = zero_total_sums[i + 1, j] - unit_total_sums[i + 1] * total[j]
+            exposed[i, j] = exposure * (sum_after - sum_before)
     return exposed
 
 
 @njit(cache=True)
-def _sums(signal: Array, row_gain: float, before: float) -> Array:
-    """P_0 = 0, P_(R+1) = P_R + x_R with x_R = (y_R - before P_R) / row_gain, shape (rows + 1, columns)."""
+def _sums(signal: Array, row_gain: float, sum_gain: float) -> Array:
+    """P_0 = 0, P_(R+1) = P_R + x_R with x_R = (y_R - sum_gain P_R) / row_gain, shape (rows + 1, columns)."""
     rows, columns = signal.shape
-    gain, decay = 1.0 / row_gain, before / row_gain - 1.0
+    gain, decay = 1.0 / row_gain, sum_gain / row_gain - 1.0
     sums = np.empty((rows + 1, columns))
     sums[0] = 0.0
     for i in range(rows):

@@ -114,9 +114,7 @@ def laser_range(ground: Ground, row: Array) -> float:
 @njit(cache=True)
 def _limit(east: float, north: float, limit: float) -> tuple[float, float]:
     size = math.hypot(east, north)
-    if size <= limit:
-        return east, north
-    return limit * east / size, limit * north / size
+    return (east, north) if size <= limit else (limit * east / size, limit * north / size)
 
 
 @njit(cache=True)

@@ -119,9 +119,7 @@ def disc_above(offset: float) -> float:
     """Fraction of a disc above a straight line that lies `offset` radii below its centre."""
     if offset >= 1.0:
         return 1.0
-    if offset <= -1.0:
-        return 0.0
-    return 0.5 + (offset * math.sqrt(1.0 - offset * offset) + math.asin(offset)) / math.pi
+    return 0.0 if offset <= -1.0 else 0.5 + (offset * math.sqrt(1.0 - offset * offset) + math.asin(offset)) / math.pi
 
 
 @njit(cache=True, inline="always")

@@ -1,9 +1,9 @@
 """Compiled error-state Kalman filter of `marsyard.sim.sensor.navigation`.
 
-A state is a row of 16: position, velocity, quaternion (x, y, z, w; world from body), gyro bias, accelerometer bias. An
-error is true less estimated; the attitude error is a small rotation about world axes. The covariance has 15 estimated
-errors, then nine considered ones: the wander of the receiver's positions (in units of its standard deviation) and
-velocities, the bias of the compass and those of the two inclinometers.
+A state has 16 values: position, velocity, quaternion (x, y, z, w; world from body), gyro bias, accelerometer bias.
+Errors are true minus estimated; the attitude error is a rotation vector in world axes. The covariance has 15 estimated
+errors and nine considered errors: the wander of the receiver's position (in units of its standard deviation) and
+velocity, the compass bias, and the biases of the two inclinometers.
 """
 
 from __future__ import annotations
@@ -24,30 +24,30 @@ POSITION_WANDER, VELOCITY_WANDER, HEADING_BIAS, TILT_BIAS = 15, 18, 21, 22
 ERRORS = 24
 #: Blocks of the state, after position and velocity.
 QUATERNION, STATE_GYRO_BIAS, STATE_ACCELEROMETER_BIAS, STATE = 6, 10, 13, 16
-#: Columns of a receiver's row: time tag, time of delivery, solution, deviations of wander and noise, whether fixed.
-TAG, ARRIVAL, GPS_POSITION, GPS_VELOCITY, GPS_WANDER, GPS_NOISE, FIXED = 0, 1, 2, 5, 8, 11, 14
-#: Columns of a compass's row after its time tag; yaw is counterclockwise from east.
+#: Columns of a receiver row: time tag, delivery time, solution, deviations of wander and noise, whether fixed.
+TAG, DELIVERY, GPS_POSITION, GPS_VELOCITY, GPS_WANDER, GPS_NOISE, FIXED = 0, 1, 2, 5, 8, 11, 14
+#: Columns of a compass row after the time tag; yaw is counterclockwise from east.
 UP, YAW = 1, 4
 #: Types of innovations.
 POSITION_FIX, VELOCITY_FIX, COMPASS, INCLINOMETER = range(4)
-#: Memory between runs: whether the receiver's last solution was fixed (-1: none yet), the filtered acceleration in
-#: world axes, and how many solutions in a row were rejected.
+#: Memory between runs: whether the last receiver solution was fixed (-1: no solution yet), filtered acceleration in
+#: world axes, and number of consecutive rejected solutions.
 LAST_FIX, FILTERED_ACCELERATION, REJECTED, MEMORY = 0, 1, 4, 5
-INNOVATION = 5  #: Columns of an innovation: time, type, axis, normalised by its deviation, whether it was used.
+INNOVATION = 5  #: Number of columns: time, type, axis, normalised innovation, whether it was used.
 
 
 class Tuning(NamedTuple):
-    """Assumptions of the filter, SI units: see `FilterParameters`."""
+    """Parameters of the filter, SI units: see `FilterParameters`. A decay is the factor over one step."""
 
     gravity_m_s2: float
     attitude_density: float
     velocity_density: float
     gyro_bias_density: float
     accelerometer_bias_density: float
-    wander_kept_fixed: float
-    wander_kept_floating: float
+    fixed_wander_decay: float
+    floating_wander_decay: float
     velocity_wander_m_s: tuple[float, float, float]
-    velocity_wander_kept: float
+    velocity_decay: float
     velocity_noise_m_s: tuple[float, float, float]
     tilt_noise_rad: float
     heading_noise_rad: float
@@ -63,9 +63,9 @@ class Tuning(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """Inputs of a run: boundaries and increments of the inertial samples, rows of receiver and compass.
+    """Inputs of a run: boundaries and increments of the inertial samples, receiver rows and compass rows.
 
-    `kept_at` are the boundaries with stored covariances, ascending.
+    `covariance_indices`: boundaries with stored covariances, ascending.
     """
 
     times: Array
@@ -74,18 +74,18 @@ class Inputs(NamedTuple):
     velocities: Array
     gps: Array
     tilts: Array
-    kept_at: NDArray[np.int64]
+    covariance_indices: NDArray[np.int64]
 
 
 class Estimate(NamedTuple):
-    """A state and the covariance of its errors; both are changed in place."""
+    """A state and the covariance of its errors; both are updated in place."""
 
     state: Array
     covariance: Array
 
 
 @njit(cache=True)
-def matrix_of(q: Array, matrix: Array) -> None:
+def write_rotation_matrix(q: Array, matrix: Array) -> None:
     """Write the rotation matrix of a quaternion."""
     x, y, z, w = q[0], q[1], q[2], q[3]
     matrix[0, 0], matrix[0, 1], matrix[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)
@@ -94,77 +94,77 @@ def matrix_of(q: Array, matrix: Array) -> None:
 
 
 @njit(cache=True)
-def _quaternion_of(turn: Array) -> tuple[float, float, float, float]:
-    angle = math.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+def _quaternion_from_vector(v: Array) -> tuple[float, float, float, float]:
+    angle = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
     scale = 0.5 - angle * angle / 48.0 if angle < 1e-4 else math.sin(0.5 * angle) / angle
-    return scale * turn[0], scale * turn[1], scale * turn[2], math.cos(0.5 * angle)
+    return scale * v[0], scale * v[1], scale * v[2], math.cos(0.5 * angle)
 
 
 @njit(cache=True)
-def _product(a: tuple[float, float, float, float], b: tuple[float, float, float, float], out: Array) -> None:
+def _multiply(a: tuple[float, float, float, float], b: tuple[float, float, float, float], out: Array) -> None:
     out[0] = a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1]
     out[1] = a[3] * b[1] + a[1] * b[3] + a[2] * b[0] - a[0] * b[2]
     out[2] = a[3] * b[2] + a[2] * b[3] + a[0] * b[1] - a[1] * b[0]
     out[3] = a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2]
-    size = math.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2 + out[3] ** 2)
+    norm = math.sqrt(out[0] ** 2 + out[1] ** 2 + out[2] ** 2 + out[3] ** 2)
     for i in range(4):
-        out[i] /= size
+        out[i] /= norm
 
 
 @njit(cache=True)
 def propagate_state(state: Array, after: Array, angle: Array, velocity: Array, gravity: float, step: float) -> Array:
-    """Write the state a step later; return the velocity gained without gravity, world axes."""
-    matrix, turn, gained = np.empty((3, 3)), np.empty(3), np.zeros(3)
-    matrix_of(state[QUATERNION:], matrix)
+    """Propagate the state by a step into `after`; return the velocity change without gravity, world axes."""
+    matrix, rotation, delta_v = np.empty((3, 3)), np.empty(3), np.zeros(3)
+    write_rotation_matrix(state[QUATERNION:], matrix)
     for i in range(3):
-        turn[i] = angle[i] - state[STATE_GYRO_BIAS + i] * step
+        rotation[i] = angle[i] - state[STATE_GYRO_BIAS + i] * step
         for j in range(3):
-            gained[i] += matrix[i, j] * (velocity[j] - state[STATE_ACCELEROMETER_BIAS + j] * step)
+            delta_v[i] += matrix[i, j] * (velocity[j] - state[STATE_ACCELEROMETER_BIAS + j] * step)
     for i in range(3):
-        change = gained[i] - (gravity * step if i == 2 else 0.0)
+        change = delta_v[i] - (gravity * step if i == 2 else 0.0)
         after[POSITION + i] = state[POSITION + i] + (state[VELOCITY + i] + 0.5 * change) * step
         after[VELOCITY + i] = state[VELOCITY + i] + change
         after[STATE_GYRO_BIAS + i] = state[STATE_GYRO_BIAS + i]
         after[STATE_ACCELEROMETER_BIAS + i] = state[STATE_ACCELEROMETER_BIAS + i]
     q = state[QUATERNION : QUATERNION + 4]
-    _product((q[0], q[1], q[2], q[3]), _quaternion_of(turn), after[QUATERNION : QUATERNION + 4])
-    return gained
+    _multiply((q[0], q[1], q[2], q[3]), _quaternion_from_vector(rotation), after[QUATERNION : QUATERNION + 4])
+    return delta_v
 
 
 @njit(cache=True)
-def apply_transition(m: Array, matrix: Array, force: Array, kept: float, velocity_kept: float, step: float) -> None:
-    """Multiply a matrix of columns of errors by the transition over a step."""
-    velocity, turn = np.empty(3), np.empty(3)
+def apply_transition(m: Array, matrix: Array, force: Array, decay: float, velocity_decay: float, step: float) -> None:
+    """Multiply error vectors (the columns of `m`) by the transition matrix of a step, in place."""
+    velocity, rotation = np.empty(3), np.empty(3)
     for j in range(ERRORS):
         for i in range(3):
-            velocity[i] = turn[i] = 0.0
+            velocity[i] = rotation[i] = 0.0
             for k in range(3):
                 bias = step * matrix[i, k] * m[ACCELEROMETER_BIAS + k, j]
                 velocity[i] += force[i, k] * m[ATTITUDE_ERROR + k, j] - bias
-                turn[i] += matrix[i, k] * m[GYRO_BIAS + k, j]
+                rotation[i] += matrix[i, k] * m[GYRO_BIAS + k, j]
         for i in range(3):
             m[POSITION + i, j] += step * (m[VELOCITY + i, j] + 0.5 * velocity[i])
             m[VELOCITY + i, j] += velocity[i]
-            m[ATTITUDE_ERROR + i, j] -= step * turn[i]
-            m[POSITION_WANDER + i, j] *= kept
-            m[VELOCITY_WANDER + i, j] *= velocity_kept
+            m[ATTITUDE_ERROR + i, j] -= step * rotation[i]
+            m[POSITION_WANDER + i, j] *= decay
+            m[VELOCITY_WANDER + i, j] *= velocity_decay
 
 
 @njit(cache=True)
-def propagate_covariance(p: Array, matrix: Array, gained: Array, kept: float, t: Tuning, step: float) -> None:
-    """Replace the covariance by that a step later: F P F' + Q, F applied to rows and then to columns."""
+def propagate_covariance(p: Array, matrix: Array, delta_v: Array, decay: float, t: Tuning, step: float) -> None:
+    """Propagate the covariance by a step, in place: P = F P F' + Q."""
     force = np.zeros((3, 3))
-    force[0, 1], force[0, 2], force[1, 2] = gained[2], -gained[1], gained[0]
-    force[1, 0], force[2, 0], force[2, 1] = -gained[2], gained[1], -gained[0]
-    apply_transition(p, matrix, force, kept, t.velocity_wander_kept, step)
-    apply_transition(p.T, matrix, force, kept, t.velocity_wander_kept, step)
+    force[0, 1], force[0, 2], force[1, 2] = delta_v[2], -delta_v[1], delta_v[0]
+    force[1, 0], force[2, 0], force[2, 1] = -delta_v[2], delta_v[1], -delta_v[0]
+    apply_transition(p, matrix, force, decay, t.velocity_decay, step)
+    apply_transition(p.T, matrix, force, decay, t.velocity_decay, step)
     for i in range(3):
         p[VELOCITY + i, VELOCITY + i] += t.velocity_density**2 * step
         p[ATTITUDE_ERROR + i, ATTITUDE_ERROR + i] += t.attitude_density**2 * step
         p[GYRO_BIAS + i, GYRO_BIAS + i] += t.gyro_bias_density**2 * step
         p[ACCELEROMETER_BIAS + i, ACCELEROMETER_BIAS + i] += t.accelerometer_bias_density**2 * step
-        p[POSITION_WANDER + i, POSITION_WANDER + i] += 1.0 - kept * kept
-        p[VELOCITY_WANDER + i, VELOCITY_WANDER + i] += t.velocity_wander_m_s[i] ** 2 * (1.0 - t.velocity_wander_kept**2)
+        p[POSITION_WANDER + i, POSITION_WANDER + i] += 1.0 - decay * decay
+        p[VELOCITY_WANDER + i, VELOCITY_WANDER + i] += t.velocity_wander_m_s[i] ** 2 * (1.0 - t.velocity_decay**2)
 
 
 @njit(cache=True)
@@ -199,13 +199,13 @@ def update_scalar(estimate: Estimate, h: Array, residual: float, noise: float, g
         state[STATE_GYRO_BIAS + i] += correction[GYRO_BIAS + i]
         state[STATE_ACCELEROMETER_BIAS + i] += correction[ACCELEROMETER_BIAS + i]
     q = state[QUATERNION : QUATERNION + 4]
-    turn = correction[ATTITUDE_ERROR : ATTITUDE_ERROR + 3]
-    _product(_quaternion_of(turn), (q[0], q[1], q[2], q[3]), q)
+    rotation = correction[ATTITUDE_ERROR : ATTITUDE_ERROR + 3]
+    _multiply(_quaternion_from_vector(rotation), (q[0], q[1], q[2], q[3]), q)
 
 
 @njit(cache=True)
 def _interpolate(times: Array, values: Array, last: int, time: float) -> Array:
-    """Interpolate linearly between the rows up to `last`."""
+    """Interpolate linearly in the rows up to index `last`."""
     k = last
     while k > 0 and times[k] > time:
         k -= 1
@@ -217,17 +217,17 @@ def _interpolate(times: Array, values: Array, last: int, time: float) -> Array:
 
 
 @njit(cache=True)
-def _reset_errors(p: Array, block: int, size: float, added: float) -> None:
-    """Replace a block of three errors by uncorrelated ones of this deviation, plus `added` times their variance."""
+def _reset_errors(p: Array, block: int, deviation: float, old_factor: float) -> None:
+    """Reset three errors to uncorrelated: variance deviation^2 plus `old_factor` times the previous variance."""
     for i in range(block, block + 3):
-        variance = added * p[i, i] + size * size
+        variance = old_factor * p[i, i] + deviation * deviation
         p[i, :], p[:, i] = 0.0, 0.0
         p[i, i] = variance
 
 
 @njit(cache=True)
 def _restart(estimate: Estimate, row: Array, t: Tuning) -> None:
-    """Set position and velocity to a solution; distrust both and the attitude."""
+    """Set position and velocity to a solution; increase the covariance of both and of the attitude."""
     state, p = estimate
     state[POSITION : POSITION + 3] = row[GPS_POSITION : GPS_POSITION + 3]
     state[VELOCITY : VELOCITY + 3] = row[GPS_VELOCITY : GPS_VELOCITY + 3]
@@ -238,7 +238,7 @@ def _restart(estimate: Estimate, row: Array, t: Tuning) -> None:
 
 @njit(cache=True)
 def update_solution(row: Array, estimate: Estimate, since: Array, time: float, t: Tuning, log: Array) -> None:
-    """Update with a receiver's solution, propagated by the path and velocity since its time; six innovations."""
+    """Update with a solution, propagated by the displacement and velocity change `since` its time; six innovations."""
     state, _ = estimate
     h = np.empty(ERRORS)
     for i in range(3):
@@ -260,7 +260,7 @@ def update_tilt(row: Array, estimate: Estimate, disturbance_rad: float, time: fl
     """Update with the inclinometers' x and y components of up; two innovations."""
     h, matrix = np.empty(ERRORS), np.empty((3, 3))
     for i in range(2):
-        matrix_of(estimate.state[QUATERNION:], matrix)
+        write_rotation_matrix(estimate.state[QUATERNION:], matrix)
         h[:] = 0.0
         h[ATTITUDE_ERROR], h[ATTITUDE_ERROR + 1], h[TILT_BIAS + i] = matrix[1, i], -matrix[0, i], 1.0
         log[i, 0], log[i, 1], log[i, 2] = time, INCLINOMETER, i
@@ -272,25 +272,25 @@ def update_tilt(row: Array, estimate: Estimate, disturbance_rad: float, time: fl
 def update_heading(row: Array, estimate: Estimate, disturbance_rad: float, time: float, t: Tuning, log: Array) -> None:
     """Update with the compass; one innovation."""
     h, matrix = np.zeros(ERRORS), np.empty((3, 3))
-    matrix_of(estimate.state[QUATERNION:], matrix)
-    level = matrix[0, 0] ** 2 + matrix[1, 0] ** 2
-    h[ATTITUDE_ERROR] = -matrix[2, 0] * matrix[0, 0] / level
-    h[ATTITUDE_ERROR + 1] = -matrix[2, 0] * matrix[1, 0] / level
+    write_rotation_matrix(estimate.state[QUATERNION:], matrix)
+    horizontal = matrix[0, 0] ** 2 + matrix[1, 0] ** 2
+    h[ATTITUDE_ERROR] = -matrix[2, 0] * matrix[0, 0] / horizontal
+    h[ATTITUDE_ERROR + 1] = -matrix[2, 0] * matrix[1, 0] / horizontal
     h[ATTITUDE_ERROR + 2], h[HEADING_BIAS] = 1.0, 1.0
     log[0, 0], log[0, 1], log[0, 2] = time, COMPASS, 0
-    off = row[YAW] - math.atan2(matrix[1, 0], matrix[0, 0])
+    residual = row[YAW] - math.atan2(matrix[1, 0], matrix[0, 0])
     noise = math.hypot(t.heading_noise_rad, t.tan_dip * disturbance_rad)
-    update_scalar(estimate, h, math.atan2(math.sin(off), math.cos(off)), noise, t.gate, log[0])
+    update_scalar(estimate, h, math.atan2(math.sin(residual), math.cos(residual)), noise, t.gate, log[0])
 
 
 @njit(cache=True)
 def _propagate(inputs: Inputs, k: int, states: Array, p: Array, memory: Array, t: Tuning) -> None:
     """Propagate state, covariance and filtered acceleration over the sample that ends at boundary k."""
     before, step, matrix = states[k - 1], inputs.step, np.empty((3, 3))
-    matrix_of(before[QUATERNION:], matrix)
-    gained = propagate_state(before, states[k], inputs.angles[k - 1], inputs.velocities[k - 1], t.gravity_m_s2, step)
-    kept = t.wander_kept_fixed if memory[LAST_FIX] == 1.0 else t.wander_kept_floating
-    propagate_covariance(p, matrix, gained, kept, t, step)
+    write_rotation_matrix(before[QUATERNION:], matrix)
+    delta_v = propagate_state(before, states[k], inputs.angles[k - 1], inputs.velocities[k - 1], t.gravity_m_s2, step)
+    decay = t.fixed_wander_decay if memory[LAST_FIX] == 1.0 else t.floating_wander_decay
+    propagate_covariance(p, matrix, delta_v, decay, t, step)
     for i in range(3):
         change = states[k, VELOCITY + i] - before[VELOCITY + i]
         filtered = memory[FILTERED_ACCELERATION + i]
@@ -299,17 +299,17 @@ def _propagate(inputs: Inputs, k: int, states: Array, p: Array, memory: Array, t
 
 @njit(cache=True)
 def run(inputs: Inputs, start: Array, p: Array, memory: Array, t: Tuning) -> tuple[Array, Array, Array, Array]:
-    """Run the filter; return states and deviations at all boundaries, stored covariances, and innovations.
+    """Run the filter; return states, stored covariances, deviations at all boundaries, and innovations.
 
     `memory` and `p` are updated in place. Readings tagged before the first boundary are ignored.
     """
-    times, gps, tilts, kept_at = inputs.times, inputs.gps, inputs.tilts, inputs.kept_at
+    times, gps, tilts, indices = inputs.times, inputs.gps, inputs.tilts, inputs.covariance_indices
     states = np.empty((times.size, STATE))
-    # position and velocity from the inertial unit alone, since the run's start
+    # position and velocity change since the start of the run, from the inertial unit only
     inertial = np.zeros((times.size, 6))
-    covariances, deviations = np.empty((kept_at.size, ESTIMATED, ESTIMATED)), np.empty((times.size, ESTIMATED))
+    deviations, covariances = np.empty((times.size, ESTIMATED)), np.empty((indices.size, ESTIMATED, ESTIMATED))
     log = np.empty((6 * gps.shape[0] + 3 * tilts.shape[0], INNOVATION))
-    logged = fix = tilt = kept = 0
+    logged = fix = tilt = stored = 0
     states[0] = start
     for k in range(times.size):
         state = states[k]
@@ -319,7 +319,7 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, t: Tuning) -> tup
             change = state[VELOCITY : VELOCITY + 3] - states[k - 1, VELOCITY : VELOCITY + 3]
             inertial[k, :3] = inertial[k - 1, :3] + (inertial[k - 1, 3:] + 0.5 * change) * inputs.step
             inertial[k, 3:] = inertial[k - 1, 3:] + change
-        while fix < gps.shape[0] and gps[fix, ARRIVAL] <= times[k]:
+        while fix < gps.shape[0] and gps[fix, DELIVERY] <= times[k]:
             row = gps[fix]
             fix += 1
             if math.isnan(row[GPS_POSITION]) or row[TAG] < times[0]:
@@ -327,7 +327,7 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, t: Tuning) -> tup
             if memory[LAST_FIX] != row[FIXED]:
                 _reset_errors(p, POSITION_WANDER, 1.0, 0.0)
                 memory[LAST_FIX] = row[FIXED]
-            # the path since the solution's time, from the velocity as estimated now
+            # displacement since the time of the solution, from the current velocity estimate
             since = inertial[k] - _interpolate(times, inertial, k, row[TAG])
             since[:3] += (state[VELOCITY : VELOCITY + 3] - inertial[k, 3:]) * (times[k] - row[TAG])
             if memory[REJECTED] >= t.max_rejected_fixes:
@@ -336,8 +336,8 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, t: Tuning) -> tup
             memory[REJECTED] = 0.0 if log[logged : logged + 6, 4].all() else memory[REJECTED] + 1.0
             logged += 6
         east, north = memory[FILTERED_ACCELERATION], memory[FILTERED_ACCELERATION + 1]
-        level = math.sqrt(east**2 + north**2 + t.unmodelled_acceleration_m_s2**2)
-        disturbance_rad = t.disturbance * level / t.gravity_m_s2
+        acceleration = math.sqrt(east**2 + north**2 + t.unmodelled_acceleration_m_s2**2)
+        disturbance_rad = t.disturbance * acceleration / t.gravity_m_s2
         while tilt < tilts.shape[0] and tilts[tilt, TAG] <= times[k]:
             row = tilts[tilt]
             tilt += 1
@@ -351,7 +351,7 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, t: Tuning) -> tup
                 logged += 1
         for i in range(ESTIMATED):
             deviations[k, i] = math.sqrt(p[i, i])
-        while kept < kept_at.size and kept_at[kept] == k:
-            covariances[kept] = p[:ESTIMATED, :ESTIMATED]
-            kept += 1
+        while stored < indices.size and indices[stored] == k:
+            covariances[stored] = p[:ESTIMATED, :ESTIMATED]
+            stored += 1
     return states, covariances, deviations, log[:logged]

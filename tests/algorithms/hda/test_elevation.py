@@ -32,10 +32,10 @@ def test_cell_positions_invert_to_indices() -> None:
     ground = ElevationMap(np.zeros((4, 6)), np.array([-1.0, 2.0]), 0.5)
     # Rows run along -y, columns along x.
     np.testing.assert_allclose(
-        ground.places(np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 5.0]])), [[-1.0, 2.0], [-1.0, 0.5], [1.5, 2.0]]
+        ground.positions(np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 5.0]])), [[-1.0, 2.0], [-1.0, 0.5], [1.5, 2.0]]
     )
     cells = np.random.default_rng(2).uniform(-3.0, 9.0, (50, 2))
-    np.testing.assert_allclose(ground.cells(ground.places(cells)), cells)
+    np.testing.assert_allclose(ground.cells(ground.positions(cells)), cells)
 
 
 def test_points_are_distributed_by_bilinear_weights() -> None:
@@ -48,7 +48,7 @@ def test_points_are_distributed_by_bilinear_weights() -> None:
     sums = np.zeros(ground.elevation_m.shape)
     for point in points:
         for row, column in np.ndindex(weights.shape):
-            x, y = ground.places(np.array([row, column], dtype=np.float64))
+            x, y = ground.positions(np.array([row, column], dtype=np.float64))
             near = max(0.0, 1.0 - abs(point[0] - x) / cell) * max(0.0, 1.0 - abs(point[1] - y) / cell)
             weights[row, column] += near
             sums[row, column] += near * point[2]
@@ -61,7 +61,7 @@ def test_plane_is_reconstructed_from_even_points() -> None:
     points = np.column_stack([x.ravel(), y.ravel(), 0.2 * x.ravel() - 0.1 * y.ravel() - 9.0])
     ground = elevation_map(points)
     assert ground is not None
-    positions = ground.places(np.moveaxis(np.indices(ground.elevation_m.shape).astype(np.float64), 0, -1))
+    positions = ground.positions(np.moveaxis(np.indices(ground.elevation_m.shape).astype(np.float64), 0, -1))
     plane = 0.2 * positions[..., 0] - 0.1 * positions[..., 1] - 9.0
     # Points lie up to half a cell from the cell centre: the error is at most the rise over half a cell.
     assert np.nanmax(np.abs(ground.elevation_m - plane)) < 0.5 * 0.3 * ground.cell_m
@@ -73,7 +73,7 @@ def test_cells_without_points_are_unknown() -> None:
     points = points[np.hypot(points[:, 0] - 1.0, points[:, 1]) > 1.0]
     ground = elevation_map(points)
     assert ground is not None
-    positions = ground.places(np.moveaxis(np.indices(ground.elevation_m.shape).astype(np.float64), 0, -1))
+    positions = ground.positions(np.moveaxis(np.indices(ground.elevation_m.shape).astype(np.float64), 0, -1))
     distance = np.hypot(positions[..., 0] - 1.0, positions[..., 1])
     assert np.all(np.isnan(ground.elevation_m[distance < 1.0 - ground.cell_m]))
     assert np.isnan(ground.elevation_m[distance > 1.3]).mean() < 0.05

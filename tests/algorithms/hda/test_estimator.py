@@ -87,7 +87,7 @@ def map_errors(scene: Pass, answer: SiteEstimate) -> np.ndarray:
     result = ground_of(answer)
     cells = np.argwhere(~np.isnan(result.elevation.elevation_m))
     z = result.elevation.elevation_m[tuple(cells.T)]
-    points = np.column_stack([result.elevation.places(cells.astype(np.float64)), z])
+    points = np.column_stack([result.elevation.positions(cells.astype(np.float64)), z])
     world = scene.camera(0).c + result.world_from_surface.apply(points)
     return np.asarray(world[:, 2] - scene.height(world[:, 0], world[:, 1]))
 

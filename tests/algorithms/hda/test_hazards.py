@@ -27,7 +27,7 @@ OPTIONS = HdaOptions(lander_diameter_m=1.0, max_roughness_m=0.2, max_slope_rad=f
 
 def make_ground(rows: int = 80, columns: int = 100, by_x: float = 0.0, by_y: float = 0.0) -> ElevationMap:
     empty = ElevationMap(np.zeros((rows, columns)), np.array([-2.0, 5.0]), CELL_M)
-    x, y = np.moveaxis(empty.places(np.moveaxis(np.indices((rows, columns)).astype(np.float64), 0, -1)), -1, 0)
+    x, y = np.moveaxis(empty.positions(np.moveaxis(np.indices((rows, columns)).astype(np.float64), 0, -1)), -1, 0)
     return replace(empty, elevation_m=by_x * x + by_y * y)
 
 

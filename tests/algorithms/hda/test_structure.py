@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.hda import Fate, HdaDetails, HdaEstimator, HdaOptions
+from marsyard.algorithms.hda import HdaDetails, HdaEstimator, HdaOptions, MatchStatus
 from marsyard.algorithms.hda.kernels import matching
 from marsyard.algorithms.hda.motion import LandingScene, Motion, build_scene, undistort
 from marsyard.algorithms.hda.structure import (
@@ -205,9 +205,9 @@ def test_matches_failing_the_reverse_check_are_counted(scene: Pass, landing_scen
     assert np.sum(checked.accepted & ~is_wrong) > 0.95 * np.sum(plain.accepted & ~is_wrong)
     # Other matches are unchanged, and each match has one outcome.
     np.testing.assert_array_equal(checked.second, plain.second)
-    dropped = checked.fates == Fate.NOT_RETURNED
+    dropped = checked.statuses == MatchStatus.NOT_RETURNED
     np.testing.assert_array_equal(checked.accepted | dropped, plain.accepted)
-    np.testing.assert_array_equal(np.where(dropped, Fate.ACCEPTED, checked.fates), plain.fates)
+    np.testing.assert_array_equal(np.where(dropped, MatchStatus.ACCEPTED, checked.statuses), plain.statuses)
     assert len(checked.points) == checked.accepted.sum()
 
 

@@ -12,10 +12,10 @@ from marsyard.algorithms.hda.kernels import matching
 from marsyard.algorithms.hda.tracking import (
     LevelSize,
     eigenvalue_test,
+    feature_border_px,
     level_sizes,
     pyramid,
     select_features,
-    template_reach_px,
     track_features,
 )
 from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak, pseudo_normalized_correlation
@@ -62,7 +62,7 @@ def test_each_block_gives_its_best_feature_within_border() -> None:
     counts = np.random.default_rng(3).integers(0, 256, (150, 200)).astype(np.uint16)
     options = HdaOptions(block_px=40, window_half_px=8)
     features = select_features(counts, options)
-    border = template_reach_px(options)
+    border = feature_border_px(options)
     interest = eigenvalue_test(counts.astype(np.float32), 11, options.min_eigenvalue)
     expected = []
     for top in range(0, 150, 40):
@@ -100,13 +100,13 @@ def test_correlation_peak_matches_shared_operators(noise: np.ndarray) -> None:
     np.testing.assert_allclose(actual, surface, atol=1e-6)
     peak = highest_peak(surface)
     z = surface[peak.row - 1 : peak.row + 2, peak.column - 1 : peak.column + 2]
-    np.testing.assert_allclose(matching.biquadratic_top(z)[:2], biquadratic_offset(surface, peak), atol=1e-12)
+    np.testing.assert_allclose(matching.fit_biquadratic_peak(z)[:2], biquadratic_offset(surface, peak), atol=1e-12)
 
 
 def test_biquadratic_peak_is_exact_for_a_quadric() -> None:
     r, c = np.mgrid[-1.0:2.0, -1.0:2.0]
     z = 0.9 - 0.3 * (r - 0.2) ** 2 - 0.2 * (c + 0.35) ** 2 - 0.1 * (r - 0.2) * (c + 0.35)
-    np.testing.assert_allclose(matching.biquadratic_top(z), (0.2, -0.35, 0.9), atol=1e-12)
+    np.testing.assert_allclose(matching.fit_biquadratic_peak(z), (0.2, -0.35, 0.9), atol=1e-12)
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (7, -4), (-38, 33), (40, 40)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from marsyard.algorithms.hda.motion import flat_fielded
+from marsyard.algorithms.hda.motion import apply_flat_field
 from marsyard.sim.measurements import DetectorImage
 from marsyard.sim.sensor import Detector, DetectorParameters, natural_fall_off
 from marsyard.sim.sensor.optics import OpticsParameters
@@ -36,7 +36,7 @@ def render_detector_image(transfer_row_s: float, clear_row_s: float) -> tuple[np
 @pytest.mark.parametrize("times", [(0.0, 0.0), (5e-6, 0.0), (5e-6, 1e-6)])
 def test_corrected_counts_match_ideal_image(times: tuple[float, float]) -> None:
     scene, image = render_detector_image(*times)
-    counts = flat_fielded(image).astype(np.float64)
+    counts = apply_flat_field(image).astype(np.float64)
     # The exposure time is counts per second. Each count is rounded twice, and the response is at least 0.65.
     expected = 0.004 * 4e9 / 4000.0 * scene
     assert np.abs(counts - expected).max() < 0.01 * expected.mean()

@@ -12,13 +12,13 @@ from marsyard.algorithms.vtt.matching import (
     bearing_rad,
     designated_position_world,
     horizontal_axis,
-    lever_pixels,
     magnification,
     predicted_position,
     roll_angle,
+    roll_points,
 )
 from marsyard.algorithms.vtt.options import VttOptions
-from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position, mast_angles, middle
+from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position, image_centre, mast_angles
 from marsyard.algorithms.vtt.stereo import disparity_px_m, epipolar_pixels, search_ranges, triangulate
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
@@ -104,16 +104,16 @@ def test_pointing_centres_the_target(mast: MastCalibration) -> None:
         angles = mast_angles(target, mast)
         assert angles is not None
         head = mast.geometry.rover_from_head(*angles).inv().apply(target)
-        np.testing.assert_allclose(mast.left.project(head)[0], middle(mast.left), atol=1e-4)
+        np.testing.assert_allclose(mast.left.project(head)[0], image_centre(mast.left), atol=1e-4)
 
 
 def test_pointing_a_pair_splits_the_disparity() -> None:
     mast = pancam()
     for target in draw_targets(3, 20):
-        angles = mast_angles(target, mast, pair=True)
+        angles = mast_angles(target, mast, use_both=True)
         assert angles is not None
         head = mast.geometry.rover_from_head(*angles).inv().apply(target)
-        left, right = (camera.project(head)[0] - middle(camera) for camera in (mast.left, mast.right))
+        left, right = (camera.project(head)[0] - image_centre(camera) for camera in (mast.left, mast.right))
         np.testing.assert_allclose(left + right, 0.0, atol=1e-4)
         distance = float(np.linalg.norm(head))
         # The disparity is f B / R to second order in the small angles.
@@ -186,8 +186,8 @@ def test_image_roll_is_opposite_to_camera_roll(roll_deg: float) -> None:
     camera = navcam().left
     # The head rolls clockwise about its line of sight (+x forward): the image rolls counter-clockwise.
     turn = rigid(Rotation.from_rotvec(np.deg2rad(roll_deg) * camera.a), np.zeros(3))
-    target = camera.c + 5.0 * camera.rays(middle(camera))[1]
-    observed = lever_pixels(target, camera, camera, turn.inv(), 0.05)
+    target = camera.c + 5.0 * camera.rays(image_centre(camera))[1]
+    observed = roll_points(target, camera, camera, turn.inv(), 0.05)
     assert observed is not None
     roll = roll_angle(observed)
     # The lens axis is 5 px from the rotation centre: the target moves in the image.
@@ -207,7 +207,7 @@ def test_passing_a_target_rolls_its_image() -> None:
         assert angles is not None
         heads.append(stop * mast.geometry.rover_from_head(*angles))
     new_from_old = heads[1].inv() * heads[0]
-    observed = lever_pixels(heads[0].inv().apply(target), mast.left, mast.left, new_from_old, 0.001)
+    observed = roll_points(heads[0].inv().apply(target), mast.left, mast.left, new_from_old, 0.001)
     assert observed is not None
     roll = roll_angle(observed)
     rotated = np.arctan2(0.9, 1.2)  # to the right
@@ -221,7 +221,7 @@ def test_passing_a_target_rolls_its_image() -> None:
 def test_roll_is_undefined_for_invisible_targets() -> None:
     camera = navcam().left
     behind = rigid(Rotation.from_rotvec([0.0, 0.0, np.pi]), np.zeros(3))
-    assert lever_pixels(np.array([5.0, 0.0, 0.0]), camera, camera, behind, 0.05) is None
+    assert roll_points(np.array([5.0, 0.0, 0.0]), camera, camera, behind, 0.05) is None
 
 
 # ----- stereo -----

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from marsyard.algorithms.interface import TargetLoss, TargetUpdate, TrackingState
-from marsyard.algorithms.vtt.accuracy import GoalReached, HandOffOutcome, hand_off
+from marsyard.algorithms.vtt.accuracy import GoalCriterion, HandOffOutcome, hand_off
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.tracker import Evidence, Journey, Tolerances, find_losses, next_state, tolerances
 from marsyard.sim.measurements import MastCalibration
@@ -106,7 +106,7 @@ def test_state_without_target_is_unchanged() -> None:
 
 
 def test_arm_receives_only_tracked_targets_at_the_goal() -> None:
-    here, goal = np.array([1.5, 0.0, 0.1]), GoalReached(distance_m=1.5, tolerance_m=0.05)
+    here, goal = np.array([1.5, 0.0, 0.1]), GoalCriterion(distance_m=1.5, tolerance_m=0.05)
     tracked = TargetUpdate(NORMAL, (), here)
     inputs = hand_off(tracked, goal, navcam())
     assert inputs.outcome is HandOffOutcome.HANDED_OVER

@@ -55,14 +55,14 @@ def test_invalid_worker_numbers_are_rejected(
 
 @pytest.mark.parametrize("address", ["nowhere", "tcp://127.0.0.1:1"])
 def test_unreachable_scheduler_is_reported(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
-    monkeypatch.setattr("marsyard.campaigns.execution.cluster._REACH_S", 1)
-    with pytest.raises(CampaignError, match=f"--cluster {address}: no scheduler answers"):
+    monkeypatch.setattr("marsyard.campaigns.execution.cluster._TIMEOUT_S", 1)
+    with pytest.raises(CampaignError, match=f"--cluster {address}: no scheduler responds"):
         ClusterExecutor(address)
 
 
 def test_invalid_address_does_not_delay_next_connection(monkeypatch: pytest.MonkeyPatch) -> None:
     """The garbage collector may close the failed client while the event loop of the next client starts."""
-    monkeypatch.setattr("marsyard.campaigns.execution.cluster._REACH_S", 1)
+    monkeypatch.setattr("marsyard.campaigns.execution.cluster._TIMEOUT_S", 1)
     with pytest.raises(CampaignError, match="missing port number"):
         ClusterExecutor("nowhere")
     get_loop_factory = distributed.utils.get_loop_factory
@@ -72,5 +72,5 @@ def test_invalid_address_does_not_delay_next_connection(monkeypatch: pytest.Monk
         return get_loop_factory()
 
     monkeypatch.setattr("distributed.utils.get_loop_factory", collect_and_get_loop_factory)
-    with pytest.raises(CampaignError, match="no scheduler answers"):
+    with pytest.raises(CampaignError, match="no scheduler responds"):
         ClusterExecutor("tcp://127.0.0.1:1")

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.campaigns.errors import CRASHED, TIMED_OUT, CaseEndedError
+from marsyard.campaigns.errors import CRASHED, TIMED_OUT, WorkerExitError
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.cases import make_unfinished_row
 from marsyard.campaigns.execution.worker_process import TaskResult, Work, WorkLimits, request_fresh_worker
@@ -110,7 +110,7 @@ def test_processes_left_by_case_end_with_it(kind: str, tmp_path: Path) -> None:
     # the next items run in another process
     assert results[1].result == results[2].result != results[0].result
     kind_of_task = "threads" if kind == "thread" else "child processes"
-    assert f"{kind_of_task} that it left running" in results[0].changed[-1]
+    assert f"{kind_of_task} that are still running" in results[0].changed[-1]
     assert results[1].changed == results[2].changed == ()
 
 
@@ -127,7 +127,7 @@ def test_child_in_own_session_respects_time_limit(tmp_path: Path) -> None:
     results = run_items(partial(wait_for_session, str(tmp_path)), range(4), WorkLimits(time_s=2.0))
     assert time.monotonic() - start_s < MAX_DURATION_S
     error = results[1].error
-    assert isinstance(error, CaseEndedError)
+    assert isinstance(error, WorkerExitError)
     assert error.outcome == TIMED_OUT
     assert " in wait_for_session" in error.trace
     assert {item: result.result for item, result in results.items() if item != 1} == {0: 0, 2: 2, 3: 3}
@@ -148,7 +148,7 @@ def test_signal_to_supervisor_ends_only_the_case(kind: int, tmp_path: Path) -> N
     results = run_items(partial(signal_supervisor, kind, str(tmp_path)), range(3), WorkLimits(time_s=2.0))
     assert time.monotonic() - start_s < MAX_DURATION_S
     error = results[1].error
-    assert isinstance(error, CaseEndedError)
+    assert isinstance(error, WorkerExitError)
     assert error.outcome == (CRASHED if kind == signal.SIGKILL else TIMED_OUT)
     assert (results[0].result, results[2].result) == (0, 2)
     assert is_gone(int((tmp_path / "processes").read_text()))
@@ -177,7 +177,7 @@ def test_only_executor_processes_are_signalled(monkeypatch: pytest.MonkeyPatch) 
     with LocalExecutor(1) as workers:
         (batch,) = workers.run(Work(overwrite_board, [1], WorkLimits(time_s=3.0)))
         worker = workers._workers[0]
-        assert isinstance(batch[0].error, CaseEndedError)
+        assert isinstance(batch[0].error, WorkerExitError)
         assert batch[0].error.outcome == TIMED_OUT
     assert worker is not None
     assert signalled
@@ -188,13 +188,13 @@ STATE_CHANGES = {
     "the working folder": lambda: os.chdir("/"),
     "environment variables": lambda: os.environ.update(LEFT_BEHIND="1"),
     "sys.path": lambda: sys.path.insert(0, "/nowhere"),
-    "the filters of warnings": lambda: warnings.simplefilter("ignore"),
-    "NumPy's handling of errors (numpy.seterr)": lambda: np.seterr(all="ignore"),
-    "the mask of new files (umask)": lambda: os.umask(0o077),
-    "the limit of recursion": lambda: sys.setrecursionlimit(2345),
+    "the warning filters": lambda: warnings.simplefilter("ignore"),
+    "NumPy's error handling (numpy.seterr)": lambda: np.seterr(all="ignore"),
+    "the file mode mask (umask)": lambda: os.umask(0o077),
+    "the recursion limit": lambda: sys.setrecursionlimit(2345),
     "OpenCV's settings (optimised code, threads)": lambda: __import__("cv2").setUseOptimized(False),
     # 0x800 and 0x400 are upwards and downwards on x86; 0x400000 is on ARM
-    "the arithmetic of floating-point numbers (rounding)": lambda: [
+    "the floating-point rounding mode": lambda: [
         ctypes.CDLL("libm.so.6").fesetround(mode) for mode in (0x800, 0x400000)
     ],
     "handlers of signals, or timers": lambda: signal.signal(signal.SIGUSR1, signal.SIG_IGN),
@@ -324,5 +324,5 @@ def test_long_error_texts_keep_both_ends() -> None:
         assert len(text) < 8_100
         assert text.startswith(head)
         assert text.endswith(tail)
-        assert "characters left out" in text
+        assert "characters omitted" in text
     assert make_unfinished_row(0, CRASHED, "short", "")["error"] == "short"

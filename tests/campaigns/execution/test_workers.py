@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from marsyard.algorithms.processes import used_memory
-from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CampaignError, CaseEndedError
+from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CampaignError, WorkerExitError
 from marsyard.campaigns.execution.worker_process import StatusBoard, TaskResult, Work, WorkLimits
 from marsyard.campaigns.execution.workers import MAX_BATCH, Batches, LocalExecutor
 
@@ -74,7 +74,7 @@ def test_errors_are_assigned_to_their_tasks() -> None:
     with LocalExecutor(2) as workers:
         results = {result.item: result for result in run_items(workers, raise_or_exit, range(3))}
         assert isinstance(results[0].error, LookupError)
-        assert isinstance(results[1].error, CaseEndedError)
+        assert isinstance(results[1].error, WorkerExitError)
         assert str(results[1].error) == "the worker process died: EXIT (3)"
         assert callable(results[2].result)
         # the pool still works
@@ -139,7 +139,7 @@ def test_only_tasks_over_a_limit_are_ended(tmp_path: Path) -> None:
             )
         }
     errors = {item: result.error for item, result in results.items() if result.error is not None}
-    assert all(isinstance(error, CaseEndedError) for error in errors.values())
+    assert all(isinstance(error, WorkerExitError) for error in errors.values())
     assert {item: error.outcome for item, error in errors.items()} == {  # type: ignore[attr-defined]
         1: TIMED_OUT,
         2: OUT_OF_MEMORY,
@@ -148,13 +148,13 @@ def test_only_tasks_over_a_limit_are_ended(tmp_path: Path) -> None:
     }
     assert [str(errors[item]) for item in (1, 2, 3, 4)] == [
         "took longer than its limit of 3 s",
-        "took more memory than its limit of 0.2 GB",
+        "used more memory than its limit of 0.2 GB",
         "wrote more than its limit of 0.1 MB",
         "the worker process died: SIGSEGV (-11)",
     ]
     # each error has the trace of the running line
     for error in errors.values():
-        assert isinstance(error, CaseEndedError)
+        assert isinstance(error, WorkerExitError)
         assert " in exceed_limit" in error.trace
     assert {item: result.result for item, result in results.items() if result.error is None} == {
         n: n for n in (0, 5, 6, 7, 8, 9)
@@ -192,7 +192,7 @@ def start_endless_process(item: int) -> int:
 def test_processes_started_by_a_task_end_with_it() -> None:
     with LocalExecutor(1) as workers:
         (result,) = run_items(workers, start_endless_process, [0], WorkLimits(time_s=1.0))
-        assert isinstance(result.error, CaseEndedError)
+        assert isinstance(result.error, WorkerExitError)
         processes = subprocess.run(["ps", "-eo", "ppid,args"], capture_output=True, text=True, check=True).stdout
     # process 1 adopts orphans
     assert not [
@@ -207,7 +207,7 @@ def exit_at_start(*_: object) -> None:
 def test_workers_that_die_at_start_are_a_campaign_error(monkeypatch: pytest.MonkeyPatch) -> None:
     with LocalExecutor(1) as workers:
         monkeypatch.setattr("marsyard.campaigns.execution.workers.run_batch", exit_at_start)
-        with pytest.raises(CampaignError, match="worker processes die before they begin a case"):
+        with pytest.raises(CampaignError, match="worker processes die before they start a case"):
             list(workers.run(Work(get_process_id, range(3))))
 
 

@@ -33,7 +33,7 @@ def test_run_killed_before_its_record_can_be_restarted(
     directory = tmp_path / "run"
     directory.mkdir()
     create_store(directory / ROWS_FILE, {"identity": "of the run that was killed"})
-    with pytest.raises(StoreError, match="a run was stopped before it began: start it again with --out"):
+    with pytest.raises(StoreError, match="a run was stopped before its first case: start it again with --out"):
         resume_campaign(directory, ExecutorConfig(1), watch)
     run(campaign_file(), directory, watch, "cases=2", jobs=1)
     assert len(read_case_rows(directory)) == 2
@@ -42,7 +42,7 @@ def test_run_killed_before_its_record_can_be_restarted(
     for name in ("cases.parquet", "cases"):
         path = directory / name
         shutil.rmtree(path) if path.is_dir() else path.unlink()
-    with pytest.raises(StoreError, match=r"already holds a campaign \(cases.sqlite\)"):
+    with pytest.raises(StoreError, match=r"contains a campaign \(cases.sqlite\)"):
         run(campaign_file(), directory, watch, "cases=2", jobs=1)
 
 
@@ -53,9 +53,9 @@ def test_run_killed_before_its_record_can_be_restarted(
         ("cases", "12", "cases is not a whole number"),
         ("cases_finished", True, "cases_finished is not a whole number"),
         ("sessions", {"a": 1}, "sessions is not a list"),
-        ("sessions", [], "sessions holds none"),
+        ("sessions", [], "sessions is empty"),
         ("identity", "abc", "identity is not a table"),
-        ("identity", {"configuration": "a"}, "identity lacks"),
+        ("identity", {"configuration": "a"}, "identity has no"),
         ("environment", 3, "environment is not a table"),
         ("configuration", [], "configuration is not a table"),
         ("changes", None, "changes is not a list"),
@@ -127,7 +127,7 @@ def test_full_temporary_folder_is_reported(monkeypatch: pytest.MonkeyPatch) -> N
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("marsyard.campaigns.execution.workers.tempfile.mkdtemp", raise_disk_full)
-    with pytest.raises(CampaignError, match=r"TMPDIR says where they go.*No space left"):
+    with pytest.raises(CampaignError, match=r"TMPDIR defines their folder.*No space left"):
         LocalExecutor(1)
 
 

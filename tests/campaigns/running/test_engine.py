@@ -101,7 +101,7 @@ def test_used_folder_is_rejected(
     campaign_file: CampaignFile, failing_campaign: Path, tmp_path: Path, watch: RecordingWatch
 ) -> None:
     before = {path: path.stat().st_mtime_ns for path in failing_campaign.rglob("*")}
-    with pytest.raises(StoreError, match="already holds a campaign"):
+    with pytest.raises(StoreError, match="contains a campaign"):
         run(campaign_file(), failing_campaign, watch)
     assert {path: path.stat().st_mtime_ns for path in failing_campaign.rglob("*")} == before
     for name in ("report.html", "cases.sqlite"):

@@ -36,7 +36,7 @@ REASONS = {
     "int of 400 digits": "column number holds an integer of 1329 bits",
     "int of 5000 digits": "column velocity_error_m_s holds an integer of 16610 bits",
     "closes files": "the case closed or replaced the worker's file descriptors",
-    "error without a message": "SilentError, whose message cannot be had",
+    "error without a message": "SilentError (its message cannot be formatted)",
     "raises": "ValueError: the algorithm raised",
     "exits": "the worker process died: EXIT (3)",
     "list in a column": "column text holds a list",

@@ -76,7 +76,7 @@ def test_campaigns_without_input_hashes_resume_and_store_them(
     del stored["identity"]["inputs"]
     (finished / "campaign.json").write_text(json.dumps(stored))
     append_cases(finished, 1, ExecutorConfig(1), watch)
-    assert any("table.csv" in note and "not known" in note for note in watch.notes)
+    assert any("table.csv" in note and "no hash is stored" in note for note in watch.notes)
     assert record.read(finished)["identity"]["inputs"]
     table.write_text("other\n")
     with pytest.raises(CampaignError, match=r"table\.csv"):
@@ -115,5 +115,5 @@ def test_terrain_camera_and_datasheet_belong_to_the_identity(tmp_path: Path) -> 
     files["sensor.toml"].unlink()
     assert list(create_identity(configuration).inputs or {}) == [str(files["site.npz"])]
     files["site.npz"].unlink()
-    with pytest.raises(CampaignError, match=r"cannot be used any more: .*site.npz: no such file"):
+    with pytest.raises(CampaignError, match=r"are no longer valid: .*site.npz: no such file"):
         create_identity(configuration)

@@ -70,7 +70,7 @@ def test_inputs_beyond_cache_limit_are_built_by_cases(
     monkeypatch.setenv("MARSYARD_CACHE_GB", "0.0015")
     directory = run(selecting, tmp_path / "run", watch)
     assert len(_list_inputs(tmp_path / "inputs")) == 1
-    assert any("more than the cache may" in note for note in watch.notes)
+    assert any("more than the cache limit" in note for note in watch.notes)
     assert len(read_case_rows(directory)) == 3
 
 

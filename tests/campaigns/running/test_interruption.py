@@ -134,8 +134,8 @@ def test_no_process_outlives_the_campaign(
 def test_second_interruption_ends_the_program() -> None:
     program = """
 import signal, sys, time
-from marsyard.cli.campaign import stopped_by_signals
-with stopped_by_signals():
+from marsyard.cli.campaign import stop_on_signals
+with stop_on_signals():
     try:
         print("ready", flush=True)
         time.sleep(3600)
@@ -164,7 +164,7 @@ def test_case_that_changes_its_process_is_noted(
     rows = read_case_rows(run(path, tmp_path / "run", watch, "retain.showcase=none"))
     assert sorted(watch.notes) == [
         "case 1 changed its worker process: the working folder",
-        "case 4 changed its worker process: child processes that it left running (python)",
+        "case 4 changed its worker process: child processes that are still running (python)",
         "case 7 changed its worker process: the working folder",
     ]
     for row, other in zip(rows, read_case_rows(failing_campaign), strict=True):

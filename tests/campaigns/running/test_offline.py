@@ -16,8 +16,8 @@ from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.offline import (
-    cases_with_changed_pictures,
     export_campaign,
+    find_cases_with_changed_images,
     scored_campaign,
     truth_folder,
 )
@@ -90,7 +90,7 @@ def test_external_answers_score_as_a_normal_run(exported: Exported, tmp_path: Pa
         assert differing_columns(row, other) == ("algorithm",)
         assert row["algorithm"] == "theirs"
         assert row["velocity_error_m_s"] < 1.0
-    assert cases_with_changed_pictures(exported.truth, tmp_path / "scored") == []
+    assert find_cases_with_changed_images(exported.truth, tmp_path / "scored") == []
     assert watch.notes == []
 
 
@@ -100,7 +100,7 @@ def test_truth_is_stored_in_a_separate_folder(exported: Exported) -> None:
     files = sorted(path.relative_to(exported.directory).as_posix() for path in exported.directory.rglob("*"))
     assert {name for name in files if "/" not in name} == {"README.md", "cases", "export.json"}
     assert not any("12.0" in path.read_text() for path in exported.directory.glob("*.*"))
-    with pytest.raises(CampaignError, match="lies within"):
+    with pytest.raises(CampaignError, match="is inside"):
         export_campaign(
             load_export_campaign(exported),
             exported.directory,
@@ -114,10 +114,10 @@ def test_export_resumes_and_rejects_other_exports(exported: Exported) -> None:
     times = {path: path.stat().st_mtime_ns for path in (exported.directory / "cases").rglob("*")}
     export_campaign(load_export_campaign(exported), *exported, ExecutorConfig(1), RecordingWatch())
     assert {path: path.stat().st_mtime_ns for path in times} == times
-    with pytest.raises(StoreError, match="holds the truth of another export"):
+    with pytest.raises(StoreError, match="contains the truth of another export"):
         export_campaign(load_export_campaign(exported, "seed=4"), *exported, ExecutorConfig(1), RecordingWatch())
     elsewhere = Exported(exported.directory, exported.truth.with_name("new-truth"))
-    with pytest.raises(StoreError, match="is there already, and is not empty"):
+    with pytest.raises(StoreError, match="already exists and is not empty"):
         export_campaign(load_export_campaign(exported), *elsewhere, ExecutorConfig(1), RecordingWatch())
 
 
@@ -127,14 +127,14 @@ def test_tables_with_missing_or_unknown_cases_are_rejected(exported: Exported, t
     with pytest.raises(CampaignError, match=r"no answer to 1 of 3 cases: 1; .*such as NO_TEMPLATE_AREA"):
         scored_campaign(*exported, incomplete)
     unknown_case = write_answers(tmp_path / "many.csv", {**answers, 7: answers[0]})
-    with pytest.raises(CampaignError, match="there is no case 7; allowed: 0 to 2"):
+    with pytest.raises(CampaignError, match="unknown case 7; allowed: 0 to 2"):
         scored_campaign(*exported, unknown_case)
     with pytest.raises(CampaignError, match="No such file"):
         scored_campaign(*exported, tmp_path / "none.csv")
-    with pytest.raises(StoreError, match="holds no finished export"):
+    with pytest.raises(StoreError, match="contains no finished export"):
         scored_campaign(tmp_path, exported.truth, incomplete)
 
 
 def test_closed_loops_cannot_be_exported(tmp_path: Path) -> None:
-    with pytest.raises(CampaignError, match="a target tracker cannot be run elsewhere"):
+    with pytest.raises(CampaignError, match="a target tracker cannot run offline"):
         load_campaign("vtt-checkout-1", [], 1, None, [f"export:{tmp_path}"])

@@ -27,5 +27,5 @@ def test_replay_reports_differing_columns(failing_campaign: Path, tmp_path: Path
     assert replay(failing_campaign, 4).differing == ("altitude_m",)
     with pytest.raises(CampaignError, match="has no case 12; allowed: 0 to 11"):
         replay(failing_campaign, 12)
-    with pytest.raises(StoreError, match="does not hold a campaign"):
+    with pytest.raises(StoreError, match="does not contain a campaign"):
         replay(failing_campaign / "cases", 0)

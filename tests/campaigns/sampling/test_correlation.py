@@ -168,12 +168,12 @@ def test_invalid_correlations_are_rejected(matrices: dict[str, object], message:
 @pytest.mark.parametrize(
     ("dispersions", "message"),
     [
-        (NORMAL.format(east=", sd=2", north="", matrix="covariance=[[4,1],[1,4]]"), "has an sd, which the covariance"),
+        (NORMAL.format(east=", sd=2", north="", matrix="covariance=[[4,1],[1,4]]"), "has an sd, but the covariance"),
         (NORMAL.format(east=", sd=2", north="", matrix="correlation=[[1,0],[0,1]]"), 'm_s".sd: required, but missing'),
-        (NORMAL.format(east="", north=", truncate=[0,1]", matrix="covariance=[[4,1],[1,4]]"), "state the group's rank"),
+        (NORMAL.format(east="", north=", truncate=[0,1]", matrix="covariance=[[4,1],[1,4]]"), "use the group's rank"),
         (SKEWED.replace('"altitude_m"]', '"terrain"]'), "correlations[0].parameters[2]: 'terrain' has no density"),
         (SKEWED.replace('"altitude_m"]', '"altitud_m"]'), "is not dispersed (did you mean 'altitude_m'?)"),
-        (SKEWED.replace('"altitude_m"]', '"wind.east_m_s"]'), "named twice: wind.east_m_s"),
+        (SKEWED.replace('"altitude_m"]', '"wind.east_m_s"]'), "repeated parameters: wind.east_m_s"),
         (SKEWED.replace("mean = 2000", 'mean = "2000 + terrain"'), "'altitude_m' has a formula"),
         (SKEWED + '[[correlations]]\nparameters=["altitude_m"]\nrank=[[1.0]]', "is in correlations[0] already"),
         (SKEWED + "x = 1", "correlations[0].x: unknown key; allowed: correlation, covariance, parameters, rank"),

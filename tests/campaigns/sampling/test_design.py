@@ -184,13 +184,13 @@ def test_nominal_case_uses_no_draws(campaign_file: CampaignFile) -> None:
 @pytest.mark.parametrize(
     ("kind", "cases", "more", "message"),
     [
-        ("sobol", 48, {}, "cases: 48 cases cannot be laid out: a Sobol design takes a power of 2, such as 32 or 64"),
-        ("sobol", 32, {"nominal": True}, "31 cases behind the nominal one"),
+        ("sobol", 48, {}, "design: a Sobol design needs a power of 2, such as 32 or 64"),
+        ("sobol", 32, {"nominal": True}, "31 cases after the nominal case"),
         ("sobol", 18, {"dispersions": DISPERSIONS + GRID}, "a power of 2 at each point of the grid, such as 2 or 4"),
-        ("random", 7, {"dispersions": DISPERSIONS + GRID}, "cases: 7 cases cannot be laid out: the grid has 6 points"),
-        ("latin-hypercube", 1, {"nominal": True}, "none is left"),
+        ("random", 7, {"dispersions": DISPERSIONS + GRID}, "cases: 7 cases do not fit the sampling design: the grid"),
+        ("latin-hypercube", 1, {"nominal": True}, "no case remains"),
         ("latin-hypercube", 2**20 + 1, {}, "has at most 1048576 cases"),
-        ("sobol", 8, {"more": "appended = [8, 3]"}, "appended[1]: 3 cases cannot be laid out"),
+        ("sobol", 8, {"more": "appended = [8, 3]"}, "appended[1]: 3 cases do not fit the sampling design"),
         ("halton", 8, {}, "design.kind: input should be 'random', 'latin-hypercube' or 'sobol', got 'halton'"),
     ],
 )

@@ -85,7 +85,7 @@ def test_rows_are_kept_without_closing_the_store(tmp_path: Path) -> None:
 def test_full_disk_is_reported_without_loss_of_rows(tmp_path: Path) -> None:
     with open_store(tmp_path, [{"case": 0}]) as store:
         store._connection.execute("PRAGMA max_page_count = 12")
-        with pytest.raises(StoreError, match="the disk is full; the rows before that are safe"):
+        with pytest.raises(StoreError, match="the disk is full; all earlier rows are stored"):
             store.add(complete_row({"case": case, "text": "x" * 1000}) for case in range(1, 100))
         assert store.count() == 1
 
@@ -104,7 +104,7 @@ def _overwrite_pages(path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda path: _truncate(path, 0), "does not say that it is one"),
+        (lambda path: _truncate(path, 0), "wrong application id"),
         (lambda path: _truncate(path, 0.5), "damaged"),
         (lambda path: _truncate(path, 7.5), "damaged"),
         (_overwrite_pages, "damaged"),
@@ -237,5 +237,5 @@ def test_products_are_read_as_written(tmp_path: Path, products: dict[str, Any]) 
 def test_unsupported_products_are_rejected(tmp_path: Path, value: object) -> None:
     with pytest.raises(TypeError, match=r"products\.a\.0 is a"):
         pack_products({"a": [value]})
-    with pytest.raises(StoreError, match="holds no products"):
+    with pytest.raises(StoreError, match="contains no products"):
         load_products(tmp_path)

@@ -15,7 +15,7 @@ import pytest
 
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.reports.dashboard.entries import (
-    ShownRequirement,
+    RequirementVerdict,
     find_campaigns,
     make_slug,
     margin_text,
@@ -154,25 +154,25 @@ def test_pages_of_unchanged_campaigns_are_kept(make_rows: Rows, make_run: MakeRu
     assert "as it was" not in page.read_text(encoding="utf-8")
 
 
-def _make_shown_requirement(estimate: float, margin: float = -0.05) -> ShownRequirement:
-    return ShownRequirement(
+def _make_verdict(estimate: float, margin: float = -0.05) -> RequirementVerdict:
+    return RequirementVerdict(
         "R", "", "PASS", estimate, 0.9, 0.95, margin, n=10, failures=1, confidence=0.9, decide_by="", note=""
     )
 
 
 def test_sparkline_draws_higher_rates_higher() -> None:
-    line = sparkline([_make_shown_requirement(0.9), _make_shown_requirement(0.97), _make_shown_requirement(1.0)])
+    line = sparkline([_make_verdict(0.9), _make_verdict(0.97), _make_verdict(1.0)])
     assert line is not None
     heights = [float(point.split(",")[1]) for point in line.points.split()]
-    assert heights[0] > line.asked > heights[1] > heights[2]
-    assert sparkline([_make_shown_requirement(0.9)]) is None
-    assert sparkline([_make_shown_requirement(float("nan"))] * 3) is None
+    assert heights[0] > line.required_y > heights[1] > heights[2]
+    assert sparkline([_make_verdict(0.9)]) is None
+    assert sparkline([_make_verdict(float("nan"))] * 3) is None
 
 
 def test_margin_is_given_in_percentage_points() -> None:
-    assert margin_text(_make_shown_requirement(0.9)) == "−5.00 pp"
-    assert margin_text(_make_shown_requirement(0.9, margin=0.0123)) == "+1.23 pp"
-    assert margin_text(_make_shown_requirement(0.9, margin=float("nan"))) == "–"
+    assert margin_text(_make_verdict(0.9)) == "−5.00 pp"
+    assert margin_text(_make_verdict(0.9, margin=0.0123)) == "+1.23 pp"
+    assert margin_text(_make_verdict(0.9, margin=float("nan"))) == "–"
 
 
 @pytest.mark.parametrize("entries", [[]])

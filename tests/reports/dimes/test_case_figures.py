@@ -18,7 +18,7 @@ from marsyard.reports.dimes.case_figures import (
     draw_dimes_case,
     draw_dimes_pair,
     is_dimes_case,
-    tracks,
+    read_tracks,
     write_dimes_figures,
 )
 from marsyard.reports.dimes.presentation import view
@@ -108,7 +108,7 @@ def test_other_products_are_not_a_dimes_case(dimes_products: dict[str, Any]) -> 
     assert is_dimes_case(dimes_products)
     assert not is_dimes_case({})
     assert not is_dimes_case({**dimes_products, "image_3": np.zeros(3)})
-    assert tracks({}) == []
+    assert read_tracks({}) == []
     with pytest.raises(ValueError, match="image_3"):
         draw_dimes_pair({**dimes_products, "image_3": None}, 1)
 
@@ -116,7 +116,7 @@ def test_other_products_are_not_a_dimes_case(dimes_products: dict[str, Any]) -> 
 def test_case_without_tracks_shows_only_images(dimes_products: dict[str, Any]) -> None:
     image_products = {name: value for name, value in dimes_products.items() if name.startswith(("image_", "velocity_"))}
     case_view = view(image_products, "k")
-    (pictures,) = case_view.plates
+    (pictures,) = case_view.figures
     assert pictures.wide
     assert "templates" not in str(pictures.svg)
     assert "Picture 3" in str(pictures.svg)

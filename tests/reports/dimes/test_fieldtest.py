@@ -51,7 +51,7 @@ def test_page_reports_misprints_and_categories(make_run: MakeRun, field_frame: p
     assert "Pisgah Run 3, short time (128 + 8 ≠ 134)" in page
     section = field_test_section(Subject(read_run(directory), "velocity_error_m_s", 5.0))
     assert section is not None
-    assert len(section.blocks[1].plates) == 2  # the third category has no answers
+    assert len(section.blocks[1].figures) == 2  # the third category has no answers
 
 
 def test_table_of_the_paper_has_its_known_misprints() -> None:

@@ -19,15 +19,15 @@ from marsyard.reports.hda.case_figures import (
     RED,
     SAFETY_COLOURS,
     YELLOW,
+    available_figures,
     draw_epipolar,
     draw_maps,
     draw_motion,
     draw_site,
     draw_tracks,
-    figures_reached,
 )
 from marsyard.reports.hda.presentation import view
-from marsyard.reports.hda.products import is_hda_case, landing_maps, true_ground
+from marsyard.reports.hda.products import is_hda_case, read_ground_truth, read_landing_maps
 from marsyard.reports.presentation import write_case_figures
 
 
@@ -105,10 +105,10 @@ def test_sites_are_marked_in_image_and_map(hda_products: dict[str, Any]) -> None
 
 def test_true_terrain_is_aligned_with_the_map(hda_products: dict[str, Any]) -> None:
     """The highest point of the true terrain lies at the highest map cell."""
-    maps, truth = landing_maps(hda_products), true_ground(hda_products)
+    maps, truth = read_landing_maps(hda_products), read_ground_truth(hda_products)
     assert maps is not None
     assert truth is not None
-    peak_cell = maps.cells(truth.away_m.reshape(-1, 2)[np.argmax(truth.elevation_m)])
+    peak_cell = maps.world_to_cell(truth.offset_from_nadir_m.reshape(-1, 2)[np.argmax(truth.elevation_m)])
     np.testing.assert_allclose(
         peak_cell, np.unravel_index(np.argmax(maps.elevation_m), maps.elevation_m.shape), atol=1.0
     )
@@ -131,10 +131,10 @@ def test_missing_safe_site_is_not_marked(hda_products: dict[str, Any]) -> None:
 )
 def test_missing_stages_have_no_figure(hda_products: dict[str, Any], missing: tuple[str, ...], n_figures: int) -> None:
     products = {name: value for name, value in hda_products.items() if name not in missing}
-    assert len(figures_reached(products)) == n_figures
+    assert len(available_figures(products)) == n_figures
     case_view = view(products, "case7")
     # Fig. 1 is not on the page; without other figures the page shows the images
-    assert len(case_view.plates) == max(1, n_figures - 1)
+    assert len(case_view.figures) == max(1, n_figures - 1)
     assert is_hda_case(products)
 
 
@@ -155,7 +155,7 @@ def test_incomplete_products_are_not_a_landing(hda_products: dict[str, Any], cha
     ],
 )
 def test_invalid_maps_are_omitted(hda_products: dict[str, Any], changes: dict[str, Any]) -> None:
-    assert figures_reached({**hda_products, **changes}) == ["fig1-tracks", "fig2-motion", "fig3-epipolar"]
+    assert available_figures({**hda_products, **changes}) == ["fig1-tracks", "fig2-motion", "fig3-epipolar"]
 
 
 def test_unknown_cells_are_drawn(hda_products: dict[str, Any]) -> None:
@@ -164,4 +164,4 @@ def test_unknown_cells_are_drawn(hda_products: dict[str, Any]) -> None:
     unknown = {name: np.where(np.isnan(elevation), np.nan, hda_products[name]) for name in ("roughness", "slope")}
     pixels = np.where(np.isnan(elevation)[..., None], np.nan, hda_products["map_pixels"])
     case_view = view({**hda_products, **unknown, "elevation": elevation, "map_pixels": pixels}, "case1")
-    assert len(case_view.plates) == 5
+    assert len(case_view.figures) == 5

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.campaign import write_report
-from marsyard.reports.hda.classes import AtSize, curves, hazard_classes, knee
+from marsyard.reports.hda.classes import SizeResult, count_hazard_classes, find_knee, tracking_curves
 from marsyard.reports.hda.sections import (
     FAULT_OUTCOMES,
     FAULTS,
@@ -22,7 +22,7 @@ from marsyard.reports.hda.sections import (
     map_rows,
     outcome_counts,
     run_times_section,
-    site_shares,
+    site_fractions,
 )
 from marsyard.reports.rates import PooledRate, pooled_rate
 from marsyard.reports.section import Subject
@@ -89,7 +89,7 @@ def test_touchdown_errors_are_compared_with_table_2() -> None:
 
 def test_reported_sites_are_scored_against_the_truth() -> None:
     frame = landing_frame(400)
-    rates = site_shares(frame)
+    rates = site_fractions(frame)
     safe = rates["chosen sites that are truly safe"]
     assert (safe.n, safe.hits) == (frame["site_reported"].sum(), (frame["site_reported"] & frame["site_safe"]).sum())
     assert rates["'no safe site', where none exists"].share == 1.0
@@ -108,7 +108,7 @@ def test_crashed_flights_are_counted_as_not_finished() -> None:
 
 
 def test_hazard_classes_have_their_limits_and_rates() -> None:
-    classes = hazard_classes(landing_frame(10))
+    classes = count_hazard_classes(landing_frame(10))
     assert {hazard_class.kind for hazard_class in classes[:5]} == {"roughness"}
     assert [hazard_class.low for hazard_class in classes[:5]] == [0.0, 1.0, 1.5, 2.0, 3.0]
     assert [hazard_class.high for hazard_class in classes[:5]] == [1.0, 1.5, 2.0, 3.0, float("inf")]
@@ -152,22 +152,26 @@ def _make_motion_rows(column: str, sizes: list[float], fractions: list[float]) -
 
 
 def test_knee_is_at_90_percent_of_the_curve() -> None:
-    (curve,) = curves(_make_motion_rows("roll_deg", [0.0, 8.0, 12.0, 16.0], [1.0, 0.96, 0.92, 0.52]))
+    (curve,) = tracking_curves(_make_motion_rows("roll_deg", [0.0, 8.0, 12.0, 16.0], [1.0, 0.96, 0.92, 0.52]))
     assert curve.knee_up == pytest.approx(12.2)
     assert np.isnan(curve.knee_down)
-    (curve,) = curves(_make_motion_rows("height_change_fraction", [-0.4, -0.2, 0.0, 0.2], [0.4, 0.9, 1.0, 0.99]))
+    (curve,) = tracking_curves(
+        _make_motion_rows("height_change_fraction", [-0.4, -0.2, 0.0, 0.2], [0.4, 0.9, 1.0, 0.99])
+    )
     assert curve.knee_down == pytest.approx(20.0)
     assert curve.knee_up == float("inf")
 
 
 def test_curve_that_starts_below_has_its_knee_at_0() -> None:
-    points = [AtSize(size, PooledRate(0, 1, share, 0.0, 1.0, 1, 0), 1, 0) for size, share in ((0.0, 0.5), (5.0, 1.0))]
-    assert knee(points, 1.0) == 0.0
+    points = [
+        SizeResult(size, PooledRate(0, 1, share, 0.0, 1.0, 1, 0), 1, 0) for size, share in ((0.0, 0.5), (5.0, 1.0))
+    ]
+    assert find_knee(points, 1.0) == 0.0
 
 
 def test_combined_changes_have_no_curve() -> None:
     frame = _make_motion_rows("roll_deg", [0.0, 8.0, 12.0], [1.0, 0.9, 0.8]).assign(pitch_deg=5.0)
-    assert curves(frame) == []
+    assert tracking_curves(frame) == []
 
 
 def test_map_errors_are_correlated_with_their_drivers() -> None:
@@ -186,7 +190,7 @@ def test_map_errors_are_correlated_with_their_drivers() -> None:
     mapped_rows = map_rows(_make_subject(frame))
     assert mapped_rows is not None
     effects = {(effect["driver"], effect["error"]): effect for effect in MAP_EFFECTS.effects(mapped_rows)}
-    noise = effects["baseline over height", "elevation error rms without its plane (% of height)"]
+    noise = effects["baseline / height", "elevation error rms without its plane (% of height)"]
     assert noise["rank_correlation"] == pytest.approx(-1.0)
     assert np.all(np.diff(noise["medians"]) < 0.0)
     scale_error = effects["altimeter's error (% of the range)", "elevation error rms (% of height)"]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from marsyard.reports.measured.presentation import MEASURED, agreement_section, matched_pairs
+from marsyard.reports.measured.presentation import MEASURED, agreement_section, read_matched_pairs
 from marsyard.reports.presentation import case_kind
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
@@ -47,7 +47,7 @@ def test_section_reports_residuals_and_unmatched_cases() -> None:
     assert block.grid is not None
     assert list(block.grid.rows[0][:4]) == ["0", "a", "VALID", "120"]
     assert block.grid.rows[1][4] == "–"
-    assert len(block.plates) == 1
+    assert len(block.figures) == 1
 
 
 def test_no_section_without_recorded_cases() -> None:
@@ -57,17 +57,17 @@ def test_no_section_without_recorded_cases() -> None:
 def test_case_without_matches_is_shown(tmp_path: Path) -> None:
     view = MEASURED.cases[0].view(make_products(0), "k")
     assert view.rows[0].succeeded is False
-    assert "0 matches" in view.plates[0].caption
+    assert "0 matches" in view.figures[0].caption
     (path,) = MEASURED.cases[0].write(tmp_path, make_products(40))
     assert path.stat().st_size > 5000
 
 
 def test_invalid_matches_and_images_give_no_pairs() -> None:
     products = make_products(40)
-    (pair,) = matched_pairs(products)
-    assert np.count_nonzero(pair.right) == 30
+    (pair,) = read_matched_pairs(products)
+    assert np.count_nonzero(pair.inlier) == 30
     assert pair.caption.startswith("Pictures 1 and 2: 30 matches, median residual ")
-    assert matched_pairs({**products, "matches_1": np.zeros((4, 3))}) == []
-    assert matched_pairs({**products, "image_2": None}) == []
+    assert read_matched_pairs({**products, "matches_1": np.zeros((4, 3))}) == []
+    assert read_matched_pairs({**products, "image_2": None}) == []
     # recorded cases are recognised before the other systems
     assert case_kind(products) is MEASURED.cases[0]

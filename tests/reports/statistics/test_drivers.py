@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from marsyard.reports.statistics.drivers import Driver, driver
+from marsyard.reports.statistics.drivers import Driver, estimate_driver
 
 
 def _find_driver(x: np.ndarray, y: np.ndarray, groups: np.ndarray | None = None) -> Driver:
-    result = driver(x, y, groups, 0.9)
+    result = estimate_driver(x, y, groups, 0.9)
     assert result is not None
     return result
 
@@ -70,14 +70,14 @@ def test_binary_condition_has_a_significant_effect() -> None:
 
 
 def test_constant_or_short_samples_have_no_effect() -> None:
-    assert driver(np.ones(50), np.arange(50.0), None, 0.9) is None
-    assert driver(np.arange(19.0), np.arange(19.0), None, 0.9) is None
+    assert estimate_driver(np.ones(50), np.arange(50.0), None, 0.9) is None
+    assert estimate_driver(np.arange(19.0), np.arange(19.0), None, 0.9) is None
 
 
 def test_condition_that_explains_all_variance() -> None:
     """Two conditions with constant responses: the explained fraction is 1 and the F ratio infinite."""
     condition = np.repeat([400.0, 800.0], 20)
-    result = driver(condition, condition / 400.0, None, 0.9)
+    result = estimate_driver(condition, condition / 400.0, None, 0.9)
     assert result is not None
     assert (result.share, result.share_lower, result.share_upper, result.p_value) == (1.0, 1.0, 1.0, 0.0)
     assert result.correlation == pytest.approx(1.0)

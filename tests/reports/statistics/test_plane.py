@@ -61,5 +61,5 @@ def test_circular_error_probable_of_normal_errors() -> None:
 def test_reach_of_an_ellipse_is_its_bounding_square() -> None:
     # semi-axes 3 and 1 rotated by 30 deg: half widths sqrt((3 cos 30)^2 + (sin 30)^2) = 2.6458 and 1.7321
     ellipse = ErrorEllipse((0.5, -2.0), 3.0, 1.0, 30.0, 0.95, 0.9)
-    assert ellipse.reach == pytest.approx(2.0 + math.sqrt(3.0))
-    assert replace(ellipse, centre=(-1.5, 0.0)).reach == pytest.approx(1.5 + math.sqrt(7.0))
+    assert ellipse.half_extent == pytest.approx(2.0 + math.sqrt(3.0))
+    assert replace(ellipse, centre=(-1.5, 0.0)).half_extent == pytest.approx(1.5 + math.sqrt(7.0))

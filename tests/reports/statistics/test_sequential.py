@@ -29,8 +29,8 @@ def test_looks_halve_from_the_last_case() -> None:
 @given(st.integers(1, 10**9))
 def test_looks_spend_the_full_risk(cases: int) -> None:
     looks = planned_looks(cases)
-    assert sum(look.share for look in looks) == pytest.approx(1.0)
-    assert all(look.share > 0.0 for look in looks)
+    assert sum(look.risk_fraction for look in looks) == pytest.approx(1.0)
+    assert all(look.risk_fraction > 0.0 for look in looks)
     assert looks[-1].cases == cases
 
 
@@ -56,7 +56,7 @@ def test_probability_of_false_verdicts_is_below_the_risk(required_rate: float) -
             before = look.cases
             failures = np.arange(added + 1)
             undecided = np.convolve(undecided, stats.binom.pmf(failures, added, 1.0 - required_rate))
-            confidence = confidence_at(1.0 - risk, look.share)
+            confidence = confidence_at(1.0 - risk, look.risk_fraction)
             for k in range(undecided.size):
                 successes = look.cases - k
                 passed = proportion_lower(successes, look.cases, confidence) >= required_rate

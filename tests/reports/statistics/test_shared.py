@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from marsyard.reports.statistics.samples import (
-    FEWEST_TERRAINS,
-    mean_interval,
-    quantile_bounds,
-    spread_interval,
-    summarize,
-)
+from marsyard.reports.statistics.samples import MIN_TERRAINS, mean_interval, quantile_bounds, spread_interval, summarize
 
 
 def _draw_values(rng: np.random.Generator, terrains: int, correlation: float) -> tuple[np.ndarray, np.ndarray]:
@@ -77,7 +71,7 @@ def test_one_value_per_terrain_equals_independent_values() -> None:
 
 
 def test_few_terrains_give_no_interval() -> None:
-    values, groups = np.random.default_rng(5).normal(size=40), np.repeat(np.arange(FEWEST_TERRAINS - 1), 10)
+    values, groups = np.random.default_rng(5).normal(size=40), np.repeat(np.arange(MIN_TERRAINS - 1), 10)
     assert all(math.isnan(bound) for bound in mean_interval(values, 0.9, groups))
     assert all(math.isnan(bound) for bound in spread_interval(values, 0.9, groups))
 

@@ -12,7 +12,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from marsyard.reports.presentation import write_case_figures
-from marsyard.reports.vtt.case_figures import TARGET, WINDOW, draw_path, draw_stops, is_vtt_case, list_stops, rover_path
+from marsyard.reports.vtt.case_figures import (
+    TARGET,
+    WINDOW,
+    draw_path,
+    draw_stops,
+    is_vtt_case,
+    read_rover_path,
+    read_stops,
+)
 from marsyard.reports.vtt.presentation import view
 from tests.reports.vtt.tracking_rows import make_products
 
@@ -66,7 +74,7 @@ def test_path_and_estimates_are_drawn_at_their_positions() -> None:
     top_view, detail = draw_path(make_products(4)).axes
     lines = {line.get_label(): np.column_stack(line.get_data()) for line in top_view.lines}
     assert lines["stops"][-1].tolist() == [8.0, 0.0]
-    assert lines["stops as believed"][0].tolist() == pytest.approx([0.05, 0.05])
+    assert lines["stops as estimated"][0].tolist() == pytest.approx([0.05, 0.05])
     assert lines["designated target"].tolist() == [[10.0, 0.0]]
     # three of four stops found the target, 0, 3 and 6 cm east of the designated point
     (name,) = [str(line.get_label()) for line in detail.lines if "estimated" in str(line.get_label())]
@@ -107,11 +115,11 @@ def test_other_products_are_not_a_tracking_case() -> None:
     assert is_vtt_case(make_products())
     assert not is_vtt_case({})
     assert not is_vtt_case(make_products() | {"template_px": None})
-    assert list_stops({}) == []
-    assert rover_path(make_products() | {"rover_true_m": np.zeros((2, 3))}) is None
+    assert read_stops({}) == []
+    assert read_rover_path(make_products() | {"rover_true_m": np.zeros((2, 3))}) is None
     with pytest.raises(ValueError, match="no picture"):
         draw_stops({})
-    with pytest.raises(ValueError, match="no way"):
+    with pytest.raises(ValueError, match="no path of a rover"):
         draw_path({})
 
 

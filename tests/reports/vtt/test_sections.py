@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.presentation import presentations
-from marsyard.reports.vtt.goal import GOAL, camera_runs, losses_grid
+from marsyard.reports.vtt.goal import GOAL, losses_grid, summarize_cameras
 from marsyard.reports.vtt.presentation import VTT
 from marsyard.reports.vtt.sections import (
     CHECKOUT_1,
@@ -48,7 +48,7 @@ def test_measured_accuracy_is_3_sigma_per_camera() -> None:
     assert pancam["drift_px"] == pytest.approx(np.sqrt(12.5))
     result = read_table(table_1_section(make_subject(frame)), 1)
     # Navcam, 2 px of drift: sqrt(1.6^2 + 0.32^2) = 1.63
-    assert result[0]["Table I, the same"] == "1.6"
+    assert result[0]["Table I at the measured drift"] == "1.6"
     # runs from other ranges, at unselectable targets or without result are excluded
     assert measured_accuracy(frame.assign(range_start_m=7.0)) == []
     assert measured_accuracy(frame.assign(selectable=False)) == []
@@ -227,7 +227,7 @@ def test_goal_statistics_by_camera() -> None:
     set_values(frame, n, tracked=False, outcome="LOST", position_error_m=np.nan, drift_px=np.nan)
     set_values(frame, n, losses="MATCH_SCORE", lost_range_m=3.5)
     frame.loc[n + 1, "true_track"] = False
-    navcam, pancam = camera_runs(frame)
+    navcam, pancam = summarize_cameras(frame)
     assert navcam["within"].hits == 225  # 0.0399 k / 299 stays within 3 cm up to k = 224
     assert navcam["median_m"] == pytest.approx(0.01995)
     assert navcam["quantile_bound_m"] > navcam["quantile_m"]
@@ -239,7 +239,7 @@ def test_goal_statistics_by_camera() -> None:
     result = read_table(GOAL(make_subject(frame)), 1)
     assert result[1]["Median (mm)"] == "4.000"
     small_sample = read_table(GOAL(make_subject(frame.iloc[:20])), 1)
-    assert small_sample[0]["Its bound (mm)"] == "n too small"
+    assert small_sample[0]["Its bound (mm)"] == "too few cases"
 
 
 def test_other_campaigns_have_no_tracking_section() -> None:

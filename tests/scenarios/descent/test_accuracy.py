@@ -34,7 +34,7 @@ def _run_descent(case: int, **parts: Any) -> tuple[list[Track], list[State], Des
         "heading_deg": rng.uniform(0.0, 360.0),
     }
     p = parameters(**PERFECT, descent=motion, detector=NOISELESS, **parts)
-    world, streams = World.of(p), Streams(5, "accuracy", case)
+    world, streams = World.from_parameters(p), Streams(5, "accuracy", case)
     flight = create_flight(p, world.surface, streams)
     states = picture_states(p, flight)
     optics = camera_optics(p.camera)

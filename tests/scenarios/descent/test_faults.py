@@ -9,7 +9,7 @@ import pytest
 from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.conditions import deliver, faulty_detector
+from marsyard.scenarios.conditions import add_detector_faults, corrupt_images
 from marsyard.scenarios.descent.exposure import (
     SHIELD_DIAMETER_M,
     HeatShield,
@@ -23,10 +23,10 @@ from marsyard.scenarios.descent.flight import create_flight, picture_states
 from marsyard.scenarios.descent.parameters import (
     CameraParameters,
     Faults,
-    faulty_altitudes,
-    faulty_attitudes,
-    faulty_terrain,
-    faulty_times,
+    add_altitude_faults,
+    add_attitude_faults,
+    add_terrain_fault,
+    add_time_fault,
 )
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import direction, rigid
@@ -63,9 +63,9 @@ def _make_state(height_m: float) -> State:
 def test_disabled_faults_have_no_effect() -> None:
     none = Faults()
     terrain, detector = TerrainParameters(), DetectorParameters()
-    assert faulty_terrain(none, terrain) == terrain
-    assert faulty_detector(none, detector) == detector
-    assert faulty_times(none, [0.0, 3.75, 7.5]) == [0.0, 3.75, 7.5]
+    assert add_terrain_fault(none, terrain) == terrain
+    assert add_detector_faults(none, detector) == detector
+    assert add_time_fault(none, [0.0, 3.75, 7.5]) == [0.0, 3.75, 7.5]
     assert none.columns == {"fault": "none", "fault_size": 0.0}
 
 
@@ -113,17 +113,17 @@ def test_heat_shield_has_the_specified_size(angle_deg: float) -> None:
 
 def test_images_can_be_repeated_or_black() -> None:
     pictures = [np.full((4, 4), value, dtype=np.uint16) for value in (1, 2, 3)]
-    assert [int(one[0, 0]) for one in deliver(pictures, 3, 0)] == [1, 2, 2]
-    assert [int(one[0, 0]) for one in deliver(pictures, 0, 1)] == [0, 2, 3]
+    assert [int(one[0, 0]) for one in corrupt_images(pictures, 3, 0)] == [1, 2, 2]
+    assert [int(one[0, 0]) for one in corrupt_images(pictures, 0, 1)] == [0, 2, 3]
     assert [int(one[0, 0]) for one in pictures] == [1, 2, 3]
 
 
 def test_reading_errors_have_the_specified_size() -> None:
     faults = Faults(altitude_error=0.1, altitude_error_once=0.2, attitude_error_deg=3.0, attitude_error_once_deg=5.0)
-    altitudes = faulty_altitudes(faults, [AltitudeMeasurement(100.0, t) for t in (0.0, 1.0, 2.0)])
+    altitudes = add_altitude_faults(faults, [AltitudeMeasurement(100.0, t) for t in (0.0, 1.0, 2.0)])
     assert [one.altitude_m for one in altitudes] == pytest.approx([110.0, 130.0, 110.0])
     level = [AttitudeMeasurement(Rotation.identity(), t) for t in (0.0, 1.0, 2.0)]
-    tilted = [one.world_from_body for one in faulty_attitudes(faults, level, np.random.default_rng(0))]
+    tilted = [one.world_from_body for one in add_attitude_faults(faults, level, np.random.default_rng(0))]
     assert np.degrees([one.magnitude() for one in (tilted[0], tilted[2])]) == pytest.approx([3.0, 3.0])
     assert np.degrees((tilted[1] * tilted[0].inv()).magnitude()) == pytest.approx(5.0)
     assert tilted[0].as_rotvec()[2] == 0.0
@@ -131,10 +131,10 @@ def test_reading_errors_have_the_specified_size() -> None:
 
 def _render_descent(faults: Mapping[str, Any], **parts: Any) -> list[np.ndarray]:
     p = parameters(faults=faults, detector=NOISELESS, **parts)
-    world, streams = World.of(p), Streams(1, "faults", 0)
+    world, streams = World.from_parameters(p), Streams(1, "faults", 0)
     states = picture_states(p, create_flight(p, world.surface, streams))
     optics = camera_optics(p.camera)
-    detector = Detector.draw(optics.fall_off, faulty_detector(p.faults, p.detector), streams.generator("detector"))
+    detector = Detector.draw(optics.fall_off, add_detector_faults(p.faults, p.detector), streams.generator("detector"))
     return [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
 
 

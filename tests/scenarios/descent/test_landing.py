@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from marsyard.scenarios.descent.parameters import LandingParameters
-from marsyard.scenarios.descent.score import touchdown
+from marsyard.scenarios.descent.score import compute_touchdown
 
 EXACT = LandingParameters(steering_error=0.0, burn_error_m_s=0.0)
 DRIFT = np.array([12.0, -9.0])
@@ -15,20 +15,20 @@ def _rng() -> np.random.Generator:
 
 
 def test_correct_answer_cancels_the_velocity() -> None:
-    result = touchdown(EXACT, DRIFT, DRIFT.copy(), 17.0, _rng())
+    result = compute_touchdown(EXACT, DRIFT, DRIFT.copy(), 17.0, _rng())
     np.testing.assert_allclose(result.with_answer, 0.0, atol=1e-12)
     np.testing.assert_allclose(result.without_answer, DRIFT)
 
 
 def test_steering_is_limited_by_its_capability() -> None:
     fast = 2.0 * DRIFT
-    result = touchdown(EXACT, fast, fast.copy(), 17.0, _rng())
-    np.testing.assert_allclose(np.hypot(*result.with_answer), 30.0 - EXACT.max_steered_m_s)
+    result = compute_touchdown(EXACT, fast, fast.copy(), 17.0, _rng())
+    np.testing.assert_allclose(np.hypot(*result.with_answer), 30.0 - EXACT.max_steering_m_s)
 
 
 def test_wrong_answer_increases_the_velocity() -> None:
     """Steering with the negated velocity doubles the velocity."""
-    result = touchdown(EXACT, DRIFT, -DRIFT, 17.0, _rng())
+    result = compute_touchdown(EXACT, DRIFT, -DRIFT, 17.0, _rng())
     np.testing.assert_allclose(result.with_answer, 2.0 * DRIFT)
 
 
@@ -36,14 +36,14 @@ def test_wrong_answer_increases_the_velocity() -> None:
     ("estimate", "available_s"), [(None, 17.0), (DRIFT, EXACT.computation_s - 0.1), (np.array([3.0, -4.0]), 17.0)]
 )
 def test_late_or_missing_answer_disables_steering(estimate: np.ndarray | None, available_s: float) -> None:
-    result = touchdown(EXACT, DRIFT, estimate, available_s, _rng())
+    result = compute_touchdown(EXACT, DRIFT, estimate, available_s, _rng())
     np.testing.assert_array_equal(result.with_answer, result.without_answer)
-    assert result.punctual == (available_s >= EXACT.computation_s)
+    assert result.is_in_time == (available_s >= EXACT.computation_s)
 
 
 def test_burn_and_steering_errors_have_specified_spread() -> None:
     p = LandingParameters(steering_error=0.1, burn_error_m_s=1.0)
-    result = [touchdown(p, DRIFT, DRIFT.copy(), 17.0, np.random.default_rng(seed)) for seed in range(2000)]
+    result = [compute_touchdown(p, DRIFT, DRIFT.copy(), 17.0, np.random.default_rng(seed)) for seed in range(2000)]
     without = np.stack([samples.without_answer for samples in result]) - DRIFT
     steered = np.stack([samples.with_answer - samples.without_answer for samples in result]) + DRIFT
     # 4000 draws determine a standard deviation to 1.1 %.

@@ -130,13 +130,13 @@ def test_exported_images_can_be_answered_offline(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"pictures": 2}, "pictures is 2, but 'dimes' takes 3; allowed: 3 to 100"),
+        ({"pictures": 2}, "pictures is 2, but 'dimes' needs 3; allowed: 3 to 100"),
         ({"pictures": 1}, "greater than or equal to 2"),
         ({"pictures": 5, "triple": [1, 3, 6]}, r"triple is \[1, 3, 6\]; allowed: three in ascending order, 1 to 5"),
         ({"triple": [1, 3, 2]}, "three in ascending order, 1 to 3"),
         (
             {"algorithm": STREAM, "pictures": 2, "faults": {"black_picture": 3}},
-            "a fault strikes picture 3, but pictures",
+            "a fault affects picture 3, but the descent",
         ),
     ],
 )

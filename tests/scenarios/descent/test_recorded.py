@@ -43,7 +43,7 @@ def _write_vertical_fall(folder: Path, **changes: Any) -> str:
 def test_recorded_flight_equals_the_simulated_case(tmp_path: Path) -> None:
     """50 Hz, north-east-down, camera axes and another time origin."""
     simulated, p = run(), parameters()
-    world = World.of(p)
+    world = World.from_parameters(p)
     flight = create_flight(p, world.surface, Streams(1, "test", 0))
     times = np.arange(-5.0, flight.firing_s + 1.0, 0.02)
     truth = flight.motion.motion(times)
@@ -113,7 +113,7 @@ def test_invalid_flights_are_rejected_on_load(tmp_path: Path) -> None:
         r"covers 0.000 to 24.900 s; pictures from 23.000 to", _write_vertical_fall(tmp_path), first_picture_s=23.0
     )
     expect_error("flight.axes|axes", _write_vertical_fall(tmp_path), axes="xyz")
-    expect_error("no quaternion of length 1", _write_vertical_fall(tmp_path), mounting=(0.0, 0.0, 0.0, 2.0))
+    expect_error("not a quaternion of length 1", _write_vertical_fall(tmp_path), mounting=(0.0, 0.0, 0.0, 2.0))
     expect_error("absent.csv: cannot be read", "absent.csv")
 
 
@@ -123,5 +123,5 @@ def test_changed_flight_file_is_rejected(tmp_path: Path) -> None:
     stored = p.model_dump(mode="json", round_trip=True)
     assert DescentScenarioParameters.model_validate(stored) == p
     _write_vertical_fall(tmp_path, height=2300.0)
-    with pytest.raises(ValidationError, match=r"flight.parquet: has changed since the campaign was made"):
+    with pytest.raises(ValidationError, match=r"file has changed since the campaign was created"):
         DescentScenarioParameters.model_validate(stored)

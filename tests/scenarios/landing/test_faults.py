@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from marsyard.scenarios.conditions import faulty_detector
+from marsyard.scenarios.conditions import add_detector_faults
 from marsyard.scenarios.landing.helicopter import HelicopterParameters, Transit
 from marsyard.scenarios.landing.parameters import (
     Faults,
     LandingScenarioParameters,
-    draw_arrivals,
-    faulty_helicopter,
-    faulty_ranges,
+    add_range_faults,
+    add_receiver_outage,
+    draw_received_pictures,
     stuck_range_m,
 )
 from marsyard.sim.sensor import preset
@@ -26,7 +26,7 @@ def test_outage_covers_images_and_landing() -> None:
     """The filter starts normally and then coasts: its errors grow by metres in 40 s."""
     off: dict[float, list[float]] = {0.0: [], 40.0: []}
     for outage, errors in off.items():
-        flight = faulty_helicopter(Faults(gps_outage_s=outage), HELICOPTER)
+        flight = add_receiver_outage(Faults(gps_outage_s=outage), HELICOPTER)
         for case in range(6):
             transit = Transit.fly(flight, np.array([0.0, 0.0, 10.0]), 0.5, 0.5, 9.8, Streams(7, "outage", case))
             estimate = np.array(transit.pose(0).world_from_body.translation)
@@ -39,9 +39,9 @@ def test_outage_covers_images_and_landing() -> None:
 
 def test_stuck_altimeter_repeats_an_earlier_range() -> None:
     ranges = np.array([9.0, 10.0, 11.0])
-    np.testing.assert_array_equal(faulty_ranges(Faults(), ranges, 10.0), ranges)
-    np.testing.assert_allclose(faulty_ranges(Faults(laser_stuck=0.2), ranges, 10.0), 12.0)
-    assert np.isnan(faulty_ranges(Faults(laser_silent=1), ranges, 10.0)).all()
+    np.testing.assert_array_equal(add_range_faults(Faults(), ranges, 10.0), ranges)
+    np.testing.assert_allclose(add_range_faults(Faults(laser_stuck=0.2), ranges, 10.0), 12.0)
+    assert np.isnan(add_range_faults(Faults(laser_silent=1), ranges, 10.0)).all()
     # This height is always above the height at which the landing slows down.
     assert stuck_range_m(Faults(laser_silent=1), 10.0) == np.inf
     assert stuck_range_m(Faults(), 10.0) is None
@@ -49,11 +49,11 @@ def test_stuck_altimeter_repeats_an_earlier_range() -> None:
 
 def test_two_images_always_remain() -> None:
     rng = np.random.default_rng(0)
-    assert len(draw_arrivals(Faults(), 40, rng)) == 40
-    subset = draw_arrivals(Faults(lost_pictures=0.75), 40, rng)
+    assert len(draw_received_pictures(Faults(), 40, rng)) == 40
+    subset = draw_received_pictures(Faults(lost_pictures=0.75), 40, rng)
     assert len(np.unique(subset)) == 10
     assert np.all(np.diff(subset) > 0)
-    assert len(draw_arrivals(Faults(lost_pictures=1.0), 40, rng)) == 2
+    assert len(draw_received_pictures(Faults(lost_pictures=1.0), 40, rng)) == 2
 
 
 @pytest.mark.parametrize("fault", [{"lost_pictures": 0.5}, {"gps_outage_s": 5.0}])
@@ -66,7 +66,7 @@ def test_flight_faults_require_a_flight(fault: dict[str, float]) -> None:
 def test_bad_pixels_can_be_listed() -> None:
     detector = preset("xc-55").detector
     plain, listed = (
-        faulty_detector(Faults.model_validate({name: 0.01}), detector).defects
+        add_detector_faults(Faults.model_validate({name: 0.01}), detector).defects
         for name in ("bad_pixels", "listed_bad_pixels")
     )
     assert (plain.dead_fraction, plain.hot_fraction, plain.listed) == (0.01, 0.01, False)

@@ -100,18 +100,18 @@ def test_landing_repeats_with_recorded_filter_errors() -> None:
         assert np.all(np.abs(errors[-1, :2]) < 3.0)
         estimate = path.state(down.time_s).position_m + errors[round((down.time_s - path.start_s) / path.step_s), :3]
         # The boundary is at most 10 ms before the touchdown: 5 mm at its speed.
-        np.testing.assert_allclose(estimate, down.believed_m, atol=0.01)
+        np.testing.assert_allclose(estimate, down.estimated_m, atol=0.01)
 
 
 def test_navigation_error_becomes_touchdown_error() -> None:
     """The true touchdown offset minus the known filter offset is the slowly varying receiver error."""
     for case in range(5):
         transit, down = _fly_landing(case)
-        unseen = (down.state.position_m - down.believed_m)[:2]
+        unseen = (down.state.position_m - down.estimated_m)[:2]
         wander = transit.instruments.receiver.floating_wander.at(np.array([down.time_s]))[0, :2]
         # The filter follows the receiver within some centimetres.
         np.testing.assert_allclose(unseen, -wander, atol=0.12)
-        assert horizontal_distance_m(down.believed_m, SITE) < 1.2
+        assert horizontal_distance_m(down.estimated_m, SITE) < 1.2
         assert horizontal_distance_m(down.gps_m, SITE) < 1.2
 
 
@@ -157,7 +157,7 @@ def test_missing_solutions_give_no_measured_touchdown() -> None:
     down = _land(transit, streams)
     assert down.gps_solutions == 0
     assert np.isnan(horizontal_distance_m(down.gps_m, SITE))
-    assert np.isfinite(horizontal_distance_m(down.believed_m, SITE))
+    assert np.isfinite(horizontal_distance_m(down.estimated_m, SITE))
 
 
 def test_stuck_altimeter_causes_a_hard_landing() -> None:

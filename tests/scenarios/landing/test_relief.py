@@ -88,7 +88,7 @@ def test_rock_under_a_fifth_of_footprint_does_not_tilt_plane() -> None:
 
 
 def test_footprint_outside_known_ground_is_rejected() -> None:
-    with pytest.raises(ValueError, match="beyond the ground"):
+    with pytest.raises(ValueError, match="beyond the grid of exact heights"):
         _make_relief().footprints(np.array([[2.5, 0.0]]), LIMITS)
 
 

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.hda import Fate, HdaDetails, Matches
+from marsyard.algorithms.hda import HdaDetails, Matches, MatchStatus
 from marsyard.algorithms.hda.motion import View
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
-from marsyard.scenarios.conformance.parts import motion
+from marsyard.scenarios.conformance.parts import swinging_fall
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.pictures import GroundTruth
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
-from marsyard.scenarios.landing.score import landing_row, site_populations, site_row, solved_row
+from marsyard.scenarios.landing.score import landing_row, site_populations, site_row, stage_row
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.sensor import preset
@@ -30,7 +30,7 @@ REPORTED, REFUSED = SiteOutcome.SAFE_SITE, SiteOutcome.NO_SAFE_SITE
 
 def make_flight() -> Flight:
     """A flight with exact navigation."""
-    states = motion().state(0.0), motion().state(3.75)
+    states = swinging_fall().state(0.0), swinging_fall().state(3.75)
     first, second = (PoseMeasurement(rigid(one.attitude, one.position_m), one.time_s) for one in states)
     return Flight(states, (first, second), np.array([0.0, 0.0, 1.0]))
 
@@ -98,12 +98,12 @@ def test_each_hazardous_population_has_a_requirement() -> None:
 
 
 def test_matches_are_counted_by_outcome() -> None:
-    fates = np.repeat(np.array(list(Fate), dtype=np.uint8), [50, 4, 3, 2])
+    statuses = np.repeat(np.array(list(MatchStatus), dtype=np.uint8), [50, 4, 3, 2])
     pixels, nothing = np.zeros((59, 2)), np.zeros(59)
-    matches = Matches(pixels, pixels, pixels, pixels, nothing, nothing, fates, np.zeros((50, 3)))
+    matches = Matches(pixels, pixels, pixels, pixels, nothing, nothing, statuses, np.zeros((50, 3)))
     camera = preset("xc-55").cameras()[0]
     view = View(np.zeros((480, 640), dtype=np.uint16), camera, rigid(Rotation.identity(), np.zeros(3)))
-    row = solved_row(HdaDetails((view, view), matches=matches))
+    row = stage_row(HdaDetails((view, view), matches=matches))
     assert row == {
         "points": 50,
         "matched_fraction": 50 / 59,

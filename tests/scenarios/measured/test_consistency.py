@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.measured.consistency import PairAgreement, PairMatches, agreement_row, offsets_px
+from marsyard.scenarios.measured.consistency import PairAgreement, PairMatches, agreement_row, epipolar_offsets_px
 from marsyard.sim.camera import Cahv, Cahvor
 from marsyard.sim.frames import rigid
 
@@ -31,7 +31,7 @@ def test_correct_poses_have_zero_offsets(moved_m: float) -> None:
     if moved_m == 0.0:
         points *= 1e4  # for any distance
     actual, expected = CAMERA.project(points)[0], second.project(points)[0]
-    assert np.abs(offsets_px(CAMERA, second, actual, expected)).max() < 1e-5
+    assert np.abs(epipolar_offsets_px(CAMERA, second, actual, expected)).max() < 1e-5
 
 
 def test_only_error_across_epipolar_line_is_an_offset() -> None:
@@ -40,13 +40,13 @@ def test_only_error_across_epipolar_line_is_an_offset() -> None:
     second = pinhole.transform(rigid(Rotation.identity(), np.array([5.0, 0.0, 0.0])))
     points = np.array([[0.0, 0.0, -100.0], [10.0, -6.0, -120.0], [-4.0, 7.0, -90.0]])
     actual, expected = pinhole.project(points)[0], second.project(points)[0]
-    across = offsets_px(pinhole, second, actual, expected + np.array([0.0, 2.0]))
-    along = offsets_px(pinhole, second, actual, expected + np.array([3.0, 0.0]))
+    across = epipolar_offsets_px(pinhole, second, actual, expected + np.array([0.0, 2.0]))
+    along = epipolar_offsets_px(pinhole, second, actual, expected + np.array([3.0, 0.0]))
     assert np.allclose(across, [0.0, 2.0], atol=0.05)  # nearest in angle, not in pixels
     assert np.allclose(along, 0.0, atol=1e-6)
     # A match behind infinity is off by its distance from infinity.
     infinity = second.project(1e9 * pinhole.rays(actual)[1])[0]
-    beyond = offsets_px(pinhole, second, actual, infinity + np.array([4.0, 0.0]))
+    beyond = epipolar_offsets_px(pinhole, second, actual, infinity + np.array([4.0, 0.0]))
     assert np.allclose(beyond, [4.0, 0.0], atol=0.05)
 
 
@@ -54,7 +54,7 @@ def test_pure_rotation_maps_to_one_point() -> None:
     second = CAMERA.transform(rigid(TURN, np.zeros(3)))
     actual = np.array([[300.0, 200.0], [400.0, 260.0]])
     expected = second.project(1e3 * CAMERA.rays(actual)[1])[0]
-    result = offsets_px(CAMERA, second, actual, expected + np.array([1.5, -2.0]))
+    result = epipolar_offsets_px(CAMERA, second, actual, expected + np.array([1.5, -2.0]))
     assert np.allclose(result, [1.5, -2.0], atol=1e-4)
 
 

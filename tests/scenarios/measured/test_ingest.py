@@ -50,7 +50,7 @@ def drop_columns(rows: Rows, *names: str) -> Rows:
         (lambda rows: change_cells(rows, 0, altitude_m=""), "line 2: altitude_m is empty"),
         (lambda rows: change_cells(rows, 0, qx="1", qy="0", qz="0", qw="0"), "line 2: the camera looks up, 90.0 deg"),
         (lambda rows: rows[:2], "line 2: case 'drop' has 2 pictures; allowed for velocity: 3"),
-        (lambda rows: drop_columns(rows, "vx_m_s", "vy_m_s", "vz_m_s"), "neither vx_m_s to vz_m_s nor positions"),
+        (lambda rows: drop_columns(rows, "vx_m_s", "vy_m_s", "vz_m_s"), "vx_m_s to vz_m_s and the positions are empty"),
         (lambda rows: drop_columns(rows, "sun_azimuth_deg", "sun_elevation_deg"), "line 2: no sun"),
         (lambda rows: drop_columns(rows, "altitude_m"), "the column 'altitude_m' is missing"),
         (lambda rows: [{**row, "altitude_ft": "1"} for row in rows], "'altitude_ft' (did you mean 'altitude_m'?)"),
@@ -75,7 +75,7 @@ def replace_by_pipe(path: Path) -> None:
         (lambda path: cv2.imwrite(str(path), np.zeros((480, 640), np.uint16)), "has 640 x 480 pixels; its camera has"),
         (lambda path: path.write_bytes(b""), "is empty (0 bytes)"),
         (replace_by_pipe, "is a named pipe; a regular file is needed"),
-        (lambda path: path.write_bytes(b"GIF89a" + bytes(100)), "is no picture that is read; allowed: PNG"),
+        (lambda path: path.write_bytes(b"GIF89a" + bytes(100)), "is not a supported picture; allowed: PNG"),
         (lambda path: cv2.imwrite(str(path), np.full((256, 1024), 5000, np.uint16)), "bits = 12 allows 4095"),
         (lambda path: cv2.imwrite(str(path), np.zeros((256, 1024, 3), np.uint8)), "has 3 bands"),
         (lambda path: path.write_bytes(path.read_bytes()[:900]), "cannot be decoded"),
@@ -100,7 +100,7 @@ def test_invalid_images_are_rejected(tmp_path: Path, write: Callable[[Path], obj
         ('axes = "enu"', 'axes = "xyz"', "poses.axes: Input should be 'enu' or 'ned', got 'xyz'"),
         ('attitude_of = "body"', "", 'poses.attitude_of must be "body"'),
         ("[poses]", "[poses", "not valid TOML"),
-        ("flat.npy", "camera.cahvor", "camera.cahvor: is no picture that is read"),
+        ("flat.npy", "camera.cahvor", "camera.cahvor: is not a supported picture"),
     ],
 )
 def test_invalid_settings_are_rejected(tmp_path: Path, old: str, new: str, message: str) -> None:

@@ -134,7 +134,7 @@ def test_case_uses_custom_motion_instruments_and_score() -> None:
 
 def test_motion_is_deterministic_per_case() -> None:
     p = parameters(terrain=FLAT, **OWN)
-    surface = World.of(p).surface
+    surface = World.from_parameters(p).surface
     first, again, other = (create_flight(p, surface, Streams(1, "test", case)).row for case in (0, 0, 1))
     assert first == again
     assert first["flight_north_m_s"] != other["flight_north_m_s"]
@@ -144,19 +144,19 @@ def test_motion_is_deterministic_per_case() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ("short", "flies -5 to 2.9 s; allowed: from -5 s or before to 8 s or after"),
-        ("length", r"gives a quaternion of length 1\.1 \(pose 1\); allowed: 1"),
+        ("short", "covers -5 to 2.9 s; allowed: from at most -5 s to at least 8 s"),
+        ("length", r"returns a quaternion of length 1\.1 \(pose 1\); allowed: 1"),
         ("up", "at picture 1 the camera looks up"),
-        ("order", "flies 25.95 to -5 s"),
-        ("nan", "gives positions_m that are not finite"),
-        ("column", "reports the column height_m twice, or it is one of its options"),
+        ("order", "covers 25.95 to -5 s"),
+        ("nan", "returns positions_m that are not finite"),
+        ("column", "reports the column height_m, which is also the name of an option"),
     ],
 )
 def test_invalid_motion_is_reported(wrong: str, message: str) -> None:
     flight = {**OWN["flight"], "options": {"wrong": wrong}}
     p = parameters(terrain=FLAT, flight=flight)
     with pytest.raises(ValueError, match=message):
-        create_flight(p, World.of(p).surface, Streams(1, "test", 0))
+        create_flight(p, World.from_parameters(p).surface, Streams(1, "test", 0))
 
 
 @pytest.mark.parametrize("lasts_s", [20.0, 20.05, 27.95, 28.0])
@@ -164,7 +164,7 @@ def test_short_motion_is_followed_to_its_end(lasts_s: float) -> None:
     """The last instant is reached for any rounding of the sum of times."""
     flight = {**OWN["flight"], "options": {"east_m_s": 0.0, "lasts_s": lasts_s, "height_m": 5000.0}}
     p = parameters(terrain=FLAT, flight=flight)
-    world, streams = World.of(p), Streams(1, "test", 0)
+    world, streams = World.from_parameters(p), Streams(1, "test", 0)
     flown = create_flight(p, world.surface, streams)
     assert flown.firing_s == pytest.approx(flown.motion.span_s[1] - 0.1)
     assert Instruments.draw(p, world, flown, streams).navigation.velocity(np.array([flown.firing_s])).shape == (1, 3)
@@ -174,10 +174,10 @@ def test_motion_below_the_ground_is_reported() -> None:
     flight = {**OWN["flight"], "options": {"height_m": 500.0}}
     p = parameters(terrain=FLAT, flight=flight)
     with pytest.raises(ValueError, match=r"at picture 3 the camera is 62\.5 m below the ground"):
-        create_flight(p, World.of(p).surface, Streams(1, "test", 0))
+        create_flight(p, World.from_parameters(p).surface, Streams(1, "test", 0))
 
 
 def test_score_cannot_replace_a_column() -> None:
     spec = f"{HERE}velocity_error"
-    with pytest.raises(ValueError, match="gives the column velocity_error_m_s, which the row has already"):
+    with pytest.raises(ValueError, match="returns the column velocity_error_m_s, which the row already contains"):
         compute_scores([spec], None, {"velocity_error_m_s"})  # type: ignore[arg-type]

@@ -42,20 +42,20 @@ def find_problem(**parts: Any) -> tuple[str, str]:
 @pytest.mark.parametrize(
     ("parts", "key", "message"),
     [
-        ({"flight": {"motion": "nowhere:X"}}, "flight", "no motion at 'nowhere:X': No module named 'nowhere'"),
+        ({"flight": {"motion": "nowhere:X"}}, "flight", "cannot import motion 'nowhere:X': No module named 'nowhere'"),
         ({"flight": {"motion": "custom_parts:Glidr"}}, "flight", "has no attribute 'Glidr'"),
-        ({"flight": {"motion": "glidr"}}, "flight", "unknown motion 'glidr'; allowed: your own as module:name"),
-        ({"flight": {"motion": "custom_parts:sideways"}}, "flight", "is no motion: it is a function, not a class"),
-        ({"flight": {"motion": "custom_parts:StarTracker"}}, "flight", "is no motion: it has no fly"),
+        ({"flight": {"motion": "glidr"}}, "flight", "unknown motion 'glidr'; allowed: a custom one as module:name"),
+        ({"flight": {"motion": "custom_parts:sideways"}}, "flight", "not a valid motion: it is a function"),
+        ({"flight": {"motion": "custom_parts:StarTracker"}}, "flight", "is not a valid motion: missing members: fly"),
         (
             {"flight": {"motion": "custom_parts:Glider", "options": {"glide": 1.0}}},
             "flight",
-            "unexpected keyword argument 'glide'; it has: height_m, speed_m_s, glide_ratio, rocking_deg",
+            "unexpected keyword argument 'glide'; available options: height_m, speed_m_s, glide_ratio, rocking_deg",
         ),
         (
             {"flight": {"motion": "custom_parts:Glider", "options": {"glide_ratio": 9.0}}},
             "flight",
-            "refuses its options: glide_ratio is 9.0; allowed: 0 to 5",
+            "': glide_ratio is 9.0; allowed: 0 to 5",
         ),
         ({"flight": {"motion": "custom_parts:Glider", "turn_deg": 1.0}}, "flight.turn_deg", "unknown key"),
         (
@@ -69,9 +69,9 @@ def find_problem(**parts: Any) -> tuple[str, str]:
             "not JSON compliant",
         ),
         ({"altimeter": {"beam": 2.0}}, "altimeter.beam", "did you mean 'beam_deg'?"),
-        ({"scores": ["custom_parts:Glider"]}, "scores", "is no score: it is a class, not a function"),
-        ({"scores": ["custom_parts:MASS_KG"]}, "scores", "is no score: it is a float, not a function"),
-        ({"scores": ["custom_parts:sideways"] * 2}, "scores", "the score 'custom_parts:sideways' is named twice"),
+        ({"scores": ["custom_parts:Glider"]}, "scores", "is not a valid score: it is a class, not a function"),
+        ({"scores": ["custom_parts:MASS_KG"]}, "scores", "is not a valid score: it is a float, not a function"),
+        ({"scores": ["custom_parts:sideways"] * 2}, "scores", "the score 'custom_parts:sideways' is listed twice"),
     ],
 )
 def test_errors_are_reported_at_their_key(parts: dict[str, Any], key: str, message: str) -> None:
@@ -126,20 +126,20 @@ def test_score_annotation_determines_its_inputs(tmp_path: Path, monkeypatch: pyt
     assert taken["landing"] == taken["kept"] == (ScoredLanding,)
     # Annotations that include more types are accepted.
     assert taken["flown"] == (ScoredFlight, ScoredDescent)
-    with pytest.raises(ValueError, match="scores ScoredLanding; allowed here: ScoredDescent"):
+    with pytest.raises(ValueError, match="accepts ScoredLanding; allowed here: ScoredDescent"):
         load_score("scores_here:landing", ScoredDescent)
-    with pytest.raises(ValueError, match="does not take one argument"):
+    with pytest.raises(ValueError, match="must accept one argument"):
         load_score("scores_here:none_at_all")
 
 
 @pytest.mark.parametrize(
     ("reported", "message"),
     [
-        ([1.0], "gives its columns as a list; allowed: a mapping"),
-        ({"a b": 1.0}, "names a column 'a b'"),
-        ({"ä": 1.0}, "names a column 'ä'"),
-        ({"a": "text"}, "gives a as a str; allowed: a number, true or false"),
-        ({"a": None}, "gives a as a NoneType"),
+        ([1.0], "returns columns of type list; allowed: a mapping"),
+        ({"a b": 1.0}, "returns the invalid column name 'a b'"),
+        ({"ä": 1.0}, "returns the invalid column name 'ä'"),
+        ({"a": "text"}, "returns a of type str; allowed: a number, true or false"),
+        ({"a": None}, "returns a of type NoneType"),
     ],
 )
 def test_invalid_columns_are_rejected(reported: object, message: str) -> None:

@@ -53,7 +53,7 @@ def write_bad_part(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> 
 @pytest.mark.parametrize(
     ("check", "random", "lines", "problem"),
     [
-        ("answer", False, "return poses(place)", "flies a tuple; allowed: marsyard.scenarios.parts.Poses"),
+        ("answer", False, "return poses(place)", "returns a tuple; allowed: marsyard.scenarios.parts.Poses"),
         ("answer", False, "t, x, q = poses(place)\nreturn Poses(t, x[:, :2], q)", "positions_m of shape"),
         ("answer", False, "t, x, q = poses(place)\nreturn Poses(t[::40], x[::40], q[::40] * 0.9)", "length 0.9"),
         ("answer", False, "t, x, q = poses(place)\nt[5] = t[4]\nreturn Poses(t, x, q)", "time does not increase after"),
@@ -64,13 +64,13 @@ def write_bad_part(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> 
             "turns by 180",
         ),
         ("answer", False, "return 1 / 0", "it raised ZeroDivisionError"),
-        ("random", True, "return Poses(*poses(place))", "its random is true, but two streams give the same"),
-        ("random", False, "return Poses(*poses(place, rng.normal()))", "its random is false, but two streams give"),
+        ("random", True, "return Poses(*poses(place))", "its attribute random is true, but two streams give the same"),
+        ("random", False, "return Poses(*poses(place, rng.normal()))", "random is false, but two streams give"),
         (
             "deterministic",
             True,
             "return Poses(*poses(place, np.random.normal()))",
-            "asked twice, it answers differently",
+            "its answers to the same case differ between two calls",
         ),
         (
             "deterministic",
@@ -84,7 +84,7 @@ def write_bad_part(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> 
             "return Poses(*poses(place), {'gust' if rng.random() > 0.4 else 'calm': 1.0})",
             "its columns change",
         ),
-        ("columns", False, "return Poses(*poses(place), {'a b': 1.0})", "names a column 'a b'"),
+        ("columns", False, "return Poses(*poses(place), {'a b': 1.0})", "returns the invalid column name 'a b'"),
     ],
 )
 def test_motion_defects_are_reported(
@@ -112,7 +112,7 @@ def test_motion_defects_are_reported(
             "answer",
             "altitude",
             "return truth.times_s",
-            "reads a ndarray; allowed: marsyard.scenarios.parts.InstrumentReadings",
+            "returns a ndarray; allowed: marsyard.scenarios.parts.InstrumentReadings",
         ),
         (
             "inputs",
@@ -135,14 +135,14 @@ def test_instrument_defects_are_reported(
     ("check", "annotation", "lines", "problem"),
     [
         ("answer", "ScoredDescent", "return {'east': case.answer.velocity_m_s[0]}", "it raised TypeError"),
-        ("answer", "ScoredLanding", "return {'site': 'here'}", "gives site as a str; allowed: a number, true or false"),
+        ("answer", "ScoredLanding", "return {'site': 'here'}", "returns site of type str; allowed: a number"),
         ("columns", "ScoredRun", "return {a.state.name: 1.0 for a in case.answers}", "its columns change"),
         ("inputs", "ScoredDescent", "case.touchdown_m_s[:] = 0.0\nreturn {}", "it changed its input, a ScoredDescent"),
         (
             "deterministic",
             "ScoredRun",
             "KEPT.append(1)\nreturn {'asked': len(KEPT)}",
-            "asked twice, it answers differently",
+            "its answers to the same case differ between two calls",
         ),
     ],
 )
@@ -169,4 +169,5 @@ def test_nearest_ground_of_suite_matches_the_plane() -> None:
         + (np.sin(away) * np.sin(turn))[..., None] * across
     )
     ranges = (apex[2] - 0.05 * apex[0]) / (0.05 * rays[..., 0] - rays[..., 2])
-    assert suite.truths()[0].nearest_ground(apex, axis, half, 1e4) == pytest.approx(float(ranges.min()), rel=1e-4)
+    nearest = suite.instrument_cases()[0].nearest_ground(apex, axis, half, 1e4)
+    assert nearest == pytest.approx(float(ranges.min()), rel=1e-4)

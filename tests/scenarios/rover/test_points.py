@@ -6,10 +6,10 @@ import trimesh
 
 from marsyard.scenarios.rover.points import (
     RockOutline,
+    find_self_occlusion,
+    find_self_shadow,
     patch_normal,
     ray_distances,
-    self_occluded,
-    self_shadowed,
     triangles_near_line,
 )
 
@@ -36,7 +36,7 @@ def test_ray_distances_match_a_sphere(sphere: np.ndarray) -> None:
 
 def test_points_lie_on_the_visible_face(sphere: np.ndarray) -> None:
     eye = np.array([0.0, 0.0, 1.5])
-    sight = RockOutline.of(sphere, eye, 0.0)
+    sight = RockOutline.from_triangles(sphere, eye, 0.0)
     middle = sight.point(0.0, 0.5)
     assert np.linalg.norm(middle - [5.0, 0.0, 0.5]) == pytest.approx(0.5, abs=1e-3)
     assert middle[0] < 4.6
@@ -48,14 +48,14 @@ def test_points_lie_on_the_visible_face(sphere: np.ndarray) -> None:
 def test_far_side_is_hidden_and_shadow_side_is_dark(sphere: np.ndarray) -> None:
     near, far = np.array([4.5, 0.0, 0.5]), np.array([5.5, 0.0, 0.5])
     points, eye = np.stack([near, far]), np.array([0.0, 0.0, 1.5])
-    assert self_occluded(sphere, points, eye).tolist() == [False, True]
+    assert find_self_occlusion(sphere, points, eye).tolist() == [False, True]
     west = np.array([-np.cos(0.5), 0.0, np.sin(0.5)])
-    assert self_shadowed(sphere, points, west).tolist() == [False, True]
+    assert find_self_shadow(sphere, points, west).tolist() == [False, True]
 
 
 def test_normals_match_the_sphere(sphere: np.ndarray) -> None:
     eye, middle = np.array([0.0, 0.0, 0.5]), np.array([5.0, 0.0, 0.5])
-    sight = RockOutline.of(sphere, eye, 0.0)
+    sight = RockOutline.from_triangles(sphere, eye, 0.0)
     for across in (-0.9, -0.5, 0.0, 0.7):
         point = sight.point(across, 0.5)
         normal = patch_normal(sphere, eye, point, 0.01)
@@ -67,7 +67,7 @@ def test_normals_match_the_sphere(sphere: np.ndarray) -> None:
 def test_selection_near_a_ray_contains_all_hits(sphere: np.ndarray) -> None:
     eye, reach = np.array([0.0, 0.0, 0.5]), 0.03
     rng = np.random.default_rng(2)
-    for point in RockOutline.of(sphere, eye, 0.0).point(0.4, 0.7), np.array([5.0, 0.4, 0.8]):
+    for point in RockOutline.from_triangles(sphere, eye, 0.0).point(0.4, 0.7), np.array([5.0, 0.4, 0.8]):
         near = triangles_near_line(sphere, eye, point, reach)
         assert 0 < len(near) < 0.2 * len(sphere)
         ahead = (point - eye) / np.linalg.norm(point - eye)

@@ -86,5 +86,5 @@ def test_turn_reverse_and_straight_legs() -> None:
     assert [one.forward_m for one in step_commands(straight, 0, make_target(1.0, 4.0))] == [0.425]
     with pytest.raises(ValueError, match="needs step_m"):
         LegParameters(motion="straight")
-    with pytest.raises(ValueError, match="navigator drives to the target"):
+    with pytest.raises(ValueError, match="autonav needs a leg of motion 'approach'"):
         LegParameters(motion="turn", autonav=True)

@@ -118,7 +118,7 @@ def test_targets_can_be_designated_by_position(designation: str) -> None:
     run = run_case(make_parameters(target={**SHORT["target"], "designation": designation}), make_streams(3))
     assert run.outcome.name == "COMPLETED"
     # The mast then points at the position. A backlash of 0.1 deg is 2.1 px per axis; half the epipolar error is 0.2 px.
-    assert np.linalg.norm(run.stops[0].found_px(run.rig.calibrated) - run.stops[0].point_px) < 3.5
+    assert np.linalg.norm(run.stops[0].reported_px(run.rig.calibrated) - run.stops[0].point_px) < 3.5
 
 
 def test_wrong_target_reported_as_tracked_is_a_false_track() -> None:
@@ -149,7 +149,7 @@ def test_missing_answer_is_a_tracker_error() -> None:
 def test_unknown_trackers_and_cameras_are_rejected() -> None:
     with pytest.raises(ValueError, match=r"unknown algorithm 'vt'.*did you mean 'vtt'"):
         make_parameters(algorithm="vt")
-    with pytest.raises(ValueError, match="no mast carries cameras called 'xc-55'"):
+    with pytest.raises(ValueError, match="no mast has the camera preset 'xc-55'"):
         make_parameters(camera={"preset": "xc-55"})
 
 
@@ -188,7 +188,7 @@ def test_trackers_share_the_images_of_a_drive() -> None:
         (True, True),
         (True, False),
     ]
-    drive = render_drive(DriveKey.of(fine, make_streams(0)))
+    drive = render_drive(DriveKey.from_parameters(fine, make_streams(0)))
     other = track_views(SharedDriveParameters.model_validate({**settings, "target": 1}), drive)
     assert other.stops[0].point_px[0] > drive.views[0].pictures.left.corner[0]
     assert other.stops[0].pictures is drive.views[0].pictures

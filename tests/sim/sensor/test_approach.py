@@ -77,7 +77,7 @@ def test_profile_has_specified_deceleration_and_ends_upright() -> None:
     forces = approach.specific_forces(times)
     carried = p.gravity_m_s2 * p.parachute_s
     lost = np.trapezoid(forces[:, 2], times)
-    assert lost == pytest.approx(p.entry_speed_m_s + p.parachute_speed_m_s + carried, rel=1e-3)
+    assert lost == pytest.approx(p.entry_delta_v_m_s + p.parachute_delta_v_m_s + carried, rel=1e-3)
     assert approach.attitudes(np.array([0.0]))[0].apply([0.0, 0.0, -1.0])[2] == pytest.approx(-1.0)
     # Initially towards the heading and 12 deg below the horizon.
     first = approach.attitudes(np.array([approach.start_s]))[0].apply([0.0, 0.0, -1.0])

@@ -90,9 +90,9 @@ def test_mirrored_images_are_rejected(euroc: Path) -> None:
     ("settings", "fault"),
     [
         ("absent.yaml", "absent.yaml: file: cannot be read"),
-        ({"file": "FILE", "focal": 3}, "leaves nothing else to state than file, number.*focal"),
-        ({"file": "FILE", "number": 1}, "holds 1 cameras; number may be 0 to 0"),
-        ({"model": "CAHVOR", "columns": 64, "rows": 64, "h": (1, 0, 0), "v": (0, 1, 0)}, "CAHVOR needs o and r"),
+        ({"file": "FILE", "focal": 3}, "unknown key focal for a camera file; allowed: file, number"),
+        ({"file": "FILE", "number": 1}, "number is 1; allowed: 0 to 0"),
+        ({"model": "CAHVOR", "columns": 64, "rows": 64, "h": (1, 0, 0), "v": (0, 1, 0)}, "CAHVOR requires o and r"),
     ],
 )
 def test_camera_errors_are_reported(euroc: Path, settings: object, fault: str) -> None:

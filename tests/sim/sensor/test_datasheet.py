@@ -128,7 +128,7 @@ FAULTS = [
     ("full_well_e = 10500", "full_well_e = -1", "full_well_e: Input should be greater than 0"),
     ("bits = 12", "bits = 24", "bits: Input should be less than or equal to 16"),
     ("bits = 12", 'bits = 12\nshutter = "rolling"', "shutter: Input should be 'global' or 'frame-transfer'"),
-    ("bits = 12", 'bits = 12\nshutter = "frame-transfer"', "needs it above 0"),
+    ("bits = 12", 'bits = 12\nshutter = "frame-transfer"', "must be above 0"),
     ("[420.0, 680.0]", "[680.0, 420.0]", "two increasing wavelengths"),
     ("bits = 12", "bits = = 12", "not valid TOML"),
 ]

@@ -120,7 +120,7 @@ def test_large_jitter_keeps_times_increasing() -> None:
 def test_navigation_is_defined_only_within_its_samples() -> None:
     increments = ImuIncrements(np.array([0.0, 1.0]), 1.0, np.zeros((1, 3)), np.zeros((1, 3)))
     solution = InertialSolution.propagate(increments, Rotation.identity(), np.zeros(3), GRAVITY)
-    with pytest.raises(ValueError, match=r"known from 0\.0000 s to 1\.0000 s"):
+    with pytest.raises(ValueError, match=r"outside the navigation solution, 0\.0000 s to 1\.0000 s"):
         solution.velocity(np.array([1.5]))
 
 

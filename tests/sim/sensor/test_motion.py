@@ -64,7 +64,7 @@ def test_rotating_camera_matches_many_renderings() -> None:
         )
 
     frame = renderer.render(scene, rays, rigid(attitude, position))
-    motion = ImageMotion.of_camera(camera, frame.range_m, frame.world_from_body, velocity, rate)
+    motion = ImageMotion.from_camera(camera, frame.range_m, frame.world_from_body, velocity, rate)
     assert motion.max_px_s == pytest.approx(np.radians(60.0) * 14.67e-3 / 12e-6, rel=0.1)
     result = moving_exposure(frame.radiance, response, motion, EXPOSURE_S, transfer_row_s, clear_row_s)
     expected = _brute_force(seen, (size, size), transfer_row_s, clear_row_s, rows=6)
@@ -142,7 +142,7 @@ def test_image_velocity_matches_finite_differences() -> None:
     distance = 1000.0 + 100.0 * rng.random((512, 512))
     pose = rigid(Rotation.from_euler("xyz", [0.2, 0.1, 1.0]), np.array([3.0, 5.0, 900.0]))
     velocity, rate = np.array([10.0, -20.0, -60.0]), np.array([0.3, -0.4, 0.2])
-    motion = ImageMotion.of_camera(camera, distance, pose, velocity, rate)
+    motion = ImageMotion.from_camera(camera, distance, pose, velocity, rate)
     pixels = 32.0 * np.stack(np.meshgrid(np.arange(16), np.arange(16)), axis=-1).astype(np.float64)
     origins, directions = camera.rays(pixels)
     world = pose.apply((origins + distance[::32, ::32, None] * directions).reshape(-1, 3))
@@ -161,8 +161,8 @@ def test_infinite_range_moves_with_rotation_only() -> None:
     )
     pose = rigid(Rotation.identity(), np.zeros(3))
     sky = np.full((96, 128), np.inf)
-    assert ImageMotion.of_camera(camera, sky, pose, np.array([50.0, 20.0, 0.0]), np.zeros(3)).max_px_s < 1e-3
-    turning = ImageMotion.of_camera(camera, sky, pose, np.zeros(3), np.array([0.0, 0.0, 0.1]))
+    assert ImageMotion.from_camera(camera, sky, pose, np.array([50.0, 20.0, 0.0]), np.zeros(3)).max_px_s < 1e-3
+    turning = ImageMotion.from_camera(camera, sky, pose, np.zeros(3), np.array([0.0, 0.0, 0.1]))
     # A left turn moves the image to the right by 500 px/rad.
     assert turning.velocity_px_s[1, 2, 1] == pytest.approx(50.0, rel=0.01)
 

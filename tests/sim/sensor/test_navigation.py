@@ -42,7 +42,7 @@ def _run_filter(
     imu_class: ImuParameters = SMALL_UNIT,
     rtk_class: RtkParameters = RTK,
     compass_class: TiltCompassParameters = COMPASS,
-    keep_s: tuple[float, ...] = (),
+    covariance_times_s: tuple[float, ...] = (),
     parameters: FilterParameters = FilterParameters(),  # noqa: B008 - frozen
 ) -> tuple[FlownPath, Imu, NavigationSolution]:
     path, rng = _make_path(seed), np.random.default_rng([seed, 1])
@@ -54,7 +54,7 @@ def _run_filter(
     readings = compass.measure(path, compass.sampling.within(*span), rng)
     navigation = NavigationFilter(parameters, SMALL_UNIT, rtk_class, compass_class, GRAVITY)
     start = navigation.initialize(solutions, readings)
-    return path, imu, navigation.run(start, increments, solutions, readings, np.array(keep_s))
+    return path, imu, navigation.run(start, increments, solutions, readings, np.array(covariance_times_s))
 
 
 def _errors(path: FlownPath, imu: Imu, solution: NavigationSolution, at: np.ndarray) -> np.ndarray:
@@ -81,8 +81,8 @@ def test_errors_are_consistent_with_the_covariance() -> None:
     floating = RtkParameters(float_fraction=0.3, float_s=10.0)
     squares = []
     for seed in range(FLIGHTS):
-        path, imu, solution = _run_filter(seed, rtk_class=floating, keep_s=(-3.0, 0.0, 2.5, 5.0))
-        errors = _errors(path, imu, solution, solution.kept_at)
+        path, imu, solution = _run_filter(seed, rtk_class=floating, covariance_times_s=(-3.0, 0.0, 2.5, 5.0))
+        errors = _errors(path, imu, solution, solution.covariance_indices)
         covariances = solution.covariances
         squares.append([float(e @ np.linalg.solve(p, e)) for e, p in zip(errors, covariances, strict=True)])
     low, high = (float(chi2.ppf(p, 15 * FLIGHTS)) / FLIGHTS for p in (0.001, 0.999))
@@ -126,8 +126,8 @@ def test_outage_errors_are_consistent_with_the_covariance() -> None:
     away = RtkParameters(outages=(Outage(start_s=-3.0, duration_s=8.1),), float_fraction=0.0)
     squares, sizes = [], []
     for seed in range(FLIGHTS):
-        path, imu, solution = _run_filter(seed, rtk_class=away, keep_s=(5.0,))
-        error = _errors(path, imu, solution, solution.kept_at)[0]
+        path, imu, solution = _run_filter(seed, rtk_class=away, covariance_times_s=(5.0,))
+        error = _errors(path, imu, solution, solution.covariance_indices)[0]
         squares.append(error[:9] @ np.linalg.solve(solution.covariances[0][:9, :9], error[:9]))
         sizes.append(np.hypot(*error[:2]))
     assert 0.2 < np.sqrt(np.mean(np.square(sizes))) < 3.0
@@ -174,7 +174,7 @@ def test_filter_resets_after_persistent_rejection() -> None:
 
 def test_pose_is_defined_only_within_the_flight() -> None:
     path, _, solution = _run_filter(0)
-    with pytest.raises(ValueError, match="known from"):
+    with pytest.raises(ValueError, match="outside the solution times"):
         solution.pose(path.span_s[1] + 1.0)
     # 5 ms after a boundary the position has moved by 5 ms of its velocity.
     tags = solution.increments.times_s

@@ -40,7 +40,7 @@ def _estimate_poses(
 ) -> tuple[Odometer, PoseEstimate]:
     rng = np.random.default_rng(seed)
     odometer = Odometer.draw(parameters, drives[0].start.world_from_rover, rng)
-    estimate = odometer.first
+    estimate = odometer.initial_estimate
     for driven in drives:
         estimate = odometer.step(estimate, driven, rng, visual)
     return odometer, estimate
@@ -78,7 +78,7 @@ def test_misalignment_appears_when_the_rover_turns() -> None:
     ground = Plane(0.1, 0.05)
     straight = _drive(ground, (STRAIGHT, STRAIGHT))
     odometer, estimate = _estimate_poses(straight, parameters, 3)
-    assert odometer.first.world_from_rover is straight[0].start.world_from_rover
+    assert odometer.initial_estimate.world_from_rover is straight[0].start.world_from_rover
     assert _error_rad(estimate, straight[-1].end.world_from_rover) == pytest.approx(np.zeros(3), abs=1e-8)
     about = _drive(ground, (DriveCommand(turn_left_rad=np.pi),))
     odometer, estimate = _estimate_poses(about, parameters, 3)

@@ -53,7 +53,7 @@ def test_slow_error_has_the_specified_correlation_time() -> None:
 def test_solution_types_have_specified_fraction_and_duration() -> None:
     times = np.arange(0.0, 400.0, 0.5)
     floating = np.array(
-        [_measure(seed, times, float_fraction=0.25, float_s=10.0)[0].floats(times) for seed in range(200)]
+        [_measure(seed, times, float_fraction=0.25, float_s=10.0)[0].is_floating(times) for seed in range(200)]
     )
     # 200 flights of about 10 cycles each.
     assert floating.mean() == pytest.approx(0.25, abs=0.02)
