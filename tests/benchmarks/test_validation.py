@@ -47,7 +47,9 @@ def _lose_drifts(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
 
 def _lose_stereo_pairs(monkeypatch: pytest.MonkeyPatch) -> list[Measure]:
     """Every second target is not found; the others are as far off as Eq. 1 says."""
-    monkeypatch.setattr(tracking_checks, "_designation_errors", lambda number, camera: (NAN if number % 2 else 0.1, 0.1))
+    monkeypatch.setattr(
+        tracking_checks, "_designation_errors", lambda number, camera: (NAN if number % 2 else 0.1, 0.1)
+    )
     return list(tracking_checks.stereo(quick=False))
 
 
