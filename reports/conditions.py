@@ -31,7 +31,8 @@ from marsyard.reports.wording import (
 #: Prefixes of the condition columns in the order of the page; the first column with each prefix is used.
 CONDITIONS = (
     "altitude_1", "altitude_m", "attitude_rate_max", "off_nadir_max", "site", "terrain_kind", "relief", "rms_slope",
-    "sun_elevation", "horizontal_speed", "camera", "rock_diameter", "slip_mean", "tilt_max", "pose_error_fraction",
+    "sun_elevation", "sun_azimuth", "image_contrast", "image_patchiness", "dust_opacity", "rocks_abundance", "defocus",
+    "stray_light", "horizontal_speed", "camera", "rock_diameter", "slip_mean", "tilt_max", "pose_error_fraction",
 )  # fmt: skip
 #: A column with at most `MAX_VALUES` values and `CASES_PER_VALUE` cases per value on average has a row for each value.
 MAX_VALUES, CASES_PER_VALUE = 12, 10

@@ -11,12 +11,15 @@ from jaxtyping import Float64, UInt16
 from pydantic import Field
 
 from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.views import SiteGround
 from marsyard.sim.dynamics import State
+from marsyard.sim.image_statistics import local_contrast
 from marsyard.sim.kernel_cache import processor_features
 from marsyard.sim.parameters import NonNegative, Parameters
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import Backend
 from marsyard.sim.sensor import DetectorParameters
+from marsyard.sim.sensor.optics import OpticsParameters
 
 
 def sun_columns(direction: Float64[np.ndarray, "3"]) -> dict[str, Scalar]:
@@ -25,6 +28,28 @@ def sun_columns(direction: Float64[np.ndarray, "3"]) -> dict[str, Scalar]:
         "sun_azimuth_deg": float(np.degrees(np.arctan2(direction[0], direction[1])) % 360.0),
         "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(direction[2], -1.0, 1.0)))),
     }
+
+
+def ground_columns(ground: SiteGround | None) -> dict[str, Scalar]:
+    """Return the optical depth of a site's air and the abundance of its rocks; NaN without a site."""
+    if ground is None:
+        return {"dust_opacity": np.nan, "rocks_abundance": np.nan}
+    rocks = ground.terrain.rocks
+    return {
+        "dust_opacity": ground.site.environment.optical_depth,
+        "rocks_abundance": 0.0 if rocks is None else rocks.abundance,
+    }
+
+
+def optics_columns(optics: OpticsParameters) -> dict[str, Scalar]:
+    """Return the dispersed errors of a camera's optics."""
+    return optics.model_dump(include={"defocus_px", "stray_light", "dust_discs"})
+
+
+def contrast_columns(picture: UInt16[np.ndarray, "rows columns"], detector: DetectorParameters) -> dict[str, Scalar]:
+    """Return the local contrast of a delivered picture and its spread (see `marsyard.sim.image_statistics`)."""
+    low, middle, high = local_contrast(np.maximum(picture - detector.offset_dn, 0.0))
+    return {"image_contrast": middle, "image_patchiness": high / low if low > 0.0 else np.nan}
 
 
 def off_nadir_deg(state: State) -> float:

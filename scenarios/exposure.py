@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.parameters import Parameters, bounded_field
-from marsyard.sim.render import Frame, PixelRays, Scene, process_renderer
+from marsyard.sim.render import Frame, PixelRays, Scene, Sun, process_renderer
 from marsyard.sim.render.backend import Backend
 from marsyard.sim.sensor import DetectorParameters, ImageMotion, natural_fall_off
 from marsyard.sim.streams import Streams
@@ -127,6 +127,29 @@ def render_state(
     frame = process_renderer(backend).render(scene, optics.rays, pose, state.time_s)
     rate = state.attitude.apply(state.body_rate_rad_s)
     return frame, ImageMotion.from_camera(optics.camera, frame.range_m, frame.world_from_body, state.velocity_m_s, rate)
+
+
+def add_haze(frame: Frame, air: Environment, sun: Sun, extinction_m: float) -> Float32[np.ndarray, "rows columns"]:
+    """Compute the radiance factor of an image through a homogeneous layer of dusty air between ground and camera.
+
+    The ground's light is attenuated by ``T = exp(-extinction x range)``; ``1 - T`` of the air's source function is
+    added: single scattering of sunlight (Henyey & Greenstein 1941) and of the mean light from sky and ground. Contrast
+    decreases, brightness changes less. The sky is not changed.
+    """
+    if extinction_m == 0.0:
+        return frame.radiance
+    transmission = np.exp(np.float32(-extinction_m) * frame.range_m.astype(np.float32))
+    # sunlight travels along -sun and is scattered along -direction, towards the camera
+    sun_body = frame.world_from_body.rotation.inv().apply(sun.direction).astype(np.float32)
+    cosine = (frame.rays.directions.astype(np.float32) @ sun_body).reshape(frame.radiance.shape)
+    g = np.float32(air.asymmetry)
+    base = np.float32(1.0) + g * g - np.float32(2.0) * g * cosine
+    phase = (np.float32(1.0) - g * g) / (base * np.sqrt(base))
+    sky = air.sky_share(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
+    ambient = np.float32(0.5 * (sky + float(frame.radiance.mean())))
+    source = np.float32(air.single_scattering_albedo) * (np.float32(0.25) * phase + ambient)
+    hazy = transmission * frame.radiance + (np.float32(1.0) - transmission) * source
+    return np.where(np.isfinite(frame.range_m), hazy, frame.radiance)
 
 
 def sunlight_ratio(air: Environment, elevation_rad: float, detector: DetectorParameters) -> float:

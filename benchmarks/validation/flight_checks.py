@@ -10,9 +10,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from benchmarks.validation.image_statistics import ImageStatistics, image_statistics
 from benchmarks.validation.records import Check, Measure
 from marsyard.cli.pictures import ImageRequest, render_images
+from marsyard.sim.image_statistics import ImageStatistics, image_statistics
 
 #: Altitudes of two of Spirit's descent pictures, metres.
 ALTITUDES_M = (1433.0, 1983.0)

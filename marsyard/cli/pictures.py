@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt16
 
+from marsyard.scenarios.exposure import add_haze
 from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, is_terrain_file, load_site
 from marsyard.scenarios.views import STANCES, Eye, SiteGround, camera_pose, site_scene
 from marsyard.sim import sensor
@@ -141,7 +142,7 @@ def render_images(request: ImageRequest, *, detector: bool = True, both: bool = 
     images = []
     for number, camera in enumerate(selected):
         frame = process_renderer(default_backend()).render(scene, rays[number], pose)
-        exposure, counts = _expose(request, ground, camera, number, frame) if detector else (None, None)
+        exposure, counts = _expose(request, ground, camera, number, frame, sun) if detector else (None, None)
         suffix = "" if len(cameras) == 1 else ("-left", "-right")[number]
         filled = _mark_filled(ground, frame)
         images.append(RenderedImage(suffix, camera.transform(pose), camera, frame, scene, exposure, counts, filled))
@@ -161,7 +162,7 @@ def _mark_filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows col
 
 
 def _expose(
-    request: ImageRequest, ground: SiteGround, camera: CameraModel, number: int, frame: Frame
+    request: ImageRequest, ground: SiteGround, camera: CameraModel, number: int, frame: Frame, sun: Sun
 ) -> tuple[sensor.AutoExposure, UInt16[np.ndarray, "rows columns"]]:
     """Expose the camera's detector with automatic exposure time; rows are not summed."""
     streams = Streams(request.seed, "render", number)
@@ -172,7 +173,10 @@ def _expose(
     parameters = preset.detector.model_copy(update={**sunlight, "rows_summed": 1})
     detector = sensor.Detector.draw(sensor.natural_fall_off(camera), parameters, streams.generator("detector response"))
     # rendered I/F is relative to the irradiance at the ground; detector I/F to that at the top of the atmosphere
-    radiance = frame.radiance * np.float32(environment.direct_share(math.radians(request.sun_elevation_deg)))
+    position = np.asarray(frame.world_from_body.translation)
+    height = float(position[2]) - float(ground.surface.height(*position[:2]))
+    hazy = add_haze(frame, environment, sun, environment.mean_extinction_m(height))
+    radiance = hazy * np.float32(environment.direct_share(math.radians(request.sun_elevation_deg)))
     auto_exposure = sensor.auto_expose(
         detector, radiance, sensor.AutoExposureParameters(), streams.generator("test pictures")
     )

@@ -10,12 +10,13 @@ from jaxtyping import Float32, Float64, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.scenarios.descent.parameters import (
+    SHIELD_FALL_M_S,
     CameraParameters,
     DescentScenarioParameters,
     add_terrain_fault,
     draw_clouds,
 )
-from marsyard.scenarios.exposure import Optics, add_calibration_error, render_state, sunlight_ratio
+from marsyard.scenarios.exposure import Optics, add_calibration_error, add_haze, render_state, sunlight_ratio
 from marsyard.scenarios.exposure import camera_optics as shared_optics
 from marsyard.scenarios.meshes import MeshParameters, add_meshes
 from marsyard.scenarios.views import Eye, SiteGround, site_scene
@@ -80,12 +81,12 @@ class World:
         return add_meshes(scene, self.meshes, (east_m, north_m))
 
 
-#: Path length to which the optical depth of haze refers, m: about the height of the first picture.
+#: Path length to which the optical depth of the haze fault refers, m: about the height of the first picture.
 HAZE_HEIGHT_M = 2000.0
 #: Diameter of MER's aeroshell (Desai & Knocke 2004), m.
 SHIELD_DIAMETER_M = 2.65
-#: Heat shield relative to the lander: downward speed, horizontal speed, tumble rate; all assumed.
-FALL_M_S, DRIFT_M_S, TUMBLE_RAD_S = 20.0, 2.0, 1.0
+#: Heat shield relative to the lander: horizontal speed and tumble rate; assumed.
+DRIFT_M_S, TUMBLE_RAD_S = 2.0, 1.0
 #: Largest angle of the heat shield from nadir in the first picture, radians (assumed).
 MAX_OFF_NADIR_RAD = 0.2
 #: Assumed albedos of the shield: charred outside, insulated inside.
@@ -116,31 +117,12 @@ def take_exposures(
     noise = streams.generator("detector noise")
     for state in states:
         frame, motion = render_state(p.render.backend, scene, optics, state, mounting)
-        radiance = frame.radiance
-        if p.faults.haze > 0.0:
-            radiance = add_haze(frame, p.faults.haze, world.sun, world.air)
+        height = float(state.position_m[2]) - float(world.surface.height(*state.position_m[:2]))
+        extinction = world.air.mean_extinction_m(height) if world.ground else 0.0
+        radiance = add_haze(frame, world.air, world.sun, extinction + p.faults.haze / HAZE_HEIGHT_M)
         if shield is not None:
             radiance = shield.draw_over(radiance, frame, world.sun, state.time_s)
         yield detector.expose(radiance * np.float32(world.brightness), noise, motion), frame
-
-
-def add_haze(frame: Frame, optical_depth: float, sun: Sun, air: Environment) -> Float32[np.ndarray, "rows columns"]:
-    """Compute the radiance factor of a picture through a homogeneous layer of dusty air between ground and lander.
-
-    The ground's light is attenuated by ``T = exp(-optical depth x range / HAZE_HEIGHT_M)``; ``1 - T`` of the air's
-    source function is added: single scattering of sunlight (Henyey & Greenstein 1941) and of the mean light from sky
-    and ground. Contrast decreases, brightness changes less.
-    """
-    transmission = np.exp(-optical_depth * frame.range_m / HAZE_HEIGHT_M)
-    directions = frame.world_from_body.rotation.apply(frame.rays.directions.astype(np.float64))
-    # sunlight travels along -sun and is scattered along -direction, towards the camera
-    cosine = (directions @ sun.direction).reshape(frame.radiance.shape)
-    g = air.asymmetry
-    phase = (1.0 - g**2) / (1.0 + g**2 - 2.0 * g * cosine) ** 1.5
-    sky = air.sky_share(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
-    ambient = 0.5 * (sky + float(frame.radiance.mean()))
-    source = air.single_scattering_albedo * (0.25 * phase + ambient)
-    return np.asarray(transmission * frame.radiance + (1.0 - transmission) * source, dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -162,7 +144,7 @@ class HeatShield:
         limits = [2 * np.pi, MAX_OFF_NADIR_RAD, 2 * np.pi, 2 * np.pi]
         azimuth, off_nadir, drift_azimuth, axis_azimuth = rng.uniform(size=4) * limits
         ray = np.array([np.sin(azimuth) * np.sin(off_nadir), np.cos(azimuth) * np.sin(off_nadir), -np.cos(off_nadir)])
-        drift = np.array([DRIFT_M_S * np.sin(drift_azimuth), DRIFT_M_S * np.cos(drift_azimuth), -FALL_M_S])
+        drift = np.array([DRIFT_M_S * np.sin(drift_azimuth), DRIFT_M_S * np.cos(drift_azimuth), -SHIELD_FALL_M_S])
         axis = np.array([np.cos(axis_azimuth), np.sin(axis_azimuth), 0.0])
         return cls(
             centre_m=first.position_m + SHIELD_DIAMETER_M / (2.0 * np.tan(0.5 * angle_rad)) * ray,

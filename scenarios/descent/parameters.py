@@ -42,6 +42,8 @@ from marsyard.sim.terrain.landforms import Dunes
 BURST_DN, BURST_PX = 300.0, 2048.0
 #: Regular dunes of the dune fault.
 REGULAR_DUNES = Dunes(wavelength_m=60.0, height_m=1.0, crest_length=20.0, regularity=12.0)
+#: Assumed: downward speed of the released heat shield relative to the lander.
+SHIELD_FALL_M_S = 20.0
 #: Index of the picture that single-picture faults affect; it belongs to both pairs.
 FAULTY_PICTURE = 1
 
@@ -59,6 +61,9 @@ class Faults(SizedFaults):
     late_s: Annotated[NonNegative, Field(le=3.0, description="delay of the second exposure after its time tag")] = 0.0
     repeated_picture: Annotated[int, bounded_field(0, 3, "picture replaced by the previous one, 2 or 3; 0: none")] = 0
     black_picture: Annotated[int, bounded_field(0, 3, "picture that is delivered black, 1 to 3; 0: none")] = 0
+    shield_range_m: Annotated[
+        NonNegative, Field(le=2000.0, description="radar locked on the heat shield at this range in picture 1; 0: none")
+    ] = 0.0
     altitude_error: Annotated[NonNegative, Field(le=0.9, description="relative excess of all altitudes")] = 0.0
     altitude_error_once: Annotated[NonNegative, Field(le=0.9, description="added, second altitude only")] = 0.0
     attitude_error_deg: Annotated[NonNegative, Field(le=90.0, description="tilt error of all attitudes")] = 0.0
@@ -91,7 +96,13 @@ def add_time_fault(faults: Faults, times_s: Sequence[float]) -> list[float]:
 
 
 def add_altitude_faults(faults: Faults, altitudes: Sequence[AltitudeMeasurement]) -> list[AltitudeMeasurement]:
-    """Add the faults' relative errors to measured altitudes."""
+    """Add the faults' relative errors to measured altitudes; a locked radar measures the falling heat shield."""
+    if faults.shield_range_m:
+        first_s = altitudes[0].time_s
+        return [
+            AltitudeMeasurement(faults.shield_range_m + SHIELD_FALL_M_S * (altitude.time_s - first_s), altitude.time_s)
+            for altitude in altitudes
+        ]
     errors = [faults.altitude_error + faults.altitude_error_once * (n == FAULTY_PICTURE) for n in range(len(altitudes))]
     return [
         AltitudeMeasurement(altitude.altitude_m * (1.0 + error), altitude.time_s)
@@ -140,6 +151,10 @@ class SunParameters(Parameters):
 
     azimuth_deg: Annotated[float, bounded_field(-360.0, 720.0, "clockwise from north")] = 270.0
     elevation_deg: Annotated[float, Field(gt=0.0, le=90.0, description="above the horizon")] = 40.0
+
+
+#: Optical depth of the atmosphere in a case.
+DustOpacity = Annotated[float | None, bounded_field(0.0, 10.0, "optical depth of the air; default: the site's")]
 
 
 class LanderParameters(Parameters):
@@ -221,6 +236,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     terrain: CheckedTerrain = TerrainParameters()
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="custom objects on the ground")] = ()
     sun: SunParameters = SunParameters()
+    dust_opacity: DustOpacity = None
     descent: SwingParameters = SwingParameters()
     pictures: Annotated[int, bounded_field(2, 100, "number, every descent.interval_s; a stream gets all")] = TRIPLE_SIZE
     #: Default: the last picture and two earlier ones, at the longest possible equal intervals.
@@ -261,6 +277,8 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
         Terrain and light must come from the same site. Pictures must be divisible into DIMES' bins because each case
         reports DIMES' feasible overlap.
         """
+        if self.dust_opacity is not None and self.site is None:
+            raise ValueError("dust_opacity needs a site; the air of a generic terrain is clear")
         if self.terrain_site != self.site:
             raise ValueError(f"site is {self.site}, but terrain is of {self.terrain_site}; `site` cannot be dispersed")
         camera: CameraParameters | CustomCamera = self.camera if self.camera.model is None else self.camera.model
@@ -301,7 +319,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     @property
     def preset(self) -> Site | None:
         """The site; None for a generic terrain."""
-        return None if self.site is None else site(self.site)
+        return None if self.site is None else site(self.site).with_dust(self.dust_opacity)
 
 
 def check_binning(binned: tuple[int, int], delivered: tuple[int, int]) -> None:

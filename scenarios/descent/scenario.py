@@ -13,7 +13,15 @@ from pydantic import BaseModel
 from marsyard.algorithms.dimes import DimesDetails
 from marsyard.scenarios.algorithm_run import case_result
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
-from marsyard.scenarios.conditions import add_detector_faults, corrupt_images, hash_images, image_columns
+from marsyard.scenarios.conditions import (
+    add_detector_faults,
+    contrast_columns,
+    corrupt_images,
+    ground_columns,
+    hash_images,
+    image_columns,
+    optics_columns,
+)
 from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, picture_states, true_velocity
 from marsyard.scenarios.descent.measurement import Instruments, measure
@@ -102,6 +110,10 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         shared = {
             **descent.overlap,
             **conditions(p, descent.world, descent.states, descent.at_firing, descent.instruments),
+            **ground_columns(descent.world.ground),
+            **contrast_columns(descent.pictures[0], p.detector),
+            **optics_columns(p.detector.optics),
+            "altimeter_sidelobe_fraction": getattr(p.altimeter, "sidelobe_fraction", np.nan),
             **instrument_errors(descent.world, descent.states, descent.measurements),
             **descent.flight.row,
             **image_columns(p.render.backend, hash_images(descent.pictures)),

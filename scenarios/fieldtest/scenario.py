@@ -16,7 +16,7 @@ from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
 from marsyard.scenarios.base import LoadGround, TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import attitude_rate_deg_s, hash_images, image_columns, off_nadir_deg, sun_columns
 from marsyard.scenarios.estimators import VELOCITY
-from marsyard.scenarios.exposure import camera_optics, draw_calibrated, render_state, sunlight_ratio
+from marsyard.scenarios.exposure import add_haze, camera_optics, draw_calibrated, render_state, sunlight_ratio
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
 from marsyard.scenarios.fieldtest.run import Category, Run, RunKey, Triple, field_camera, simulate_run
 from marsyard.scenarios.interface import CaseResult, Scalar
@@ -220,7 +220,10 @@ def take_picture(
     p, scene = run.key.field_test, scene_at(run, start_scene, ground, state.time_s)
     frame, motion = render_state(p.backend, scene, camera_optics(field_camera()), state)
     brightness = sunlight_ratio(ground.site.environment, float(np.arcsin(scene.sun.direction[2])), p.detector)
-    return detector.expose(frame.radiance * np.float32(brightness), rng, motion), frame.points_world(CLOUD_GRID_PX)
+    air = ground.site.environment
+    height = float(state.position_m[2]) - float(ground.surface.height(*state.position_m[:2]))
+    radiance = add_haze(frame, air, scene.sun, air.mean_extinction_m(height))
+    return detector.expose(radiance * np.float32(brightness), rng, motion), frame.points_world(CLOUD_GRID_PX)
 
 
 def cloud_transmittances(

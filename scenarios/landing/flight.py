@@ -24,7 +24,7 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
-from marsyard.sim.sensor.ranging import DOWN, RangingUnit, range_along
+from marsyard.sim.sensor.ranging import RangingUnit, range_along
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 
@@ -61,12 +61,12 @@ class Flight:
         received = draw_received_pictures(p.faults, transit.times_s.size, streams.generator("lost pictures"))
         # laser ranges to the ground, without rocks, at all pictures
         transit_states = [transit.state(number) for number in range(transit.times_s.size)]
-        axes = [np.asarray(state.attitude.apply(DOWN)) for state in transit_states]
+        unit = RangingUnit.draw(p.laser, streams.generator("laser"))
+        axes = [np.asarray(state.attitude.apply(unit.axis)) for state in transit_states]
         true_ranges = [
             range_along(surface, state.position_m, axis, 5.0 * height)
             for state, axis in zip(transit_states, axes, strict=True)
         ]
-        unit = RangingUnit.draw(p.laser, streams.generator("laser"))
         readings = unit.readings(transit.times_s, np.array(true_ranges), streams.generator("laser noise, transit"))
         ranges = add_range_faults(p.faults, readings.values, height)[received]
         calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))

@@ -12,7 +12,7 @@ from pydantic import Field, field_validator, model_validator
 from marsyard.algorithms.hda import HdaOptions, TrackSeed
 from marsyard.scenarios.algorithm_run import AlgorithmSelection
 from marsyard.scenarios.conditions import SizedFaults
-from marsyard.scenarios.descent.parameters import Location, RenderParameters, SunParameters
+from marsyard.scenarios.descent.parameters import DustOpacity, Location, RenderParameters, SunParameters
 from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.exposure import CalibrationParameters
 from marsyard.scenarios.landing.helicopter import HelicopterParameters
@@ -175,6 +175,7 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="custom meshes on the ground")] = ()
     texture: NonNegative = Field(default=1.0, le=10.0, description="contrast of the fine texture / the site's contrast")
     sun: SunParameters = SunParameters()
+    dust_opacity: DustOpacity = None
     camera: NamedOrCustomCamera = Field(default="xc-55", description="nadir camera preset, or a table with file")
     calibration: CalibrationParameters = Field(default=CalibrationParameters(), description="camera calibration errors")
     detector: DetectorChoice = Field(default_factory=lambda: preset("xc-55").detector)
@@ -247,4 +248,4 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     @property
     def preset(self) -> Site:
         """The site."""
-        return site(self.site)
+        return site(self.site).with_dust(self.dust_opacity)

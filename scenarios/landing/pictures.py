@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8, UInt16
+from jaxtyping import Bool, Float, Float64, UInt8, UInt16
 from scipy.ndimage import distance_transform_edt
 
 from marsyard.algorithms.hda import Ground, Safety
@@ -70,11 +70,18 @@ class Pair:
     @property
     def axis_range_m(self) -> float:
         """True range from the camera along the first optical axis to ground or rock, metres."""
-        frame = self.frames[0]
-        column, row = self.images[0].camera.project(np.array([self.images[0].camera.a]))[0][0]
-        # the four pixels around the axis, at most 0.7 px from it
-        ranges = frame.range_m[int(row) : int(row) + 2, int(column) : int(column) + 2]
-        return float(np.median(ranges))
+        return self.range_along_m(self.images[0].camera.a)
+
+    def range_along_m(self, axis: Float64[np.ndarray, "3"]) -> float:
+        """Compute the true range of the first picture along a direction (body axes): median of the four nearest pixels.
+
+        They are at most 0.7 px from the direction.
+        """
+        ranges, image = self.frames[0].range_m, self.images[0]
+        column, row = image.camera.project(np.array([axis]))[0][0]
+        rows_summed = len(ranges) // len(image.counts)
+        first_row, first_column = int((row + 0.5) * rows_summed - 0.5), int(column)
+        return float(np.median(ranges[first_row : first_row + 2, first_column : first_column + 2]))
 
 
 def take_pictures(p: LandingScenarioParameters, world: World, flight: Flight, optics: Optics, streams: Streams) -> Pair:
@@ -109,7 +116,7 @@ def measure(p: LandingScenarioParameters, flight: Flight, pair: Pair, streams: S
     is no range.
     """
     unit = RangingUnit.draw(p.laser, streams.generator("laser"))
-    reading = unit.readings(np.zeros(1), np.array([pair.axis_range_m]), streams.generator("laser noise"))
+    reading = unit.readings(np.zeros(1), np.array([pair.range_along_m(unit.axis)]), streams.generator("laser noise"))
     slant = float(add_range_faults(p.faults, reading.values, p.height_m)[0])
     calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
     camera = calibrated.bin(columns=1, rows=p.detector.rows_summed)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.hda import STAGES, HdaDetails, MatchStatus, hda_products
 from marsyard.algorithms.hda.motion import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
-from marsyard.scenarios.conditions import sun_columns
+from marsyard.scenarios.conditions import contrast_columns, ground_columns, optics_columns, sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.helicopter import horizontal_distance_m, land
@@ -279,7 +279,9 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
         "grid_px": p.hda.grid_px,
         "max_slope_deg": float(np.degrees(p.hda.max_slope_rad)),
         "max_roughness_m": p.hda.max_roughness_m,
-        "rocks_abundance": 0.0 if p.terrain.rocks is None else p.terrain.rocks.abundance,
+        **ground_columns(case.world.ground),
+        **contrast_columns(pair.counts[0], p.detector),
+        **optics_columns(p.detector.optics),
     }
 
 

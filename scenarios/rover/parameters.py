@@ -61,6 +61,7 @@ class WorldParameters(Parameters):
     samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, every 2.5 cm")] = 2048
     incline: InclineParameters = InclineParameters()
     rms_slope_deg: Annotated[float | None, bounded_field(0.0, 30.0, "of the ground; default: the site's")] = None
+    dust_opacity: Annotated[float | None, bounded_field(0.0, 10.0, "of the air; default: the site's")] = None
     rock_abundance: Annotated[float | None, bounded_field(0.0, 0.4, "area fraction; default: the site's")] = None
     largest_near_m: Annotated[NonNegative, Field(description="maximum diameter of rocks on the route")] = 0.08
     east_m: float = Field(default=8.0, description="position of the target's rock, periodic terrain")
@@ -220,6 +221,9 @@ class CameraParameters(Parameters):
     custom: Annotated[CustomPair | None, Field(description="a custom pair on the preset's mast")] = None
     detector: DetectorChoice | None = Field(default=None, description="both detectors; default: preset")
     detector_noise: Annotated[bool, Field(description="whether pictures have detector noise and response")] = True
+    defocus_px: Annotated[NonNegative, Field(le=10.0, description="diameter of a point's defocused image, px")] = 0.0
+    stray_light: Annotated[float, bounded_field(0.0, 0.5, "fraction of the light spread evenly")] = 0.0
+    dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on each lens")] = 0
 
     @field_validator("preset")
     @classmethod
@@ -250,7 +254,10 @@ class CameraParameters(Parameters):
 
     def settings(self) -> DetectorParameters:
         """Return the parameters of both detectors."""
-        return preset(self.preset).detector if self.detector is None else self.detector
+        detector = preset(self.preset).detector if self.detector is None else self.detector
+        errors = {name: getattr(self, name) for name in ("defocus_px", "stray_light", "dust_discs")}
+        changes = {name: value for name, value in errors.items() if value}
+        return detector.model_copy(update={"optics": detector.optics.model_copy(update=changes)})
 
 
 class ScoreParameters(Parameters):

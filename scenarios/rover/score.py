@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, stereo_range_error_m
 from marsyard.algorithms.vtt.stereo import disparity_px_m
-from marsyard.scenarios.conditions import sun_columns
+from marsyard.scenarios.conditions import ground_columns, optics_columns, sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.scores import ScoredRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
@@ -192,6 +192,9 @@ def fixed_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "disparity_error_goal_px": run.rig.head.disparity_error_px(GOAL_M),
         "mast_azimuth_error_deg": float(azimuth_error),
         "mast_elevation_error_deg": float(elevation_error),
+        **ground_columns(run.world.ground),
+        **optics_columns(p.camera.settings().optics),
+        "pointing_zero_deg": p.pointing.zero_deg,
     }
 
 

@@ -76,6 +76,7 @@ class RunWorld:
         """Create the world of a run."""
         w = p.world
         site_ground = load_ground(site(w.site), terrain_parameters(w), w.bank_seed, w.terrain)
+        site_ground = replace(site_ground, site=site(w.site).with_dust(w.dust_opacity))
         ground, rocks = place_rocks(p, site_ground, streams.generator("placed rocks"))
         radius = p.start.distance_m + BACKGROUND_M
         azimuth, half_angle = p.bearing_rad + np.pi, np.radians(w.background_half_deg)

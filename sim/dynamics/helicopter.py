@@ -20,6 +20,7 @@ from jaxtyping import Float64
 from pydantic import Field, model_validator
 from scipy.interpolate import BPoly
 
+from marsyard.sim.dynamics.rotorcraft import Vibration, VibrationParameters
 from marsyard.sim.dynamics.trajectory import Motion, Trajectory, attitudes_and_body_rates, check_times
 from marsyard.sim.parameters import Fraction, Parameters, Positive, bounded_field
 
@@ -59,6 +60,9 @@ class HelicopterParameters(Parameters):
     fly_over_s: Annotated[Positive, Field(le=120.0, description="duration of a pass over the targets")] = 90.0
     between_s: Annotated[Positive, Field(description="time between the passes over the targets")] = 2400.0
     approach_s: Annotated[Positive, Field(description="from the first targets to the first pass (assumed)")] = 350.0
+    vibration: Annotated[VibrationParameters, Field(description="at the blades' rate, on the platform (assumed)")] = (
+        VibrationParameters(rate_hz=13.0, acceleration_m_s2=1.0, angle_deg=0.005)
+    )
 
     @model_validator(mode="after")
     def _return_takes_time(self) -> HelicopterParameters:
@@ -129,6 +133,7 @@ class HelicopterFlight(Trajectory):
     passes: tuple[FlownPass, ...]
     fly_overs_s: tuple[tuple[float, float], tuple[float, float]]
     gravity_m_s2: float
+    vibration: Vibration
 
     @property
     def span_s(self) -> tuple[float, float]:
@@ -142,13 +147,15 @@ class HelicopterFlight(Trajectory):
         pitch, pitch_rate = self.tilt_along.derivatives(times_s)
         roll, roll_rate = self.tilt_across.derivatives(times_s)
         angle_rates = np.stack([self.platform.derivative()(times_s), pitch_rate, roll_rate], axis=-1)
-        attitudes, rates = attitudes_and_body_rates(np.stack([yaw, pitch, roll], axis=-1), angle_rates)
+        vibration = [self.vibration.derivative(times_s, order) for order in range(3)]
+        angles = np.stack([yaw, pitch, roll], axis=-1) + vibration[0][:, 3:]
+        attitudes, rates = attitudes_and_body_rates(angles, angle_rates + vibration[1][:, 3:])
         forward = np.array([np.sin(self.azimuth_rad), np.cos(self.azimuth_rad), 0.0])
         left = np.array([-forward[1], forward[0], 0.0])
         derivatives = []
         for order in range(3):
             along, across, up = (curve.derivative(order)(times_s) for curve in (self.along, self.across, self.up))
-            derivatives.append(np.outer(along, forward) + np.outer(across, left))
+            derivatives.append(np.outer(along, forward) + np.outer(across, left) + vibration[order][:, :3])
             derivatives[order][:, 2] += up
         derivatives[0] = self.origin_m + derivatives[0]
         return Motion.from_accelerations(times_s, derivatives, attitudes, rates, self.gravity_m_s2)
@@ -195,6 +202,7 @@ def helicopter_flight(
         passes=passes,
         fly_overs_s=fly_overs,
         gravity_m_s2=gravity_m_s2,
+        vibration=Vibration.draw(p.vibration, rng),
     )
 
 

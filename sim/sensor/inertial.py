@@ -120,7 +120,7 @@ class ApproachParameters(Parameters):
 
     attitude_sd_deg: Annotated[NonNegative, Field(description="attitude error at the reference per axis, deg")] = 0.05
     velocity_sd_m_s: Annotated[NonNegative, Field(description="velocity error at the reference per axis, m/s")] = 1.0
-    spin_scale_ppm: Annotated[NonNegative, Field(description="scale factor error of the spin gyro, ppm")] = 20.0
+    spin_scale_ppm: Annotated[NonNegative, Field(description="scale factor error of the spin gyro, ppm")] = 100.0
     cruise_s: Annotated[NonNegative, Field(le=20000.0, description="from the star reference to entry, s")] = 900.0
     entry_s: Annotated[Positive, Field(le=2000.0, description="from entry to parachute deployment, s")] = 240.0
     parachute_s: Annotated[Positive, Field(le=2000.0, description="from deployment to the descent's start, s")] = 80.0

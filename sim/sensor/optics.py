@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 from pydantic import Field
 from scipy.spatial.transform import RigidTransform
+from scipy.special import j1
 
 from marsyard.sim.camera import Cahvore, CameraModel
 from marsyard.sim.parameters import NonNegative, Parameters
@@ -123,6 +124,8 @@ class OpticsParameters(Parameters):
     diffraction_px: Annotated[NonNegative, Field(le=5.0, description="wavelength x f-number / pitch; 0: none")] = 0.70
     diffusion_px: Annotated[NonNegative, Field(le=5.0, description="RMS charge diffusion, pixels (assumed)")] = 0.25
     pixel_aperture: Annotated[bool, Field(description="average over pixels; not for area-sampled renderings")] = False
+    defocus_px: Annotated[NonNegative, Field(le=10.0, description="diameter of the defocused image of a point")] = 0.0
+    stray_light: Annotated[float, Field(ge=0.0, le=0.5, description="fraction of the light spread evenly")] = 0.0
     dust_discs: Annotated[int, Field(ge=0, le=1000, description="specks of dust on the lens")] = 0
     dust_depth: Annotated[float, Field(ge=0.0, le=1.0, description="fraction of the light absorbed by a speck")] = 0.3
     dust_radius_px: Annotated[float, Field(gt=0.0, le=1000.0, description="mean shadow radius, px; +- 1/3")] = 25.0
@@ -135,13 +138,17 @@ def line_spread(parameters: OpticsParameters) -> Float32[np.ndarray, "taps"]:
 
     The Fourier series of the weights is the modulation transfer function up to the Nyquist frequency: the product of a
     diffraction-limited circular pupil, 2/pi (acos s - s sqrt(1 - s^2)) with s = frequency x wavelength x f-number
-    (Goodman, Introduction to Fourier Optics, 6.4), of diffusion, exp(-2 (pi sigma f)^2), and optionally of the pixel
-    aperture, sinc(f). Rows and columns are treated as separable, which is an approximation for a round pupil.
+    (Goodman, Introduction to Fourier Optics, 6.4), of diffusion, exp(-2 (pi sigma f)^2), of defocus, 2 J1(x) / x with
+    x = pi d f for a uniform disc of diameter d, and optionally of the pixel aperture, sinc(f). Rows and columns are
+    treated as separable, which is an approximation for a round pupil.
     """
     frequency = np.linspace(0.0, 0.5, 513)
     transfer = np.exp(-2.0 * (np.pi * parameters.diffusion_px * frequency) ** 2)
     if parameters.pixel_aperture:
         transfer = transfer * np.sinc(frequency)
+    if parameters.defocus_px > 0.0:
+        x = np.maximum(np.pi * parameters.defocus_px * frequency, 1e-9)
+        transfer = transfer * 2.0 * j1(x) / x
     s = np.minimum(frequency * parameters.diffraction_px, 1.0)
     transfer = transfer * (2.0 / np.pi) * (np.arccos(s) - s * np.sqrt(1.0 - s * s))
     offsets = np.arange(-KERNEL_HALF_SIZE_PX, KERNEL_HALF_SIZE_PX + 1)
@@ -153,11 +160,17 @@ def line_spread(parameters: OpticsParameters) -> Float32[np.ndarray, "taps"]:
 
 
 def apply_point_spread(radiance: Image, parameters: OpticsParameters) -> Image:
-    """Blur a scene by lens and charge diffusion, without loss or shift; the scene is mirrored at the border."""
-    if parameters.diffraction_px == 0.0 and parameters.diffusion_px == 0.0 and not parameters.pixel_aperture:
-        return radiance
-    taps = line_spread(parameters)
-    return np.asarray(cv2.sepFilter2D(radiance, cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT))
+    """Blur a scene by lens and charge diffusion, without loss or shift; the scene is mirrored at the border.
+
+    Stray light replaces a fraction of the radiance of every pixel by the same fraction of the scene's mean radiance.
+    """
+    p, scene = parameters, radiance
+    if p.diffraction_px > 0.0 or p.diffusion_px > 0.0 or p.defocus_px > 0.0 or p.pixel_aperture:
+        taps = line_spread(p)
+        scene = np.asarray(cv2.sepFilter2D(radiance, cv2.CV_32F, taps, taps, borderType=cv2.BORDER_REFLECT))
+    if p.stray_light > 0.0:
+        scene = np.float32(1.0 - p.stray_light) * scene + np.float32(p.stray_light * scene.mean(dtype=np.float64))
+    return scene
 
 
 def natural_fall_off(camera: CameraModel) -> Image:

@@ -2,7 +2,7 @@
 
 The radar measures the range to the nearest ground within a cone fixed to the body. The nearest point is the foot of the
 perpendicular over a slope, the nearest crest over relief, and at the edge of the beam if the tilt exceeds half the beam
-width. Ground reflectivity and antenna pattern are not modelled.
+width. A fraction of the readings may come from the wider cone of the side lobes. Ground reflectivity is not modelled.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from jaxtyping import Float64
 from numpy.random import Generator
 from pydantic import Field, model_validator
 from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics import Trajectory
-from marsyard.sim.parameters import Parameters
+from marsyard.sim.parameters import Fraction, Parameters
 from marsyard.sim.sensor.imu import Vector
 from marsyard.sim.sensor.instrument import Clock, ClockParameters, Readings, Sampling, Times
 from marsyard.sim.terrain import Surface
@@ -33,6 +34,7 @@ MAX_SLOPE = 3.0  #: Maximum slope of the ground in the radar's search.
 
 _Fraction = Annotated[float, Field(ge=0.0, le=0.2)]
 _Metres = Annotated[float, Field(ge=0.0, le=100.0)]
+_Degrees = Annotated[float, Field(ge=0.0, le=10.0)]
 
 
 class RangingParameters(Parameters):
@@ -45,6 +47,7 @@ class RangingParameters(Parameters):
     count_m: Annotated[_Metres, Field(description="resolution, m; 0: no rounding")] = 0.0
     min_range_m: Annotated[float, Field(ge=0.0, description="minimum range, m")] = 0.0
     max_range_m: Annotated[float, Field(gt=0.0, le=20000.0, description="maximum range, m")] = 5000.0
+    boresight_deg: Annotated[_Degrees, Field(description="SD per axis of the constant pointing error, deg")] = 0.0
     clock: ClockParameters = ClockParameters()
 
     @model_validator(mode="after")
@@ -63,6 +66,7 @@ class LaserParameters(RangingParameters):
     count_m: Annotated[_Metres, Field(description="resolution, m; 0: no rounding")] = 0.01
     max_range_m: Annotated[float, Field(gt=0.0, le=20000.0, description="maximum range, m")] = 300.0
     beam_mrad: Annotated[float, Field(ge=0.0, le=50.0, description="full width of the beam, mrad")] = 0.0
+    boresight_deg: Annotated[_Degrees, Field(description="SD per axis of the constant pointing error, deg")] = 0.1
     clock: ClockParameters = ClockParameters(offset_sd_s=0.002, jitter_sd_s=0.0005)
 
 
@@ -73,6 +77,8 @@ class RadarParameters(RangingParameters):
     """
 
     beam_deg: Annotated[float, Field(gt=0.0, lt=180.0, description="full width of the beam, deg")] = 60.0
+    sidelobe_deg: Annotated[float, Field(gt=0.0, lt=180.0, description="full width with the side lobes, deg")] = 120.0
+    sidelobe_fraction: Annotated[Fraction, Field(description="readings of the side lobes instead of the beam")] = 0.0
     scale_error: Annotated[_Fraction, Field(description="fraction of the range, constant")] = 0.003
     noise: Annotated[_Fraction, Field(description="fraction of the range, per reading")] = 0.0015
     count_m: Annotated[_Metres, Field(description="resolution, m; 0: no rounding")] = 0.3
@@ -82,19 +88,26 @@ class RadarParameters(RangingParameters):
 
 @dataclass(frozen=True)
 class RangingUnit:
-    """A ranging instrument with its constant errors; `scale` is the noise-free ratio of measured to true range."""
+    """A ranging instrument with its constant errors.
+
+    - scale: noise-free ratio of measured to true range
+    - axis: direction in which it measures, body axes
+    """
 
     parameters: RangingParameters
     sampling: Sampling
     clock: Clock
     scale: float
+    axis: Vector
 
     @classmethod
     def draw(cls, parameters: RangingParameters, rng: Generator) -> RangingUnit:
         """Draw the constant errors."""
         p = parameters
         sampling, clock = Sampling.draw(p.rate_hz, rng), Clock.draw(p.clock, rng)
-        return cls(p, sampling, clock, 1.0 + p.scale_error * float(rng.standard_normal()))
+        scale = 1.0 + p.scale_error * float(rng.standard_normal())
+        tilt = np.radians(p.boresight_deg) * np.append(rng.standard_normal(2), 0.0)
+        return cls(p, sampling, clock, scale, np.asarray(Rotation.from_rotvec(tilt).apply(DOWN)))
 
     def readings(self, times_s: Times, ranges_m: Float64[np.ndarray, "n"], rng: Generator) -> Readings:
         """Simulate readings of true ranges (infinite without a return) at true times."""
@@ -147,11 +160,12 @@ class RadarAltimeter:
     def measure(self, trajectory: Trajectory, times_s: Times, rng: Generator) -> Readings:
         """Measure the range to the nearest ground within the beam at each true time."""
         motion, p = trajectory.motion(times_s), self.parameters
-        axes = motion.attitudes.apply(DOWN.copy())
-        half_angle = np.radians(0.5 * p.beam_deg)
+        axes = motion.attitudes.apply(self.unit.axis)
+        is_sidelobe = rng.random(times_s.size) < p.sidelobe_fraction
+        half_angles = np.radians(0.5 * np.where(is_sidelobe, max(p.sidelobe_deg, p.beam_deg), p.beam_deg))
         ranges = [
-            first_return(self.surface, position, axis, half_angle, p.max_range_m)
-            for position, axis in zip(motion.positions_m, axes, strict=True)
+            first_return(self.surface, position, axis, float(half_angle), p.max_range_m)
+            for position, axis, half_angle in zip(motion.positions_m, axes, half_angles, strict=True)
         ]
         return self.unit.readings(times_s, np.array(ranges, dtype=np.float64), rng)
 

@@ -38,15 +38,16 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
     rms_slope = np.tan(np.radians(p.rms_slope_deg))
     relief_m = rms_slope / relief.line_slope_rms(p.slope_baseline_m)
     albedo = Spectrum.power_law(p.samples, p.spacing_m, p.albedo_hurst, p.outer_scale_m)
+    contrast = p.albedo_contrast * float(np.exp(p.contrast_spread * substream(rng, "contrast").standard_normal()))
     craters = draw_craters(p, substream(rng, "craters"))
     cover = UNIFORM
     if p.units is None:
         height = relief.field(substream(rng, "relief"), relief_m)
-        tone = albedo.field(substream(rng, "albedo"), p.albedo_contrast)
+        tone = albedo.field(substream(rng, "albedo"), contrast)
         ground = Ground(height, tone, p.spacing_m)
     else:
         height, rough = relief.split_field(substream(rng, "relief"), relief_m, p.fine_below_m)
-        tone, fine = albedo.split_field(substream(rng, "albedo"), p.albedo_contrast, p.fine_below_m)
+        tone, fine = albedo.split_field(substream(rng, "albedo"), contrast, p.fine_below_m)
         ground = Ground(height, tone, p.spacing_m)
         cover = p.units.apply(ground, craters, substream(rng, "units"))
         height += rough * refine(np.ascontiguousarray(cover[..., ROUGHNESS]), ground.side)

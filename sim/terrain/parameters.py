@@ -7,7 +7,7 @@ from typing import Annotated, Any, get_args
 
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
-from marsyard.sim.parameters import Fraction, Parameters, Positive, bounded_field, merge_settings
+from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field, merge_settings
 from marsyard.sim.terrain.imported import RealTerrain
 from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
@@ -37,6 +37,9 @@ class TerrainParameters(Parameters):
     crater_ejecta_contrast: Annotated[Fraction, Field(description="log albedo of the freshest ejecta, + or -")] = 0.12
     albedo: Annotated[float, Field(gt=0.0, lt=1.0, description="mean albedo")] = 0.2
     albedo_contrast: Annotated[Fraction, Field(description="RMS of the fractal albedo's logarithm, all scales")] = 0.12
+    contrast_spread: Annotated[NonNegative, Field(description="SD of that RMS' logarithm from terrain to terrain")] = (
+        0.0
+    )
     albedo_hurst: Annotated[float, Field(ge=-0.5, lt=1.0, description="Hurst exponent; 0: equal in all octaves")] = 0.0
     units: Annotated[
         SurfaceUnits | None, Field(description="surface units; without, the ground is alike everywhere")

@@ -29,6 +29,7 @@ class Environment(Parameters):
     optical_depth: Annotated[float, Field(ge=0.0, le=10.0, description="extinction optical depth of the air")] = 0.5
     single_scattering_albedo: Annotated[float, Field(ge=0.0, lt=1.0, description="scattering over extinction")] = 0.94
     asymmetry: Annotated[float, Field(gt=-1.0, lt=1.0, description="mean cosine of the scattering angle")] = 0.65
+    scale_height_m: Annotated[Positive, Field(description="height over which the extinction falls by e, m")] = 11100.0
 
     @property
     def sun_radius_rad(self) -> float:
@@ -68,6 +69,11 @@ class Environment(Parameters):
         mean = c1 * np.exp(-k * tau) + c2 * np.exp(k * tau) - alpha * fade
         slant = p * (c1 * np.exp(-k * tau) - c2 * np.exp(k * tau)) - beta * fade
         return float(max(mean + two_thirds * slant, 0.0) / fade)
+
+    def mean_extinction_m(self, height_m: float) -> float:
+        """Return the mean extinction coefficient between the ground and a height above it, 1/m."""
+        height_m = max(height_m, 1.0)
+        return float(-self.optical_depth * np.expm1(-height_m / self.scale_height_m) / height_m)
 
     def _delta_scaled(self) -> tuple[float, float, float]:
         """Optical depth, single-scattering albedo and asymmetry without the forward peak g**2."""
@@ -112,6 +118,13 @@ class Site(Parameters):
     rock_texture: SiteTexture
     descent: TerrainParameters | None = None
     ground: TerrainParameters | None = None
+
+    def with_dust(self, optical_depth: float | None) -> Site:
+        """Return the site with another optical depth of its air; None keeps it."""
+        if optical_depth is None:
+            return self
+        air = self.environment.model_copy(update={"optical_depth": optical_depth})
+        return self.model_copy(update={"environment": air})
 
     def terrain(self, scale: str | None = None, changes: Mapping[str, Any] | None = None) -> TerrainParameters:
         """Return the terrain at a scale, 'descent' or 'ground', with some parameters changed; default: the coarsest.

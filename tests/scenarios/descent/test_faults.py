@@ -14,7 +14,6 @@ from marsyard.scenarios.descent.exposure import (
     SHIELD_DIAMETER_M,
     HeatShield,
     World,
-    add_haze,
     calibrated_camera,
     camera_optics,
     take_exposures,
@@ -28,6 +27,7 @@ from marsyard.scenarios.descent.parameters import (
     add_terrain_fault,
     add_time_fault,
 )
+from marsyard.scenarios.exposure import add_haze
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
@@ -85,7 +85,7 @@ def test_haze_reduces_contrast_but_not_brightness() -> None:
     """At nadir the contrast falls as exp(-depth), and the mean brightness hardly changes."""
     pattern = np.where(np.indices((256, 256)).sum(axis=0) % 2, 0.12, 0.10)
     frame = _render_level_ground(2000.0, pattern)
-    clear, hazy = add_haze(frame, 0.0, SUN, Environment()), add_haze(frame, 1.0, SUN, Environment())
+    clear, hazy = (add_haze(frame, Environment(), SUN, depth / 2000.0) for depth in (0.0, 1.0))
     np.testing.assert_allclose(clear, pattern, rtol=1e-6)
     middle = np.s_[126:130, 126:130]
     assert np.ptp(hazy[middle]) == pytest.approx(np.exp(-1.0) * 0.02, rel=0.03)

@@ -30,10 +30,11 @@ def test_case_is_deterministic(nominal: CaseResult) -> None:
 
 
 def test_each_catalogue_dispersion_is_reported() -> None:
-    """Each column has the last part of the path as its name and the simulated value; a fault has name and size."""
+    """Each column has the path, or an end of it, as its name and the simulated value; a fault has name and size."""
     dispersed = load_campaign("dimes-gusev").draws(3)
     samples = {path: value for path, value in dispersed.items() if path != "location.terrain"}
-    tables: dict[str, Any] = {"location": dict(WORLD["location"]), "faults": {"late_s": 0.25}}
+    tables: dict[str, Any] = {"location": dict(WORLD["location"]), "faults": {"late_s": 0.25}, "site": "gusev"}
+    tables["terrain"] = dict(WORLD["terrain"])
     for path, value in samples.items():
         *names, last = path.split(".")
         table = tables
@@ -42,7 +43,8 @@ def test_each_catalogue_dispersion_is_reported() -> None:
         table[last] = value
     row = run(**tables).row
     for path, value in samples.items():
-        column = path.replace(".", "_")
+        parts = path.split(".")
+        column = next(name for name in ("_".join(parts[start:]) for start in range(len(parts))) if name in row)
         assert row[column] == pytest.approx(value, rel=1e-9), path
     assert (row["fault"], row["fault_size"], row["terrain"]) == ("late_s", 0.25, 0)
     campaigns = [load_campaign(name).configuration for name in catalogue()]
@@ -105,13 +107,13 @@ def test_ideal_instruments_are_reported_without_errors(nominal: CaseResult) -> N
 
 
 def test_instrument_errors_have_the_specified_size() -> None:
-    """Radar: 1 % is 3 sigma of all errors. Navigation: a tenth of a degree after 20 minutes at 1 deg/h."""
+    """Radar: 1 % is 3 sigma of all errors. Navigation: 1.4 deg after 38 turns with a scale error of 100 ppm."""
     rows = [run(case).row for case in range(4)]
     altitude = np.array([float(row["altitude_error_common"]) for row in rows])
     attitude = np.array([float(row["attitude_error_common_deg"]) for row in rows])
     independent = np.array([float(row["attitude_error_independent_deg"]) for row in rows])
     assert np.abs(altitude).max() < 0.015
-    assert 0.01 < attitude.max() < 0.5
+    assert 0.1 < attitude.max() < 4.2
     # Gyro drift between images is small: a time tag error of 1 ms at 20 deg/s dominates.
     assert independent.max() < 0.1
 

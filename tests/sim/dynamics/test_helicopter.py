@@ -17,8 +17,8 @@ def make_flight(**changes: object) -> HelicopterFlight:
 
 @pytest.mark.parametrize("turns", [False, True])
 def test_velocity_rate_and_force_are_derivatives(turns: bool) -> None:
-    """Central differences over 1 ms: the truncation for the 0.6 Hz swing is below 1e-5 rad/s."""
-    flight, step = make_flight(turns_with_flight=turns), 1e-3
+    """Central differences over 0.4 ms: the truncation for the vibration of 13 Hz is below 1e-6 m/s."""
+    flight, step = make_flight(turns_with_flight=turns), 2e-4
     times = np.linspace(-40.0, 2440.0, 400)
     before, now, after = (flight.motion(times + shift) for shift in (-step, 0.0, step))
     velocity = (after.positions_m - before.positions_m) / (2.0 * step)
@@ -38,7 +38,7 @@ def test_passes_match_the_paper() -> None:
     heights = motion.positions_m[:, 2] - ORIGIN[2]
     assert abs(heights.min() - 1000.0) < 1.0
     assert abs(heights.max() - 2000.0) < 1.0
-    assert np.all(np.abs(motion.velocities_m_s[:, 2] - 1.0) < 0.01)  # "1 to 2 m/s"
+    assert np.all(np.abs(motion.velocities_m_s[:, 2] - 1.0) < 0.03)  # "1 to 2 m/s", and vibration
     speed = np.hypot(*motion.velocities_m_s[:, :2].T)
     assert abs(speed.mean() - 30.0) < 0.5
     tilt = np.degrees(np.arccos(motion.attitudes.as_matrix()[:, 2, 2]))

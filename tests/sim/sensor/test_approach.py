@@ -137,7 +137,7 @@ def test_scale_error_rotates_attitude_about_spin_axis() -> None:
     np.testing.assert_array_equal(calibrated.gyro.scale[:2], imu.gyro.scale[:2])
 
 
-def test_descent_attitude_error_is_a_few_tenths_of_a_degree() -> None:
+def test_spin_scale_error_dominates_the_descent_attitude_error() -> None:
     approach = Approach(ApproachParameters(), -2.0)
     errors = []
     for seed in range(150):
@@ -145,7 +145,7 @@ def test_descent_attitude_error_is_a_few_tenths_of_a_degree() -> None:
         imu = approach.calibrate(Imu.draw(ImuParameters(), (approach.start_s, 0.0), rng), rng)
         errors.append(approach.errors(imu, rng).attitude_rad)
     spread = np.degrees(np.std(errors, axis=0))
-    # 1 deg/h for 1140 s along the spin axis and 20 ppm of 38 turns give 0.32 and 0.27 deg about the entry direction.
+    # 1 deg/h for 1140 s along the spin axis and 100 ppm of 38 turns give 0.32 and 1.37 deg about the entry direction.
     # Across the axis the bias averages out until the parachute opens.
-    assert 0.3 < spread[0] < 0.55
-    assert spread[1:].max() < 0.25
+    assert 1.2 < spread[0] < 1.6
+    assert spread[1:].max() < 0.45

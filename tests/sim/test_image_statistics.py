@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.validation.image_statistics import SIDE, image_statistics, spectral_slope
+from marsyard.sim.image_statistics import SIDE, image_statistics, spectral_slope
 
 
 @pytest.mark.parametrize("exponent", [-1.5, -2.5])

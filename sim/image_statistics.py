@@ -40,14 +40,26 @@ def image_statistics(picture: Float[np.ndarray, "rows columns"]) -> ImageStatist
     top, left = (rows - side) // 2, (columns - side) // 2
     square = np.asarray(picture[top : top + side, left : left + side], dtype=np.float64)
     small = cv2.resize(square, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
-    blocks = small.reshape(SIDE // BLOCK, BLOCK, SIDE // BLOCK, BLOCK)
-    local = blocks.std(axis=(1, 3)) / blocks.mean(axis=(1, 3))
-    p10, p50, p90 = (float(value) for value in np.percentile(local, [10.0, 50.0, 90.0]))
+    p10, p50, p90 = local_contrast(small)
     offset = np.arange(SIDE) - 0.5 * (SIDE - 1)
     radius = np.hypot(offset[:, None], offset) / np.hypot(offset[0], offset[0])
     corner = float(small[radius > 0.9].mean() / small[radius < 0.25].mean())
     rms = float(small.std() / small.mean())
     return ImageStatistics(rms, spectral_slope(small), p10, p50, p90, p90 / p10, corner)
+
+
+def local_contrast(picture: Float[np.ndarray, "rows columns"]) -> tuple[float, float, float]:
+    """Compute the 10, 50 and 90 % percentiles of a block's standard deviation divided by its mean.
+
+    The picture is resized to `SIDE` x `SIDE` pixels; NaN if all blocks are black.
+    """
+    small = cv2.resize(np.asarray(picture, dtype=np.float64), (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+    blocks = small.reshape(SIDE // BLOCK, BLOCK, SIDE // BLOCK, BLOCK)
+    deviation, mean = blocks.std(axis=(1, 3)), blocks.mean(axis=(1, 3))
+    if not np.any(mean > 0.0):
+        return (np.nan, np.nan, np.nan)
+    p10, p50, p90 = np.percentile(deviation[mean > 0.0] / mean[mean > 0.0], [10.0, 50.0, 90.0])
+    return float(p10), float(p50), float(p90)
 
 
 def spectral_slope(picture: Float[np.ndarray, "side side"]) -> float:
