@@ -122,6 +122,8 @@ def test_reading_errors_have_the_specified_size() -> None:
     faults = Faults(altitude_error=0.1, altitude_error_once=0.2, attitude_error_deg=3.0, attitude_error_once_deg=5.0)
     altitudes = add_altitude_faults(faults, [AltitudeMeasurement(100.0, t) for t in (0.0, 1.0, 2.0)])
     assert [one.altitude_m for one in altitudes] == pytest.approx([110.0, 130.0, 110.0])
+    locked = add_altitude_faults(Faults(shield_range_m=60.0), [AltitudeMeasurement(2000.0, t) for t in (0.0, 1.0, 2.0)])
+    assert [one.altitude_m for one in locked] == [60.0, 80.0, 100.0]
     level = [AttitudeMeasurement(Rotation.identity(), t) for t in (0.0, 1.0, 2.0)]
     tilted = [one.world_from_body for one in add_attitude_faults(faults, level, np.random.default_rng(0))]
     assert np.degrees([one.magnitude() for one in (tilted[0], tilted[2])]) == pytest.approx([3.0, 3.0])

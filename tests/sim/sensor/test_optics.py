@@ -76,3 +76,25 @@ def test_dust_attenuates_and_is_not_calibrated() -> None:
     clean, soiled = (Detector.draw(even, DetectorParameters(optics=o), np.random.default_rng(1)) for o in (MER, dusty))
     assert soiled.response.sum() < clean.response.sum()
     np.testing.assert_array_equal(soiled.calibration.flat_field, clean.calibration.flat_field)
+
+
+@pytest.mark.parametrize("diameter", [1.0, 2.5])
+def test_defocus_has_the_transfer_of_a_uniform_disc(diameter: float) -> None:
+    sharp, soft = (OpticsParameters(diffraction_px=0.0, diffusion_px=0.0, defocus_px=d) for d in (1e-6, diameter))
+    frequency = np.array([0.1, 0.2, 0.3])
+    offsets = np.arange(-6, 7)
+    waves = np.cos(2.0 * np.pi * frequency[:, None] * offsets)
+    measured = waves @ line_spread(soft) / (waves @ line_spread(sharp))
+    x = np.pi * diameter * frequency
+    # J1 by its integral, (1/pi) int cos(t - x sin t) dt
+    t = np.linspace(0.0, np.pi, 2001)
+    bessel = np.trapezoid(np.cos(t - x[:, None] * np.sin(t)), t, axis=1) / np.pi
+    np.testing.assert_allclose(measured, 2.0 * bessel / x, atol=0.02)
+
+
+def test_stray_light_reduces_contrast_and_keeps_the_mean() -> None:
+    scene = np.random.default_rng(0).uniform(0.1, 0.3, (32, 48)).astype(np.float32)
+    nothing = OpticsParameters(diffraction_px=0.0, diffusion_px=0.0)
+    veiled = apply_point_spread(scene, nothing.model_copy(update={"stray_light": 0.2}))
+    assert veiled.mean() == pytest.approx(scene.mean(), rel=1e-5)
+    assert veiled.std() == pytest.approx(0.8 * scene.std(), rel=1e-5)

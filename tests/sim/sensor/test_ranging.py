@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
 
 from marsyard.sim.sensor import (
     ClockParameters,
@@ -240,6 +241,34 @@ def test_laser_unit_adds_its_errors() -> None:
     unit = RangingUnit.draw(perfect, np.random.default_rng(0))
     readings = unit.readings(np.arange(3.0), np.array([10.0, np.inf, 301.0]), np.random.default_rng(0))
     np.testing.assert_array_equal(readings.values, [10.0, np.nan, np.nan])
+
+
+def test_boresight_error_has_the_specified_spread() -> None:
+    parameters = LaserParameters(boresight_deg=0.5)
+    axes = np.array([RangingUnit.draw(parameters, np.random.default_rng(seed)).axis for seed in range(400)])
+    # 400 values determine a spread to 3.5 %; the tolerance is three times that
+    np.testing.assert_allclose(np.degrees(axes[:, :2].std(axis=0)), 0.5, rtol=0.11)
+    np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1.0)
+
+
+def test_side_lobes_see_the_ground_below_a_tilted_beam() -> None:
+    """Tilted by 50 deg, the beam of 60 deg ends 20 deg from nadir; the side lobes reach the nadir."""
+    tilted = Swaying(position_m=(160.0, 160.0, 1000.0), tilt=Rotation.from_rotvec([0.0, np.radians(50.0), 0.0]))
+    times = np.arange(100) * 0.1
+    beam, lobes = (
+        RadarAltimeter.draw(
+            RadarParameters(scale_error=0.0, noise=0.0, count_m=0.0, sidelobe_fraction=fraction),
+            FLAT,
+            np.random.default_rng(0),
+        )
+        .measure(tilted, times, np.random.default_rng(1))
+        .values
+        for fraction in (0.0, 0.3)
+    )
+    np.testing.assert_allclose(beam, 1000.0 / np.cos(np.radians(20.0)), rtol=1e-3)
+    near = np.isclose(lobes, 1000.0, rtol=1e-3)
+    assert np.all(near | np.isclose(lobes, beam, rtol=1e-6))
+    assert 0.15 < near.mean() < 0.45
 
 
 def test_true_altitude_is_vertical_height_above_ground() -> None:
