@@ -26,12 +26,15 @@ from marsyard.campaigns.running.preparation import plan_inputs
 from marsyard.scenarios.exposure import ProvidesSamples
 from marsyard.scenarios.systems import scenario, scenario_names
 from marsyard.sim.camera import BODY_FRAME, write_cahvor
+from marsyard.sim.sensor.compression import compress
 
 MANIFEST = "dataset.json"
 
 
-def write_dataset(campaign: Campaign, folder: Path, cases_per_shard: int, jobs: int) -> list[Path]:
-    """Write the missing shards; return the paths of all shards.
+def write_dataset(
+    campaign: Campaign, folder: Path, cases_per_shard: int, jobs: int, bits_per_pixel: float | None = None
+) -> list[Path]:
+    """Write the missing shards; return the paths of all shards. Images are compressed to `bits_per_pixel`.
 
     Raises CampaignError if the scenario provides no samples, or the folder is read-only or contains another data set.
     """
@@ -39,7 +42,7 @@ def write_dataset(campaign: Campaign, folder: Path, cases_per_shard: int, jobs: 
         name = campaign.configuration.scenario
         allowed = ", ".join(name for name in scenario_names() if isinstance(scenario(name), ProvidesSamples))
         raise CampaignError(f"the scenario '{name}' provides no training samples; allowed: {allowed}")
-    _write_manifest(campaign, folder, cases_per_shard)
+    _write_manifest(campaign, folder, cases_per_shard, bits_per_pixel)
     total = campaign.configuration.total_cases
     starts = range(0, total, cases_per_shard)
     paths = [folder / f"shard-{number:06d}.tar" for number in range(len(starts))]
@@ -52,7 +55,7 @@ def write_dataset(campaign: Campaign, folder: Path, cases_per_shard: int, jobs: 
 
         # built once here; otherwise each worker process would build them
         _prepare_inputs(campaign, itertools.chain.from_iterable(cases for _, cases in missing))
-        Parallel(n_jobs=jobs)(delayed(_write_shard)(campaign, path, cases) for path, cases in missing)
+        Parallel(n_jobs=jobs)(delayed(_write_shard)(campaign, path, cases, bits_per_pixel) for path, cases in missing)
     return paths
 
 
@@ -62,12 +65,13 @@ def _prepare_inputs(campaign: Campaign, cases: Iterable[int]) -> None:
         campaign.scenario.prepare(base, number)
 
 
-def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int) -> None:
+def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int, bits_per_pixel: float | None) -> None:
     """Write the manifest of the data set. Raises StoreError if the folder contains another data set."""
     configuration = campaign.configuration
     manifest = {
         "campaign": configuration.name,
         "cases_per_shard": cases_per_shard,
+        **({} if bits_per_pixel is None else {"bits_per_pixel": bits_per_pixel}),
         "configuration_sha256": configuration_hash(configuration),
         "configuration": configuration.model_dump(mode="json"),
     }
@@ -76,8 +80,8 @@ def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int) -> N
         folder.mkdir(parents=True, exist_ok=True)
         if path.exists():
             previous = json.loads(path.read_text(encoding="utf-8"))
-            for key in ("configuration_sha256", "cases_per_shard"):
-                if previous.get(key) != manifest[key]:
+            for key in ("configuration_sha256", "cases_per_shard", "bits_per_pixel"):
+                if previous.get(key) != manifest.get(key):
                     raise StoreError(f"{folder} contains another data set ({key} differs); choose another folder")
             return
         path.write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
@@ -85,25 +89,26 @@ def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int) -> N
         raise StoreError(f"{path} cannot be read or written: {error}") from error
 
 
-def _write_shard(campaign: Campaign, path: Path, cases: range) -> None:
+def _write_shard(campaign: Campaign, path: Path, cases: range, bits_per_pixel: float | None) -> None:
     partial_path = path.with_suffix(".part")
     with tarfile.open(partial_path, "w", format=tarfile.USTAR_FORMAT) as shard:
         for case in cases:
-            for name, contents in _create_files(campaign, case):
+            for name, contents in _create_files(campaign, case, bits_per_pixel):
                 entry = tarfile.TarInfo(name)
                 entry.size = len(contents)
                 shard.addfile(entry, io.BytesIO(contents))
     partial_path.replace(path)
 
 
-def _create_files(campaign: Campaign, case: int) -> Iterator[tuple[str, bytes]]:
+def _create_files(campaign: Campaign, case: int, bits_per_pixel: float | None) -> Iterator[tuple[str, bytes]]:
     scenario = campaign.scenario
     assert isinstance(scenario, ProvidesSamples)  # noqa: S101  (checked by `write_dataset`)
     draws = campaign.draws(case)
     for number, sample in enumerate(scenario.samples(campaign.parameters(case), campaign.streams(case))):
         key = f"{case:07d}-{number}"
         metadata = {"campaign": campaign.configuration.name, "case": case, "picture": number, "drawn": draws}
-        yield f"{key}.image.png", _encode(sample.image * np.uint16(2 ** (16 - sample.bits)))
+        image = sample.image if bits_per_pixel is None else compress(sample.image, bits_per_pixel)
+        yield f"{key}.image.png", _encode(image * np.uint16(2 ** (16 - sample.bits)))
         yield f"{key}.range.npy", _encode(sample.range_m)
         yield f"{key}.normal.npy", _encode(sample.normal)
         yield f"{key}.rocks.png", _encode(sample.rocks)

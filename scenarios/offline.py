@@ -1,6 +1,7 @@
 """Algorithms that run outside of Marsyard: export the cases, and read the answers from a table.
 
-Both replace an algorithm of a campaign: ``export:FOLDER`` writes its inputs and returns no answer,
+Both replace an algorithm of a campaign: ``export:FOLDER`` (or ``export:FOLDER::bits-per-pixel=B`` with lossy
+compression of the images) writes its inputs and returns no answer,
 ``answers:FILE.csv`` returns the answer in its table.
 """
 
@@ -9,7 +10,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import lru_cache
 from pathlib import Path
@@ -23,8 +24,11 @@ from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEst
 from marsyard.scenarios.user_files import check_column_groups, finite_number, format_problems, parse_table
 from marsyard.sim.files import check_regular
 from marsyard.sim.measurements import LandingMeasurements
+from marsyard.sim.sensor.compression import compress
 
 EXPORT, ANSWERS = "export:", "answers:"
+#: Between the folder of an export and the bits per pixel of its compressed images.
+LOSSY = "::bits-per-pixel="
 
 #: Folder of the cases in an export.
 CASES = "cases"
@@ -121,7 +125,8 @@ def create_offline(spec: str, answer_format: AnswerFormat[Any], case: int) -> An
     """Create the replacement of an algorithm in a case."""
     file = answers_file(spec)
     if file is None:
-        return Recorder(Path(spec.removeprefix(EXPORT)) / CASES / f"{case:06d}", answer_format)
+        folder, _, bits = spec.removeprefix(EXPORT).partition(LOSSY)
+        return Recorder(Path(folder) / CASES / f"{case:06d}", answer_format, float(bits) if bits else None)
     answer = read_answers(file, answer_format).get(case)
     return RecordedAnswer(answer, f"{file.name} has no answer to case {case}", answer_format)
 
@@ -132,9 +137,15 @@ class Recorder:
 
     folder: Path
     answer_format: AnswerFormat[Any]
+    bits_per_pixel: float | None = None  #: size of the compressed images; None without compression
 
     def estimate(self, measurements: Any) -> Any:
         """Write a case. Raises OSError."""
+        if self.bits_per_pixel is not None:
+            lossy = [
+                replace(image, counts=compress(image.counts, self.bits_per_pixel)) for image in measurements.images
+            ]
+            measurements = replace(measurements, images=tuple(lossy))
         unfinished = self.folder.with_name(f"{self.folder.name}.part{os.getpid()}")
         shutil.rmtree(unfinished, ignore_errors=True)
         unfinished.mkdir(parents=True)

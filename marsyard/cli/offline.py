@@ -29,21 +29,24 @@ def export(
     jobs: options.JobsOption = None,
     cluster: options.ClusterOption = None,
     override: options.SetOption = None,
+    bits_per_pixel: options.BitsOption = None,
 ) -> None:
     """Export images, measurements and camera models for an external algorithm; repeat the command to continue."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.running.offline import export_campaign, truth_folder
     from marsyard.campaigns.store import record
     from marsyard.reports.wording import count
-    from marsyard.scenarios.offline import EXPORT
+    from marsyard.scenarios.offline import EXPORT, LOSSY
 
     truth = truth_folder(out) if truth is None else truth
     no_products = ["retain.products=none", "retain.showcase=none"]
-    loaded = load_campaign(campaign, [*(override or []), *no_products], cases, seed, [f"{EXPORT}{out.resolve()}"])
+    recorder = f"{EXPORT}{out.resolve()}" + ("" if bits_per_pixel is None else f"{LOSSY}{bits_per_pixel:g}")
+    loaded = load_campaign(campaign, [*(override or []), *no_products], cases, seed, [recorder])
     command = ["marsyard", "export", campaign, "--out", str(out), "--truth", str(truth)]
     command += [] if cases is None else ["-n", str(cases)]
     command += [] if seed is None else ["--seed", str(seed)]
     command += [word for value in override or [] for word in ("--set", value)]
+    command += [] if bits_per_pixel is None else ["--bits-per-pixel", f"{bits_per_pixel:g}"]
     loaded = replace(loaded, command=tuple(command))
     with show_progress(truth, f"the same command again ({out})") as watch:
         export_campaign(loaded, out, truth, make_executor(jobs, cluster), watch)
@@ -94,6 +97,7 @@ def dataset(
     shard: Annotated[int, Option(metavar="N", min=1, help="Cases per shard.")] = 50,
     jobs: Annotated[int, Option(metavar="J", min=1, help="Worker processes.")] = 1,
     override: options.SetOption = None,
+    bits_per_pixel: options.BitsOption = None,
 ) -> None:
     """Write images with range, normals, rock masks, hazard maps and poses as WebDataset shards; repeat it to continue.
 
@@ -102,7 +106,7 @@ def dataset(
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.dataset import write_dataset
 
-    shards = write_dataset(load_campaign(campaign, override or [], cases, seed), out, shard, jobs)
+    shards = write_dataset(load_campaign(campaign, override or [], cases, seed), out, shard, jobs, bits_per_pixel)
     total = sum(path.stat().st_size for path in shards)
     typer.echo(f"{len(shards)} shards, {options.size_text(total)}: {out}")
 

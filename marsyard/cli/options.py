@@ -40,6 +40,10 @@ CasesOption = Annotated[int | None, Option("-n", "--cases", metavar="N", help="N
 SeedOption = Annotated[int | None, Option(metavar="S", help="Root seed of the random draws.")]
 JsonOption = Annotated[bool, Option("--json", help="Print JSON.")]
 DirectoryArgument = Annotated[Path, Argument(metavar="DIR", help="Folder of a finished campaign run.")]
+BitsOption = Annotated[
+    float | None,
+    Option(metavar="BITS", min=0.1, max=16.0, help="Compress images with loss to this size per pixel (JPEG 2000)."),
+]
 SetOption = Annotated[
     list[str] | None,
     Option(

@@ -24,6 +24,7 @@ from marsyard.sim.camera import BODY_FRAME, CameraModel, write_cahvor
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Frame, PixelRays, Scene, Sun, process_renderer
 from marsyard.sim.render.backend import default_backend
+from marsyard.sim.sensor.compression import compress
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Site, sites
 from marsyard.sim.terrain.imported import embed
@@ -51,6 +52,7 @@ class ImageRequest:
     sun_elevation_deg: float
     seed: int
     max_hole_fraction: float
+    bits_per_pixel: float | None = None  #: size of the compressed counts; None without compression
 
     @classmethod
     def from_defaults(cls, site: str, camera: str, **settings: Any) -> ImageRequest:
@@ -180,7 +182,8 @@ def _expose(
     auto_exposure = sensor.auto_expose(
         detector, radiance, sensor.AutoExposureParameters(), streams.generator("test pictures")
     )
-    return auto_exposure, auto_exposure.detector.expose(radiance, streams.generator("detector noise"))
+    counts = auto_exposure.detector.expose(radiance, streams.generator("detector noise"))
+    return auto_exposure, counts if request.bits_per_pixel is None else compress(counts, request.bits_per_pixel)
 
 
 def truth_layers(image: RenderedImage) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Option
 
-from marsyard.cli.options import JsonOption, MaxHolesOption, SiteArgument, console, fail
+from marsyard.cli.options import BitsOption, JsonOption, MaxHolesOption, SiteArgument, console, fail
 
 if TYPE_CHECKING:
     from marsyard.sim.terrain import Surface
@@ -214,6 +214,7 @@ class RenderOptions:
     sun_elevation: Annotated[float, Option(metavar="DEG", help="Sun elevation above the horizon.")] = 35.0
     detector: Annotated[bool, Option("--detector/--radiance", help="Detector counts, or radiance factor.")] = True
     seed: Annotated[int, Option(metavar="S", min=0, help="Seed of the terrain and the noise.")] = 1
+    bits_per_pixel: BitsOption = None
     overwrite: OverwriteOption = False
     max_holes: MaxHolesOption = None
 
@@ -226,6 +227,7 @@ def render(arguments: RenderOptions) -> None:
     with report_image_errors(arguments.out):
         settings = {"scale": arguments.scale, "seed": arguments.seed, "max_hole_fraction": arguments.max_holes}
         settings |= {f"{name}_m": getattr(arguments, name) for name in ("altitude", "east", "north")}
+        settings["bits_per_pixel"] = arguments.bits_per_pixel
         angles = ("azimuth", "elevation", "sun_azimuth", "sun_elevation")
         settings |= {f"{name}_deg": getattr(arguments, name) for name in angles}
         request = ImageRequest.from_defaults(arguments.site, arguments.camera, **settings)

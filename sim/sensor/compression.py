@@ -1,0 +1,27 @@
+"""Lossy compression of delivered images, as on a mission's downlink.
+
+The Mars Exploration Rovers compress images with ICER, a wavelet coder, to about 1 to 3 bits per pixel (Kiely & Klimesh
+2003, IPN Progress Report 42-155). JPEG 2000, also a wavelet coder, represents it here.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import UInt16
+
+#: Allowed compressed sizes, bits per pixel.
+MIN_BITS, MAX_BITS = 0.1, 16.0
+
+
+def compress(counts: UInt16[np.ndarray, "rows columns"], bits_per_pixel: float) -> UInt16[np.ndarray, "rows columns"]:
+    """Compress an image to a size and decompress it; an image that is smaller without loss is not changed.
+
+    Raises ValueError if `bits_per_pixel` is not within `MIN_BITS` and `MAX_BITS`.
+    """
+    if not MIN_BITS <= bits_per_pixel <= MAX_BITS:
+        raise ValueError(f"{bits_per_pixel:g} bits per pixel; allowed: {MIN_BITS:g} to {MAX_BITS:g}")
+    # the option is the compressed size in thousandths of 16 bits per pixel
+    target = [cv2.IMWRITE_JPEG2000_COMPRESSION_X1000, max(1, round(1000.0 * bits_per_pixel / 16.0))]
+    _, encoded = cv2.imencode(".jp2", counts, target)
+    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED), dtype=np.uint16)
