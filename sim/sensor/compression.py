@@ -14,14 +14,17 @@ from jaxtyping import UInt16
 MIN_BITS, MAX_BITS = 0.1, 16.0
 
 
-def compress(counts: UInt16[np.ndarray, "rows columns"], bits_per_pixel: float) -> UInt16[np.ndarray, "rows columns"]:
+def compress(
+    counts: UInt16[np.ndarray, "rows columns"], bits_per_pixel: float, full_scale_dn: int
+) -> UInt16[np.ndarray, "rows columns"]:
     """Compress an image to a size and decompress it; an image that is smaller without loss is not changed.
 
-    Raises ValueError if `bits_per_pixel` is not within `MIN_BITS` and `MAX_BITS`.
+    Counts above `full_scale_dn`, from ringing at edges, are clipped. Raises ValueError if `bits_per_pixel` is not within `MIN_BITS` and `MAX_BITS`.
     """
     if not MIN_BITS <= bits_per_pixel <= MAX_BITS:
         raise ValueError(f"{bits_per_pixel:g} bits per pixel; allowed: {MIN_BITS:g} to {MAX_BITS:g}")
     # the option is the compressed size in thousandths of 16 bits per pixel
     target = [cv2.IMWRITE_JPEG2000_COMPRESSION_X1000, max(1, round(1000.0 * bits_per_pixel / 16.0))]
     _, encoded = cv2.imencode(".jp2", counts, target)
-    return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED), dtype=np.uint16)
+    decoded = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED), dtype=np.uint16)
+    return np.minimum(decoded, np.uint16(full_scale_dn))
