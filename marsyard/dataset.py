@@ -107,7 +107,7 @@ def _create_files(campaign: Campaign, case: int, bits_per_pixel: float | None) -
     for number, sample in enumerate(scenario.samples(campaign.parameters(case), campaign.streams(case))):
         key = f"{case:07d}-{number}"
         metadata = {"campaign": campaign.configuration.name, "case": case, "picture": number, "drawn": draws}
-        image = sample.image if bits_per_pixel is None else compress(sample.image, bits_per_pixel)
+        image = sample.image if bits_per_pixel is None else compress(sample.image, bits_per_pixel, 2**sample.bits - 1)
         yield f"{key}.image.png", _encode(image * np.uint16(2 ** (16 - sample.bits)))
         yield f"{key}.range.npy", _encode(sample.range_m)
         yield f"{key}.normal.npy", _encode(sample.normal)

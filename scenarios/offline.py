@@ -142,10 +142,10 @@ class Recorder:
     def estimate(self, measurements: Any) -> Any:
         """Write a case. Raises OSError."""
         if self.bits_per_pixel is not None:
-            lossy = [
-                replace(image, counts=compress(image.counts, self.bits_per_pixel)) for image in measurements.images
-            ]
-            measurements = replace(measurements, images=tuple(lossy))
+            bits, images = self.bits_per_pixel, measurements.images
+            counts = [compress(image.counts, bits, image.calibration.full_scale_dn) for image in images]
+            lossy = tuple(replace(image, counts=values) for image, values in zip(images, counts, strict=True))
+            measurements = replace(measurements, images=lossy)
         unfinished = self.folder.with_name(f"{self.folder.name}.part{os.getpid()}")
         shutil.rmtree(unfinished, ignore_errors=True)
         unfinished.mkdir(parents=True)

@@ -183,7 +183,9 @@ def _expose(
         detector, radiance, sensor.AutoExposureParameters(), streams.generator("test pictures")
     )
     counts = auto_exposure.detector.expose(radiance, streams.generator("detector noise"))
-    return auto_exposure, counts if request.bits_per_pixel is None else compress(counts, request.bits_per_pixel)
+    if request.bits_per_pixel is not None:
+        counts = compress(counts, request.bits_per_pixel, parameters.full_scale_dn)
+    return auto_exposure, counts
 
 
 def truth_layers(image: RenderedImage) -> dict[str, Any]:
