@@ -19,8 +19,8 @@ def compress(
 ) -> UInt16[np.ndarray, "rows columns"]:
     """Compress an image to a size and decompress it; an image that is smaller without loss is not changed.
 
-    Counts above `full_scale_dn`, from ringing at edges, are clipped. Raises ValueError if `bits_per_pixel` is not within
-    `MIN_BITS` and `MAX_BITS`.
+    Counts above `full_scale_dn`, from ringing at edges, are clipped. Raises ValueError if `bits_per_pixel` is not
+    within `MIN_BITS` and `MAX_BITS`.
     """
     if not MIN_BITS <= bits_per_pixel <= MAX_BITS:
         raise ValueError(f"{bits_per_pixel:g} bits per pixel; allowed: {MIN_BITS:g} to {MAX_BITS:g}")
