@@ -108,7 +108,8 @@ def take_exposures(
     clouds = draw_clouds(p.faults, first_ground_m, streams.generator("clouds"))
     scene = replace(scene, caster_diameter_m=p.lander.caster_diameter_m, clouds=clouds)
     # the camera is at the body's origin; its alignment error is a pure rotation, unknown to the lander
-    tilt = np.radians(p.camera.alignment_error_deg) * streams.generator("camera alignment").standard_normal(3)
+    alignment_deg = 0.0 if p.exact_instruments else p.camera.alignment_error_deg
+    tilt = np.radians(alignment_deg) * streams.generator("camera alignment").standard_normal(3)
     mounting = RigidTransform.from_rotation(Rotation.from_rotvec(tilt))
     shield = None
     if p.faults.heat_shield_deg:

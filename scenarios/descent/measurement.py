@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.descent.exposure import World, calibrated_camera
-from marsyard.scenarios.descent.flight import MARGIN_S, DescentFlight, gravity_m_s2
+from marsyard.scenarios.descent.exposure import World, calibrated_camera, camera_optics
+from marsyard.scenarios.descent.flight import MARGIN_S, DescentFlight, gravity_m_s2, mean_velocities
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_altitude_faults, add_attitude_faults
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.instruments import (
@@ -20,9 +20,18 @@ from marsyard.scenarios.parts.instruments import (
     InstrumentReadings,
     InstrumentTruth,
 )
-from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.dynamics import State, Trajectory
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
-from marsyard.sim.sensor import Approach, Clock, Detector, Imu, InertialSolution, RadarAltimeter, Readings
+from marsyard.sim.sensor import (
+    Approach,
+    Clock,
+    Detector,
+    Imu,
+    InertialSolution,
+    RadarAltimeter,
+    Readings,
+    height_above_ground,
+)
 from marsyard.sim.sensor.ranging import first_return
 from marsyard.sim.streams import Streams
 
@@ -88,11 +97,35 @@ class Instruments:
         )
 
 
+Counts = Sequence[UInt16[np.ndarray, "rows columns"]]
+
+
+def measure_exactly(
+    p: DescentScenarioParameters, world: World, states: Sequence[State], pictures: Counts, detector: Detector
+) -> DescentMeasurements:
+    """Create measurements without errors: true attitudes, altitudes, times and velocities, and the true camera."""
+    camera = camera_optics(p.camera).camera.bin(columns=1, rows=p.detector.rows_summed)
+    heights = height_above_ground(world.surface, np.stack([state.position_m for state in states]))
+    return DescentMeasurements(
+        images=tuple(
+            DetectorImage(counts, state.time_s, camera, detector.calibration)
+            for counts, state in zip(pictures, states, strict=True)
+        ),
+        attitudes=tuple(AttitudeMeasurement(state.attitude, state.time_s) for state in states),
+        altitudes=tuple(
+            AltitudeMeasurement(float(height), state.time_s) for height, state in zip(heights, states, strict=True)
+        ),
+        interval_velocities_m_s=mean_velocities(states),
+        sun_direction=world.sun.direction,
+        inertial_velocities_m_s=np.stack([state.velocity_m_s for state in states]),
+    )
+
+
 def measure(
     p: DescentScenarioParameters,
     world: World,
     motion: Trajectory,
-    pictures: Sequence[UInt16[np.ndarray, "rows columns"]],
+    pictures: Counts,
     detector: Detector,
     instruments: Instruments,
     streams: Streams,

@@ -255,6 +255,9 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     clock: Annotated[ClockParameters, Field(description="clock of the pictures' time tags")] = ClockParameters(
         offset_sd_s=0.001, jitter_sd_s=0.0005
     )
+    exact_instruments: Annotated[
+        bool, Field(description="estimators get true attitudes, altitudes, times and camera, to see the images' error")
+    ] = False
     landing: LandingParameters = LandingParameters()
     render: RenderParameters = Field(default_factory=RenderParameters)
 

@@ -24,7 +24,7 @@ from marsyard.scenarios.conditions import (
 )
 from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, picture_states, true_velocity
-from marsyard.scenarios.descent.measurement import Instruments, measure
+from marsyard.scenarios.descent.measurement import Instruments, measure, measure_exactly
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_terrain_fault
 from marsyard.scenarios.descent.score import (
     Pictures,
@@ -156,7 +156,10 @@ class Descent:
         images = [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
         pictures = corrupt_images(images, p.faults.repeated_picture, p.faults.black_picture)
         instruments = Instruments.draw(p, world, flight, streams)
-        measurements = measure(p, world, flight.motion, pictures, detector, instruments, streams)
+        if p.exact_instruments:
+            measurements = measure_exactly(p, world, states, pictures, detector)
+        else:
+            measurements = measure(p, world, flight.motion, pictures, detector, instruments, streams)
         overlap: Mapping[str, Scalar] = {}
         if p.triple_indices is not None:
             triple = [states[index] for index in p.triple_indices]

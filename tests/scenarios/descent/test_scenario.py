@@ -231,3 +231,12 @@ def test_slow_algorithm_misses_the_firing() -> None:
 def test_dimes_run_time_requirement_uses_measured_time() -> None:
     requested = {one.id: one for one in load_campaign("dimes-landing").configuration.requirements}
     assert requested["DIMES-TIME"].metric == "in_time_measured"
+
+
+def test_exact_instruments_leave_only_the_error_of_the_images() -> None:
+    row = run(exact_instruments=True).row
+    for name in ("attitude_error_common_deg", "attitude_error_independent_deg", "velocity_change_error_m_s"):
+        assert float(row[name]) < 1e-6
+    assert abs(float(row["altitude_error_common"])) < 1e-9
+    assert abs(float(row["tag_error_1_s"])) < 1e-12
+    assert abs(float(row["velocity_error_m_s"])) < 0.3
