@@ -62,11 +62,20 @@ def test_kelso_rises_over_200_m_and_ivanpah_is_the_flattest(measured: dict[str, 
         assert measured["ivanpah"].mean_slope_90_m_deg < measured[other].mean_slope_90_m_deg
 
 
-def test_contrast_at_pisgah_is_like_that_at_the_mars_sites(measured: dict[str, TerrainStatistics]) -> None:
-    """'Similar to contrast measured on descent images synthesized' at most MER sites: within one third."""
+def _median_contrast(name: str) -> float:
+    parameters = site(name).terrain("descent")
+    coarse = parameters.model_copy(update={"samples": 1024, "spacing_m": 4 * parameters.spacing_m})
+    return float(
+        np.median([terrain_statistics(synthesise(coarse, np.random.default_rng(k))).contrast for k in range(5)])
+    )
+
+
+def test_contrast_at_pisgah_is_at_most_that_at_the_mars_sites() -> None:
+    """'Similar to contrast measured on descent images synthesized' from MOC, which is a lower limit: half to all."""
+    pisgah = _median_contrast("pisgah")
+    assert pisgah < 0.1
     for name in MARS:
-        assert measured["pisgah"].contrast == pytest.approx(measured[name].contrast, rel=1 / 3)
-    assert measured["pisgah"].contrast < 0.1
+        assert 0.5 < pisgah / _median_contrast(name) < 1.0
 
 
 def test_sites_have_complete_parameters() -> None:
