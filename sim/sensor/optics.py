@@ -194,13 +194,16 @@ def natural_fall_off(camera: CameraModel) -> Image:
 def dust_transmission(shape: tuple[int, int], parameters: OpticsParameters, rng: np.random.Generator) -> Image:
     """Draw the transmission of dust on the lens: soft absorbing discs at random positions."""
     transmission = np.ones(shape, dtype=np.float32)
-    row, column = np.ogrid[: shape[0], : shape[1]]
     for _ in range(parameters.dust_discs):
         centre = rng.uniform(0.0, 1.0, 2) * shape
         radius = parameters.dust_radius_px * rng.uniform(2.0 / 3.0, 4.0 / 3.0)
+        half = radius * (1.0 + parameters.dust_softness)
+        first, last = np.maximum(centre - half, 0.0).astype(int), np.minimum(centre + half + 1.0, shape).astype(int)
+        row, column = np.ogrid[first[0] : last[0], first[1] : last[1]]
         distance = np.hypot(row - centre[0], column - centre[1]) / radius
         coverage = np.clip((1.0 + parameters.dust_softness - distance) / (2.0 * parameters.dust_softness), 0.0, 1.0)
-        transmission *= (1.0 - parameters.dust_depth * coverage**2 * (3.0 - 2.0 * coverage)).astype(np.float32)
+        shade = 1.0 - parameters.dust_depth * coverage**2 * (3.0 - 2.0 * coverage)
+        transmission[first[0] : last[0], first[1] : last[1]] *= shade.astype(np.float32)
     return transmission
 
 
