@@ -19,7 +19,7 @@ STAGES: Stages = {
     "shading": (("kernels/shading.py", "shade"),),
     "pixels with edges, but for their shading": (
         ("render/renderer.py", "edge_pixels"),
-        ("render/renderer.py", "rays_within"),
+        ("render/renderer.py", "supersample_rays"),
         ("kernels/edges.py", "trace_subpixel_rays"),
     ),
     "detector": (("sensor/detector.py", "drawn"), ("sensor/detector.py", "expose"), ("sensor/motion.py", "seen")),

@@ -5,8 +5,8 @@
   ("left"), z up. A descent camera looks along -z.
 - site: the frame of rover operations (x north, y east, z down), used only when files are read or written.
 
-Transforms are SciPy's `RigidTransform` and `Rotation`, named so that equations read from right to left:
-``world_from_body.apply(points_body)`` gives ``points_world``. Arrays of quaternions carry their order in the name
+Transforms are SciPy's `RigidTransform` and `Rotation`. Their names contain the target and the source frame:
+``world_from_body.apply(points_body)`` gives ``points_world``. Names of quaternion arrays contain the component order
 (``quaternion_xyzw``, SciPy's order, or ``quaternion_wxyz``, the order of PDS labels).
 """
 
@@ -26,18 +26,18 @@ def rigid(rotation: Rotation, translation: Float[np.ndarray, "3"]) -> RigidTrans
 
 
 def rigid_from_axes(axes: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> RigidTransform:
-    """The transform ``x -> axes x + translation``; the axes must be a rotation to rounding. This is not checked."""
+    """The transform ``x -> axes x + translation``; `axes` must be a rotation matrix, which is not checked."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = axes, translation
     return RigidTransform(matrix, normalize=False, copy=False)  # ten times faster than with the check
 
 
 def compose(outer: RigidTransform, inner: RigidTransform) -> RigidTransform:
-    """Compose two single transforms, ``outer * inner``, five times faster than SciPy: without normalisation."""
+    """Compose two single transforms, ``outer * inner``, without normalisation: five times faster than SciPy."""
     return RigidTransform(outer.as_matrix() @ inner.as_matrix(), normalize=False, copy=False)
 
 
-def turn_matrix(transform: RigidTransform) -> Float[np.ndarray, "3 3"]:
+def rotation_matrix(transform: RigidTransform) -> Float[np.ndarray, "3 3"]:
     """Return the rotation matrix of a single transform, 30 times faster than ``transform.rotation.as_matrix()``."""
     return np.ascontiguousarray(transform.as_matrix()[:3, :3])
 

@@ -1,7 +1,7 @@
-"""Cache folder of compiled kernels: one folder per state of the kernels' sources and per processor.
+"""Cache folder of compiled kernels: one folder per version of the kernel sources.
 
-numba recompiles a function when its own file changes, not when a function that it calls from another file changes. A
-stale kernel would return old results. Any change of any kernel source therefore selects a new folder.
+numba recompiles a function when its file changes, but not when a function that it calls in another file changes. A
+stale kernel would return old results. Therefore a change of any kernel source selects a new folder.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from marsyard.sim.cache import cache_directory
 
 @cache
 def processor_features() -> str:
-    """Return the machine type and a hash of the instruction set extensions that compiled code is made for."""
+    """Return the machine type and a hash of the processor's instruction set extensions."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
-    stated = next((line.split(":", 1)[1] for line in lines if line.startswith(("flags", "Features"))), "")
-    flags = " ".join(sorted(stated.split()))
+    extensions = next((line.split(":", 1)[1] for line in lines if line.startswith(("flags", "Features"))), "")
+    flags = " ".join(sorted(extensions.split()))
     return f"{platform.machine()}-{hashlib.sha256(flags.encode()).hexdigest()[:12]}"
 
 
-#: The folders that hold kernels, in the source tree and in an installation.
+#: The folders that contain kernels, in the source tree and in an installation.
 _FOLDERS = ("sim", "algorithms", "scenarios")
 
 
 def set_cache_folder() -> None:
-    """Set numba's cache folder by the kernels' sources, without importing numba; the user's own setting is kept."""
+    """Set numba's cache folder from a hash of the kernel sources, without importing numba, if the user sets none."""
     if "NUMBA_CACHE_DIR" in os.environ:
         return
     root, digest = Path(__file__).parents[1], hashlib.sha256(sys.version.encode())
@@ -42,24 +42,24 @@ def set_cache_folder() -> None:
     try:
         folder = cache_directory("kernels") / digest.hexdigest()[:16]
     except OSError:
-        return  # without a writable folder numba uses its own, or compiles in every process
+        return  # without a writable folder numba uses its default folder, or compiles in every process
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
     if "numba" in sys.modules:
         sys.modules["numba"].config.CACHE_DIR = str(folder)
 
 
 def kernels_are_ready(user: str) -> bool:
-    """Whether a user of the kernels (a scenario) has completed a run with the cached kernels on this processor."""
-    mark = _mark(user)
-    return mark is not None and mark.exists()
+    """Whether a user of the kernels (a scenario) has completed a run with the cached kernels on this processor type."""
+    marker = _marker_path(user)
+    return marker is not None and marker.exists()
 
 
 def mark_ready(user: str) -> None:
-    """Record that the kernels of this user are compiled."""
-    if (mark := _mark(user)) is not None:
+    """Record that the kernels of this user (a scenario) are compiled."""
+    if (marker := _marker_path(user)) is not None:
         with suppress(OSError):
-            mark.parent.mkdir(parents=True, exist_ok=True)
-            mark.touch()
+            marker.parent.mkdir(parents=True, exist_ok=True)
+            marker.touch()
 
 
 def count_compiled_functions() -> int:
@@ -68,8 +68,8 @@ def count_compiled_functions() -> int:
     return 0 if folder is None else sum(1 for _ in Path(folder).rglob("*.nbc"))
 
 
-def _mark(user: str) -> Path | None:
-    # compiled code runs on its own type of processor only: numba keeps one compiled form per type
+def _marker_path(user: str) -> Path | None:
+    # numba stores compiled code per processor type
     folder = os.environ.get("NUMBA_CACHE_DIR")
     digest = hashlib.sha256(f"{user} {processor_features()}".encode())
     return None if folder is None else Path(folder) / f"{digest.hexdigest()[:16]}.ready"

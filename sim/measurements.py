@@ -1,6 +1,7 @@
-"""Measurements: the only input of an algorithm; and commands to the wheels.
+"""Measurements, the only input of an algorithm, and drive commands.
 
-Nothing here is ground truth. Cameras are as calibrated, times as tagged, attitudes and altitudes as measured.
+Measurements contain no ground truth: camera models are calibrated ones, times are time tags, and attitudes and
+altitudes contain measurement errors.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from marsyard.sim.frames import rigid_from_axes
 class DetectorCalibration:
     """Calibration of an image detector before flight.
 
-    - flat_field: relative response of each delivered pixel (1 at the brightest)
+    - flat_field: relative response of each image pixel (maximum 1)
     - exposure_s: exposure time
-    - transfer_row_s: time of a charge packet under each physical row during the transfer to the storage area
-    - clear_row_s: time of a charge packet under each physical row during the clearing before the exposure
-    - rows_summed: physical rows summed on the chip into one delivered row
+    - transfer_row_s: time per physical row during the charge transfer to the storage area
+    - clear_row_s: time per physical row while the detector is cleared before the exposure
+    - rows_summed: physical rows summed on the chip into one image row
     - offset_dn: counts without light
-    - full_scale_dn: the largest count (4095 for 12 bits)
+    - full_scale_dn: maximum count (4095 for 12 bits)
     """
 
     flat_field: Float[np.ndarray, "rows columns"]
@@ -41,13 +42,13 @@ class DetectorCalibration:
 
 @dataclass(frozen=True)
 class DetectorImage:
-    """A picture as delivered by a camera.
+    """A picture as read out from a camera.
 
-    Row 0 is nearest to the storage area and is shifted out first. A packet of row r passes the rows r-1, r-2, ... 0.
+    Row 0 is nearest to the storage area and is shifted out first. The charge of row r passes the rows r-1, r-2, ... 0.
 
     - counts: detector counts, after summing on the chip
     - time_s: time tag of the middle of the exposure
-    - camera: the calibrated camera model of the delivered picture, in the body frame
+    - camera: the calibrated camera model of this picture, in the body frame
     """
 
     counts: UInt16[np.ndarray, "rows columns"]
@@ -74,9 +75,9 @@ class AltitudeMeasurement:
 
 @dataclass(frozen=True)
 class DescentFrame:
-    """Measurements available to the lander's computer at one descent picture; without later ones.
+    """Measurements available to the lander's computer when one descent picture is taken.
 
-    Both velocities contain the same unknown error of the navigation's initial velocity.
+    Both velocities contain the same unknown error: that of the initial velocity of inertial navigation.
 
     - sun_direction: unit vector to the sun, world axes
     - inertial_velocity_m_s: inertial velocity of the camera at the picture, world axes; None if not recorded
@@ -93,12 +94,12 @@ class DescentFrame:
 
 @dataclass(frozen=True)
 class DescentMeasurements:
-    """Measurements available to the lander's computer at the last descent picture: the third, for DIMES.
+    """Measurements available to the lander's computer after the last descent picture (DIMES takes three).
 
-    - images, attitudes, altitudes: as many of each, in the order of exposure
+    - images, attitudes, altitudes: one of each per picture, in the order of exposure
     - interval_velocities_m_s: mean inertial velocities of the camera between successive pictures, world axes. All
-      contain the same unknown error of the navigation's initial velocity; only their differences are accurate (the
-      paper's "biased IMU horizontal velocities")
+      contain the unknown error of the initial velocity of inertial navigation; only their differences are accurate
+      (the paper's "biased IMU horizontal velocities")
     - sun_direction: unit vector to the sun, world axes
     - inertial_velocities_m_s: inertial velocities at the pictures, with the same error; None if not recorded
     """
@@ -121,49 +122,49 @@ class DescentMeasurements:
         return self.images[-2].time_s, self.images[-1].time_s
 
     def frames(self) -> tuple[DescentFrame, ...]:
-        """The same measurements, picture by picture."""
-        at = self.inertial_velocities_m_s
+        """Return the measurements of each picture."""
+        velocities = self.inertial_velocities_m_s
         return tuple(
             DescentFrame(
                 image=image,
                 attitude=self.attitudes[number],
                 altitude=self.altitudes[number],
                 sun_direction=self.sun_direction,
-                inertial_velocity_m_s=None if at is None else at[number],
+                inertial_velocity_m_s=None if velocities is None else velocities[number],
                 interval_velocity_m_s=self.interval_velocities_m_s[number - 1] if number else None,
             )
             for number, image in enumerate(self.images)
         )
 
     def select(self, indices: tuple[int, ...]) -> DescentMeasurements:
-        """Select pictures by ascending indices, with the mean velocities between them."""
-        at = self.inertial_velocities_m_s
-        intervals = [self._mean_velocity(first, second) for first, second in pairwise(indices)]
+        """Select pictures by ascending indices; the mean velocities are those between the selected pictures."""
+        velocities = self.inertial_velocities_m_s
+        mean_velocities = [self._mean_velocity(first, second) for first, second in pairwise(indices)]
         return replace(
             self,
             images=tuple(self.images[index] for index in indices),
             attitudes=tuple(self.attitudes[index] for index in indices),
             altitudes=tuple(self.altitudes[index] for index in indices),
-            interval_velocities_m_s=np.array(intervals, dtype=np.float64).reshape(-1, 3),
-            inertial_velocities_m_s=None if at is None else at[list(indices)],
+            interval_velocities_m_s=np.array(mean_velocities, dtype=np.float64).reshape(-1, 3),
+            inertial_velocities_m_s=None if velocities is None else velocities[list(indices)],
         )
 
     def _mean_velocity(self, first: int, second: int) -> Float[np.ndarray, "3"]:
-        between = self.interval_velocities_m_s[first:second]
-        if len(between) == 1:
-            return np.asarray(between[0])
-        return np.asarray(np.average(between, axis=0, weights=np.diff(self.tags_s[first : second + 1])))
+        velocities = self.interval_velocities_m_s[first:second]
+        if len(velocities) == 1:
+            return np.asarray(velocities[0])
+        return np.asarray(np.average(velocities, axis=0, weights=np.diff(self.tags_s[first : second + 1])))
 
 
 @dataclass(frozen=True)
 class MastGeometry:
     """Geometry of a pan-tilt mast, as surveyed before flight.
 
-    The azimuth axis is parallel to the rover's z axis; the elevation axis, above it, is the head's y axis. With both
+    The azimuth axis is parallel to the rover's z axis. The elevation axis is the y axis of the camera head. With both
     angles zero the head's axes are parallel to the rover's: x forward, y left, z up.
 
     - base_m: a point of the azimuth axis in the rover (body) frame
-    - elbow_m: vector from the base to the elevation axis, in axes that turn with the azimuth
+    - elbow_m: vector from the base to the elevation axis, in axes that rotate with the azimuth
     - head_m: vector from the elevation axis to the head frame's origin, in the head's axes
     - azimuth_limits_rad: minimum and maximum azimuth, positive to the right (clockwise seen from above)
     - elevation_limits_rad: minimum and maximum elevation, positive upwards
@@ -179,13 +180,13 @@ class MastGeometry:
         """Pose of the head in the rover frame at these angles; the limits are not checked."""
         (sa, ca), (se, ce) = ((math.sin(angle), math.cos(angle)) for angle in (azimuth_rad, elevation_rad))
         pan = np.array([[ca, sa, 0.0], [-sa, ca, 0.0], [0.0, 0.0, 1.0]])
-        turn = pan @ np.array([[ce, 0.0, -se], [0.0, 1.0, 0.0], [se, 0.0, ce]])
-        return rigid_from_axes(turn, self.base_m + pan @ self.elbow_m + turn @ self.head_m)
+        rotation = pan @ np.array([[ce, 0.0, -se], [0.0, 1.0, 0.0], [se, 0.0, ce]])
+        return rigid_from_axes(rotation, self.base_m + pan @ self.elbow_m + rotation @ self.head_m)
 
 
 @dataclass(frozen=True)
 class MastCalibration:
-    """A mast and the calibrated stereo pair on its head; camera models of the full frames, in the head frame."""
+    """Mast geometry and the camera models of the stereo pair on its head, for full frames, in the head frame."""
 
     geometry: MastGeometry
     left: CameraModel
@@ -194,7 +195,7 @@ class MastCalibration:
 
 @dataclass(frozen=True)
 class MastImage:
-    """A full frame or subframe of a camera on the mast; `corner` is column and row of its upper left pixel."""
+    """A full frame or subframe of a mast camera; `corner` is the column and row of its upper left pixel."""
 
     counts: UInt16[np.ndarray, "rows columns"]
     corner: tuple[int, int] = (0, 0)
@@ -202,12 +203,11 @@ class MastImage:
 
 @dataclass(frozen=True)
 class RoverMeasurements:
-    """Measurements available to the rover's computer at a stop: a stereo pair taken from the pointed mast.
+    """Measurements available to the rover's computer at a stop: a stereo pair of the mast cameras.
 
     - left, right: the pictures, taken at the same time
     - azimuth_rad, elevation_rad: the mast's angles as read by its encoders
-    - world_from_rover: pose of the rover as estimated on board: exact at the start by definition, later with errors by
-      slip and drift
+    - world_from_rover: pose of the rover as estimated on board; exact at the start, later with slip and drift errors
     """
 
     left: MastImage
@@ -220,12 +220,12 @@ class RoverMeasurements:
 
 @dataclass(frozen=True)
 class DriveCommand:
-    """A motion command to a rover's wheels: constant velocity and turn rate until the path is driven.
+    """A drive command: motion with constant velocity and turn rate over a path.
 
     Straight ahead is ``(d, 0, 0)``, backward ``(-d, 0, 0)``, crabbing ``(0, d, 0)``, a turn in place ``(0, 0, t)``, an
-    arc of radius d / t ``(d, 0, t)``; ``(0, -r * t, t)`` moves sideways around a point that stays r ahead.
+    arc of radius d / t ``(d, 0, t)``. ``(0, -r * t, t)`` is an arc around a point at distance r straight ahead.
 
-    - forward_m, left_m: path along the rover's x and y axes; both axes turn with the rover
+    - forward_m, left_m: path along the rover's x and y axes, which turn with the rover
     - turn_left_rad: turn about the rover's z axis, counterclockwise seen from above
     """
 
@@ -240,8 +240,8 @@ class DriveCommand:
 
     @property
     def displacement_m(self) -> Float[np.ndarray, "2"]:
-        """End position without slip, in the rover's axes at the start (forward, left)."""
-        # chord of an arc: the path, shortened by sin(t/2) / (t/2) and rotated by t/2
+        """Displacement without slip, in the rover's axes at the start (forward, left)."""
+        # chord of an arc: the path length times sin(t/2) / (t/2), rotated by t/2
         half = 0.5 * self.turn_left_rad
         sine, cosine = np.sin(half), np.cos(half)
         path = np.array([[cosine, -sine], [sine, cosine]]) @ np.array([self.forward_m, self.left_m])
@@ -254,9 +254,9 @@ class DriveCommand:
 
 @dataclass(frozen=True)
 class PixelTarget:
-    """A target designated by a full-frame pixel (u, v) of the left camera, from the rover's current position.
+    """A target designated by a full-frame pixel (u, v) in a picture of the left camera at the rover's current position.
 
-    The angles are those of the mast when the picture was taken.
+    The angles are the mast's azimuth and elevation when the picture was taken.
     """
 
     pixel: Float[np.ndarray, "2"]
@@ -294,12 +294,12 @@ class PoseMeasurement:
 class LandingMeasurements:
     """Measurements available to the helicopter's computer for the selection of a landing site.
 
-    - images: two pictures of overlapping ground, in order, each with its camera in the body frame
+    - images: two overlapping pictures of the ground, in order of exposure, each with its camera in the body frame
     - poses: the on-board filter's pose at each picture
-    - slant_range_m: laser altimeter range at the first picture, from its camera's centre along the optical axis to the
+    - slant_range_m: laser altimeter range at the first picture, from the camera's centre along the optical axis to the
       ground; NaN without a return
     - up_body: unit vector upwards at the first picture as measured by the inclinometers, body axes
-    - apriori_site_world: landing site used if no better one is detected: a point in the world frame, metres
+    - apriori_site_world: landing site used if no better one is detected; world frame, metres
     """
 
     images: tuple[DetectorImage, DetectorImage]

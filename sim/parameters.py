@@ -1,4 +1,4 @@
-"""Base class and common field types of all parameters, and former names of keys, columns and options."""
+"""Base class and common field types of all parameters, and deprecated names of keys, columns and options."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
-class RenamedWarning(FutureWarning):
-    """A former name was given."""
+class DeprecatedNameWarning(FutureWarning):
+    """A deprecated name was used."""
 
 
 @cache
@@ -24,38 +24,38 @@ def _names(section: str) -> Mapping[str, str]:
     return names
 
 
-def current_key(name: str, known: Collection[str], given: Collection[str] = ()) -> str:
-    """Current name of a key in a table with `known` keys; the name itself if it is known, or both are given."""
+def current_key(name: str, valid_keys: Collection[str], input_keys: Collection[str] = ()) -> str:
+    """Return the current name of a key; the name itself if it is valid, or if the input contains both names."""
     current = _names("keys").get(name)
-    if current is None or name in known or current not in known or current in given:
+    if current is None or name in valid_keys or current not in valid_keys or current in input_keys:
         return name
-    return _warn_former(name, current)
+    return _warn_deprecated(name, current)
 
 
 def current_column(name: str, exists: Callable[[str], bool]) -> str:
-    """Current name of a column, given which columns exist; it may follow a compared algorithm's name and a dot."""
+    """Return the current name of a column; the name may have the prefix "<algorithm>." of a comparison."""
     algorithm, dot, column = name.rpartition(".")
-    for former, current in _names("columns").items():
-        match = re.fullmatch(former.replace("*", r"(\d+)"), column)
+    for deprecated, current in _names("columns").items():
+        match = re.fullmatch(deprecated.replace("*", r"(\d+)"), column)
         renamed = current.replace("*", match[1]) if match and match.groups() else current
         if match and exists(renamed):
-            return algorithm + dot + _warn_former(column, renamed)
+            return algorithm + dot + _warn_deprecated(column, renamed)
     return name
 
 
 def current_options(words: Sequence[str]) -> list[str]:
-    """Words of a command line with the current names of options."""
-    return [_warn_former(word, _names("options").get(word, word)) for word in words]
+    """Replace deprecated names of options in the words of a command line."""
+    return [_warn_deprecated(word, _names("options").get(word, word)) for word in words]
 
 
 def stream_name(path: str) -> str:
-    """Name of the random stream of a dispersion."""
+    """Random stream name of a dispersed parameter; renamed parameters keep their old stream."""
     return _names("streams").get(path, path)
 
 
-def _warn_former(former: str, current: str) -> str:
-    if former != current:
-        warnings.warn(f"'{former}' is now '{current}'; the former name is accepted until 0.2", RenamedWarning, 3)
+def _warn_deprecated(name: str, current: str) -> str:
+    if name != current:
+        warnings.warn(f"'{name}' is now '{current}'; the former name is accepted until 0.2", DeprecatedNameWarning, 3)
     return current
 
 
@@ -70,18 +70,18 @@ def bounded_field(low: float, high: float, description: str) -> Any:
 
 
 class Parameters(BaseModel):
-    """User parameters: unknown keys are errors, validated objects are immutable. Former names of keys are accepted."""
+    """User parameters. Unknown keys are errors; deprecated keys are accepted. Validated objects are immutable."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     @model_validator(mode="before")
     @classmethod
-    def _rename_former_keys(cls, given: Any) -> Any:
-        if not isinstance(given, Mapping) or cls.model_fields.keys() >= given.keys():
-            return given
+    def _rename_deprecated_keys(cls, values: Any) -> Any:
+        if not isinstance(values, Mapping) or cls.model_fields.keys() >= values.keys():
+            return values
         return {
-            current_key(name, cls.model_fields, given) if isinstance(name, str) else name: value
-            for name, value in given.items()
+            current_key(name, cls.model_fields, values) if isinstance(name, str) else name: value
+            for name, value in values.items()
         }
 
 
@@ -89,8 +89,8 @@ def merge_settings(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[
     """Merge changes into nested settings: tables are merged, other values replaced."""
     merged = dict(base)
     for key, value in changes.items():
-        below = merged.get(key)
-        if isinstance(below, Mapping) and isinstance(value, Mapping):
-            value = merge_settings(below, value)
+        current = merged.get(key)
+        if isinstance(current, Mapping) and isinstance(value, Mapping):
+            value = merge_settings(current, value)
         merged[key] = value
     return merged

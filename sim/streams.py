@@ -1,7 +1,7 @@
-"""Named random streams: every dispersion and every instrument of every case has its own generator.
+"""Named random streams: each dispersed parameter and each instrument of a case has its own random generator.
 
-A stream is a pure function of (root seed, campaign name, case number, stream name). It does not depend on the order of
-requests, on the worker or on other streams.
+A stream is a pure function of (root seed, campaign name, case number, stream name). It does not depend on the order in
+which streams are used, on the worker or on other streams.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ import numpy as np
 
 @lru_cache(maxsize=1024)
 def hash_words(text: str) -> tuple[int, ...]:
-    """Return 128 bits of the SHA-256 of a text as four words for the spawn key of `SeedSequence`."""
+    """Return the first 128 bits of a text's SHA-256 hash as four words for the spawn key of `SeedSequence`."""
     digest = hashlib.sha256(text.encode()).digest()
     return tuple(int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4))
 
 
 def stream_key(campaign: str, case: int, name: str) -> tuple[int, ...]:
-    """The spawn key of a stream: always nine words, so that no two keys coincide."""
+    """Return the spawn key of a stream, always nine words."""
     return (*hash_words(campaign), case, *hash_words(name))
 
 
 @dataclass(frozen=True)
 class Streams:
-    """The random streams of one case, by the root seed and the name of its campaign and its number from zero."""
+    """The random streams of one case: root seed and name of the campaign, and number of the case from zero."""
 
     seed: int
     campaign: str
     case: int
 
     def generator(self, name: str) -> np.random.Generator:
-        """Return a new generator at the start of the named stream (of a dispersion or an instrument)."""
+        """Return a new generator at the start of the stream with this name."""
         key = stream_key(self.campaign, self.case, name)
         return np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=key)))

@@ -15,7 +15,7 @@ from marsyard.algorithms.interface import MastAim, PixelBox
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.stereo import epipolar_pixels
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.frames import turn_matrix
+from marsyard.sim.frames import rotation_matrix
 from marsyard.sim.measurements import MastCalibration, MastGeometry, PixelTarget
 
 #: Maximum number of Newton steps, and the error below which a step is the last one (quadratic convergence).
@@ -56,7 +56,7 @@ def _offset(
     If the head rotates about an axis w through a, a point p fixed to the rover moves by -w x (p - a) in the head frame.
     """
     rover_from_head = mast.rover_from_head(float(angles[0]), float(angles[1]))
-    to_head = turn_matrix(rover_from_head).T
+    to_head = rotation_matrix(rover_from_head).T
     sine, cosine = np.sin(angles[0]), np.cos(angles[0])
     left_direction = np.array([sine, cosine, 0.0])
     elbow = mast.base_m + np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ mast.elbow_m

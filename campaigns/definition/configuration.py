@@ -20,7 +20,7 @@ from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, Gri
 from marsyard.scenarios.interface import Scenario
 from marsyard.scenarios.systems import UnknownScenarioError, row_columns, scenario
 from marsyard.sim.files import check_regular
-from marsyard.sim.parameters import Parameters, RenamedWarning, current_column, current_key
+from marsyard.sim.parameters import DeprecatedNameWarning, Parameters, current_column, current_key
 
 Model = TypeVar("Model", bound=BaseModel)
 #: Location of a key in nested tables and lists: names and indices.
@@ -350,7 +350,7 @@ def use_current_names(tables: Mapping[str, Any], selected: Scenario) -> dict[str
 def update_stored_configuration(stored: Mapping[str, Any]) -> dict[str, Any]:
     """Configuration of a stored campaign in the current names, without a warning."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RenamedWarning)
+        warnings.simplefilter("ignore", DeprecatedNameWarning)
         stored = {current_key(key, CampaignConfiguration.model_fields): value for key, value in stored.items()}
         try:
             selected = scenario(str(stored.get("scenario")))
@@ -365,7 +365,7 @@ def find_renamed_columns(names: Iterable[str], scenario_name: str) -> dict[str, 
     """Stored columns with a former name, each with its current name; without a warning."""
     column = _column_names(scenario_name)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RenamedWarning)
+        warnings.simplefilter("ignore", DeprecatedNameWarning)
         return {name: current for name in names if (current := column(name)) != name}
 
 

@@ -161,9 +161,9 @@ _format_default = warnings.formatwarning
 def _format_warning(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
 ) -> str:
-    from marsyard.sim.parameters import RenamedWarning
+    from marsyard.sim.parameters import DeprecatedNameWarning
 
-    if issubclass(category, RenamedWarning):
+    if issubclass(category, DeprecatedNameWarning):
         return f"warning: {message}\n"
     return _format_default(message, category, filename, lineno, line)
 

@@ -15,7 +15,7 @@ from marsyard.cli.options import BitsOption, JsonOption, MaxHolesOption, SiteArg
 
 if TYPE_CHECKING:
     from marsyard.sim.terrain import Surface
-    from marsyard.sim.terrain.imported import Embedded, RealExtent
+    from marsyard.sim.terrain.imported import EmbeddedDtm, RealExtent
     from marsyard.sim.terrain.parameters import TerrainParameters
     from marsyard.sim.terrain.surface import TerrainStatistics
 from collections.abc import Iterator
@@ -161,7 +161,7 @@ def _range(values: tuple[float, float], digits: int) -> str:
     return f"{low:.{digits}f}" if low == high else f"{low:.{digits}f}-{high:.{digits}f}"
 
 
-def write_terrain_image(path: Path, surface: Surface, real: Embedded | None) -> None:
+def write_terrain_image(path: Path, surface: Surface, real: EmbeddedDtm | None) -> None:
     """Write a shaded nadir image as PNG, grid north up; for a DTM, mark its outline and filled holes.
 
     Raises ValueError if the file exists or cannot be written.

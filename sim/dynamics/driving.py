@@ -27,7 +27,7 @@ from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.dynamics.rover import Ground, RoverParameters, Stance, settle
-from marsyard.sim.frames import compose, turn_matrix
+from marsyard.sim.frames import compose, rotation_matrix
 from marsyard.sim.measurements import DriveCommand
 from marsyard.sim.parameters import Fraction, Parameters, bounded_field
 
@@ -169,7 +169,7 @@ def drive(
     before = start
     for _ in range(count):
         # slope of the ground reduces the path and the turn; then the rover settles at its new position
-        rotation = turn_matrix(before.world_from_rover)
+        rotation = rotation_matrix(before.world_from_rover)
         path = _apply_slip(p, factor, rotation, step_command)
         turn_factor = max(1.0 - factor * (p.turn + p.turn_slope * p.excess_slip(before.tilt_rad)), 0.0)
         turn = turn_factor * step_command.turn_left_rad + wander_rad / count

@@ -27,7 +27,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.dynamics.kernels import suspension
-from marsyard.sim.frames import rigid, turn_matrix
+from marsyard.sim.frames import rigid, rotation_matrix
 from marsyard.sim.parameters import Parameters, bounded_field
 
 Metres = Annotated[float, Field(gt=0.0, le=5.0)]
@@ -216,7 +216,7 @@ class Stance:
 
     @cached_property
     def _yaw_pitch_roll(self) -> tuple[float, float, float]:
-        m = turn_matrix(self.world_from_rover)
+        m = rotation_matrix(self.world_from_rover)
         pitch = np.arctan2(-m[2, 0], np.hypot(m[2, 1], m[2, 2]))
         return float(np.arctan2(m[1, 0], m[0, 0])), float(pitch), float(np.arctan2(m[2, 1], m[2, 2]))
 
@@ -239,7 +239,7 @@ class Stance:
     @property
     def tilt_rad(self) -> float:
         """Angle of the rover's z axis from the vertical."""
-        return float(np.arccos(np.clip(turn_matrix(self.world_from_rover)[2, 2], -1.0, 1.0)))
+        return float(np.arccos(np.clip(rotation_matrix(self.world_from_rover)[2, 2], -1.0, 1.0)))
 
 
 def settle(

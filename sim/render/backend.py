@@ -1,8 +1,8 @@
-"""The OpenGL context, and the depth and triangle numbers of pinhole views that it draws.
+"""OpenGL rendering of pinhole views: depth and triangle numbers.
 
-pyrender makes the context, off-screen, through OSMesa or EGL; its scenes and renderer are not used, as they take longer
-than a small picture does. The platform has to be chosen before pyrender or PyOpenGL is first imported in a process.
-Contexts belong to the process that made them: they survive neither fork nor threads.
+pyrender creates an off-screen context through OSMesa or EGL. Its scene graph and renderer are not used: their overhead
+exceeds the drawing time of a small picture. The platform must be chosen before pyrender or PyOpenGL is first imported.
+A context can be used only in the process and thread that created it.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
 Backend = Literal["osmesa", "egl"]
 BACKENDS: tuple[Backend, ...] = ("osmesa", "egl")
-#: Environment variable that names the backend where a campaign does not.
+#: Environment variable for the backend, used if the campaign does not define it.
 BACKEND_VARIABLE = "MARSYARD_GL"
 
 
 class RenderingError(RuntimeError):
-    """OpenGL cannot draw here; the message states the cause and a remedy."""
+    """Rendering failed; the message contains the cause."""
 
 
 #: The library that each backend loads.
@@ -35,9 +35,9 @@ _LIBRARIES: dict[Backend, str] = {"osmesa": "OSMesa", "egl": "EGL"}
 
 
 def default_backend() -> Backend:
-    """Return the backend of the variable ``MARSYARD_GL``; by default OSMesa, or EGL if only it is installed.
+    """Return the backend of the variable ``MARSYARD_GL``; by default OSMesa, or EGL if OSMesa is not installed.
 
-    Recent Mesa no longer has OSMesa, so new distributions lack it.
+    Recent versions of Mesa no longer contain OSMesa.
     """
     name = os.environ.get(BACKEND_VARIABLE, "").lower()
     if not name:
@@ -51,7 +51,7 @@ def default_backend() -> Backend:
 #: OpenGL's camera looks along -z with y up.
 _VIEW_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
-#: Passes the triangle's number from its vertices to its samples.
+#: Passes the triangle's number from its vertices to its fragments.
 _VERTEX_SHADER = """#version 330 core
 layout(location = 0) in vec3 position;
 layout(location = 1) in vec4 number;
@@ -60,7 +60,7 @@ uniform mat4 projection;
 flat out vec4 encoded;
 void main()
 {
-    // mat4() keeps the compiler from projecting the viewed corner instead, which rounds otherwise
+    // mat4() prevents the compiler from reordering the products, which would change the rounding
     gl_Position = mat4(projection * view) * vec4(position, 1.0);
     encoded = number;
 }
@@ -74,20 +74,20 @@ void main()
 }
 """
 _POSITION, _NUMBER = 0, 1
-#: Numbers are encoded in the 24 bits of a colour, least significant first; the other bits are opacity.
+#: Numbers are encoded in the 24 bits of a colour, least significant byte first; the other bits are opacity.
 _NUMBER_BITS, _OPAQUE = 0xFFFFFF, 0xFF000000
 
 
 class DepthRenderer:
-    """Draws depth and triangle numbers of a scene, one sample at the centre of each pixel.
+    """Renderer of a scene's depth and triangle numbers, with one sample at the centre of each pixel.
 
-    `side_px`, width and height of the picture, is fixed: resizing costs more than drawing. Raises RenderingError where
-    no context can be created.
+    `side_px` is the width and height of the picture. It is fixed, because resizing takes longer than drawing. Raises
+    RenderingError if no context can be created.
     """
 
     def __init__(self, side_px: int, backend: Backend) -> None:
         if not __debug__:
-            raise RenderingError("pyrender makes OpenGL calls inside assert statements: run Python without -O")
+            raise RenderingError("pyrender calls OpenGL inside assert statements: run Python without -O")
         current = os.environ.get("PYOPENGL_PLATFORM")
         if "OpenGL" in sys.modules and current != backend:
             raise RenderingError(
@@ -96,8 +96,8 @@ class DepthRenderer:
             )
         os.environ["PYOPENGL_PLATFORM"] = backend
         self.side_px = side_px
-        self._ground_corners: int | None = None
-        self._object_corners = 0
+        self._ground_vertex_count: int | None = None
+        self._object_vertex_count = 0
         try:
             import pyrender  # noqa: F401
         # PyOpenGL raises AttributeError for the functions of a missing library
@@ -150,11 +150,11 @@ class DepthRenderer:
         GL.glBindBuffer(GL.GL_ARRAY_BUFFER, self._numbers)
         GL.glVertexAttribPointer(_NUMBER, 4, GL.GL_UNSIGNED_BYTE, True, 0, None)
         GL.glEnableVertexAttribArray(_NUMBER)
-        # the ground's corners have no numbers of their own
+        # the ground's vertices have the number 0
         GL.glVertexAttrib4f(_NUMBER, 0.0, 0.0, 0.0, 1.0)
         if self._platform.supports_framebuffers():
-            # the context has no picture of its own; one sample a pixel, at its centre: with several, drivers that
-            # honour multisampling (EGL) return an off-centre depth
+            # the context has no default framebuffer; one sample per pixel, as drivers with multisampling (EGL) return
+            # the depth at an off-centre sample
             GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, GL.glGenFramebuffers(1))
             formats = {GL.GL_COLOR_ATTACHMENT0: GL.GL_RGBA8, GL.GL_DEPTH_ATTACHMENT: GL.GL_DEPTH_COMPONENT24}
             for attachment, format_ in formats.items():
@@ -175,36 +175,37 @@ class DepthRenderer:
         triangles: Float64[np.ndarray, "triangles 3 3"],
         numbers: Int64[np.ndarray, "triangles"],
     ) -> None:
-        """Load the ground, and numbered triangles on it, in world coordinates; they replace those loaded before."""
+        """Load the ground and the numbered triangles of objects, in world coordinates; they replace previous data."""
         gl = self._gl
         self._platform.make_current()
         gl.glBindVertexArray(self._ground_array)
         vertices, faces = ground.vertices.view(np.ndarray), ground.faces.view(np.ndarray)
-        contents = [
+        uploads = [
             (gl.GL_ARRAY_BUFFER, self._vertices, vertices.astype(np.float32)),
             (gl.GL_ELEMENT_ARRAY_BUFFER, self._faces, faces.astype(np.uint32)),
         ]
-        if len(triangles) or self._object_corners:
+        if len(triangles) or self._object_vertex_count:
             encoded = np.repeat((numbers + 1).astype(np.uint32) | np.uint32(_OPAQUE), 3)
-            contents.append((gl.GL_ARRAY_BUFFER, self._triangles, triangles.astype(np.float32)))
-            contents.append((gl.GL_ARRAY_BUFFER, self._numbers, encoded))
-        for kind, buffer, values in contents:
+            uploads.append((gl.GL_ARRAY_BUFFER, self._triangles, triangles.astype(np.float32)))
+            uploads.append((gl.GL_ARRAY_BUFFER, self._numbers, encoded))
+        for kind, buffer, values in uploads:
             gl.glBindBuffer(kind, buffer)
             gl.glBufferData(kind, values.nbytes, np.ascontiguousarray(values), gl.GL_STREAM_DRAW)
-        self._ground_corners, self._object_corners = faces.size, 3 * len(triangles)
+        self._ground_vertex_count, self._object_vertex_count = faces.size, 3 * len(triangles)
 
     def draw(
         self, world_from_view: Float[np.ndarray, "4 4"], focal_px: float, near_m: float, far_m: float
     ) -> tuple[Float32[np.ndarray, "side side"], Int32[np.ndarray, "_ _"]]:
-        """Draw depth along a view's axis, metres, 0 for nothing, and triangle numbers plus one, 0 for the ground.
+        """Draw the depth along a view's axis, metres, 0 where no surface is visible, and triangle numbers.
 
-        The numbers are an empty array where only ground is loaded. Row 0 is the top of the view.
+        The numbers start at 1 for the first triangle; 0 is the ground. The array is empty if only ground is loaded. Row
+        0 is the top of the view.
 
         - world_from_view: pose; the view's axes are x right, y down, z forward, its origin the centre of projection
         - focal_px: focal length in samples of the depth picture; the principal point is the picture's centre
         - near_m, far_m: depths of the clipping planes
         """
-        if self._ground_corners is None:
+        if self._ground_vertex_count is None:
             raise RenderingError("no mesh has been loaded")
         gl, side, near, far = self._gl, self.side_px, near_m, far_m
         self._platform.make_current()
@@ -216,15 +217,15 @@ class DepthRenderer:
         for uniform, matrix in ((self._view, view_from_world), (self._projection, projection)):
             gl.glUniformMatrix4fv(uniform, 1, True, matrix.astype(np.float32))
         gl.glBindVertexArray(self._ground_array)
-        gl.glDrawElements(gl.GL_TRIANGLES, self._ground_corners, gl.GL_UNSIGNED_INT, None)
-        if self._object_corners:
+        gl.glDrawElements(gl.GL_TRIANGLES, self._ground_vertex_count, gl.GL_UNSIGNED_INT, None)
+        if self._object_vertex_count:
             gl.glBindVertexArray(self._objects_array)
-            gl.glDrawArrays(gl.GL_TRIANGLES, 0, self._object_corners)
-        # OpenGL's depths, from 0 to 1, and colours, red in the least significant byte: the lowest row first
+            gl.glDrawArrays(gl.GL_TRIANGLES, 0, self._object_vertex_count)
+        # OpenGL returns the lowest row first: depths from 0 to 1, and colours with red in the least significant byte
         depths = np.empty((side, side), np.float32)
         gl.glReadPixels(0, 0, side, side, gl.GL_DEPTH_COMPONENT, gl.GL_FLOAT, depths)
         depth = depth_in_metres(depths, float(near), float(far))
-        if self._object_corners == 0:
+        if self._object_vertex_count == 0:
             return depth, np.zeros((0, 0), dtype=np.int32)
         colours = np.empty((side, side, 4), np.uint8)
         gl.glReadPixels(0, 0, side, side, gl.GL_RGBA, gl.GL_UNSIGNED_BYTE, colours)
@@ -237,6 +238,6 @@ class DepthRenderer:
         return " / ".join(self._gl.glGetString(name).decode() for name in (self._gl.GL_RENDERER, self._gl.GL_VERSION))
 
     def close(self) -> None:
-        """Release the context and its buffers."""
+        """Delete the context and its buffers."""
         self._platform.make_current()
         self._platform.delete_context()

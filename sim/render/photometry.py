@@ -21,7 +21,7 @@ SUN_RADIUS_AT_MARS_RAD = 0.00305
 
 @dataclass(frozen=True)
 class Sun:
-    """Direct sunlight: unit vector towards the sun in world axes, and half the angle that its disc subtends."""
+    """Direct sunlight: unit vector towards the sun in world axes, and angular radius of its disc."""
 
     direction: Float[np.ndarray, "3"]
     angular_radius_rad: float = SUN_RADIUS_AT_MARS_RAD
@@ -30,23 +30,23 @@ class Sun:
         if abs(float(np.linalg.norm(self.direction)) - 1.0) > 1e-9:
             raise ValueError(f"the sun's direction {self.direction} is not a unit vector")
         if not self.angular_radius_rad > 0.0:
-            raise ValueError(f"the sun's angular radius is {self.angular_radius_rad} rad; more than 0 is needed")
+            raise ValueError(f"the sun's angular radius is {self.angular_radius_rad} rad; it must be greater than 0")
 
 
 @dataclass(frozen=True)
 class DustySky:
-    """A sky that is brighter towards the sun and the horizon, for cameras that see it, with the sun's disc.
+    """A sky that is brighter towards the sun and the horizon, with the sun's disc, for pixels that show the sky.
 
-    Light scattered once in a plane layer of air (Chandrasekhar 1960, section 7), over the sun's at the ground::
+    Radiance by single scattering in a plane layer of air (Chandrasekhar 1960, section 7), relative to direct sunlight
+    at the ground::
 
         I/F = (w tau / 4 t) P(g) mu0 / (mu0 - mu) (1 - exp(t / mu0 - t / mu))
 
     with the Henyey-Greenstein phase function P, optical depth tau, single-scattering albedo w, mean cosine g of the
-    scattering angle, and the sines of elevation mu of the view and mu0 of the sun. Light is weakened on its way by
-    ``t = (1 - w g**2) tau``: the forward peak, a fraction g**2 of the scattered light, counts as direct sun (Joseph et
-    al. 1976). Multiply scattered light is spread evenly, so that all light except that peak gives level ground the
-    irradiance `Photometry.sky_share`; where single scattering exceeds that, it is scaled down to it. The ground is lit
-    as by an even sky.
+    scattering angle, and the sines of elevation mu of the view and mu0 of the sun. The extinction depth is
+    ``t = (1 - w g**2) tau``: the forward peak, a fraction g**2 of the scattered light, is part of the direct sunlight
+    (Joseph et al. 1976). Multiple scattering adds a uniform radiance, so that the irradiance of level ground without
+    the peak is `Photometry.sky_share`. If single scattering exceeds this irradiance, it is scaled down.
     """
 
     optical_depth: float
@@ -64,33 +64,34 @@ class DustySky:
             )
 
     def coefficients(self, sun_z: float, sky_share: float) -> tuple[float, float, float, float]:
-        """Coefficients of `sky_brightness`: even radiance; factor, depth and asymmetry of single scattering."""
+        """Coefficients of `sky_brightness`: uniform radiance; factor, depth and asymmetry of single scattering."""
         depth = (1.0 - self.single_scattering_albedo * self.asymmetry**2) * self.optical_depth
         scale = self.single_scattering_albedo * self.optical_depth / (4.0 * depth)
         without_peak = 1.0 - self.asymmetry**2
-        once = without_peak * scale * _scattered_irradiance(sun_z, depth, self.asymmetry)
-        return max(sky_share - once, 0.0), scale * min(sky_share / once, 1.0), depth, self.asymmetry
+        single = without_peak * scale * _scattered_irradiance(sun_z, depth, self.asymmetry)
+        return max(sky_share - single, 0.0), scale * min(sky_share / single, 1.0), depth, self.asymmetry
 
 
 @dataclass(frozen=True)
 class Photometry:
-    """A Lunar-Lambert surface with an opposition surge, under direct sun, an even sky and light from the ground around.
+    """A Lunar-Lambert surface with an opposition surge, under direct sunlight, a uniform sky and light from the ground.
 
-    Radiance factor (I/F) of ground of albedo A under incidence i, emission e, phase angle g::
+    Radiance factor (I/F) of ground with albedo A, incidence angle i, emission angle e and phase angle g::
 
         I/F = A K S(g) [2 L cos i / (cos i + cos e) + (1 - L) cos i] + A D (1 + n_z) / 2 + A B (1 - n_z) / 2
         S(g) = 1 + B0 / (1 + tan(g / 2) / h)
 
-    The Lunar-Lambert law is that of McEwen (1991); the surge has the form of Hapke's shadow-hiding term (1986). K makes
-    A the spherical albedo of the law: the fraction of isotropic light that a surface reflects. The law is reciprocal.
+    The Lunar-Lambert law is from McEwen (1991); the surge has the form of Hapke's shadow-hiding term (1986). K
+    normalises the law so that A is its spherical albedo, the reflected fraction of isotropic light. The law is
+    reciprocal.
 
     - lunar_fraction: L, between 0 (Lambert) and 1 (Lommel-Seeliger). About 0.55 for Mars at small phase (McEwen 1991)
     - surge_amplitude, surge_width: B0 and h
-    - sky_share: D, diffuse irradiance from the sky over the direct sun's on a plane facing it
-    - sky_radiance: radiance factor of an even sky in pixels without ground
-    - sky: replaces the even sky there
-    - surrounding_albedo: albedo of the ground that scatters light onto slopes and into shadows: B is this times the
-      irradiance of level ground
+    - sky_share: D, diffuse irradiance from the sky divided by that of direct sunlight on a plane facing the sun
+    - sky_radiance: radiance factor of a uniform sky in pixels without ground
+    - sky: model that replaces the uniform sky in these pixels
+    - surrounding_albedo: albedo of the ground that scatters light onto slopes and into shadows; B is this albedo times
+      the irradiance of level ground
     """
 
     lunar_fraction: float = 0.55
@@ -106,10 +107,10 @@ class Photometry:
         return 1.0 / _spherical_albedo(self.lunar_fraction, self.surge_amplitude, self.surge_width)
 
     def law(self, sun: Sun, caster_diameter_m: float) -> Float64[np.ndarray, "8"]:
-        """Coefficients of the reflectance kernel, in its order."""
-        bounced = self.surrounding_albedo * (max(float(sun.direction[2]), 0.0) + self.sky_share)
+        """Coefficients of the reflectance kernel (`marsyard.sim.render.kernels.structs.Light`)."""
+        ground_light = self.surrounding_albedo * (max(float(sun.direction[2]), 0.0) + self.sky_share)
         law = (self.lunar_fraction, self.surge_amplitude, self.surge_width, self.normalisation())
-        return np.array([*law, self.sky_share, bounced, caster_diameter_m, sun.angular_radius_rad])
+        return np.array([*law, self.sky_share, ground_light, caster_diameter_m, sun.angular_radius_rad])
 
     def sky_coefficients(self, sun: Sun) -> Float64[np.ndarray, "4"]:
         """Coefficients of the sky kernel."""
@@ -120,7 +121,7 @@ class Photometry:
 
 @dataclass(frozen=True)
 class Texture:
-    """Albedo finer than the terrain's samples: octaves of three-dimensional noise, evaluated per pixel.
+    """Albedo variation finer than the terrain's samples: octaves of three-dimensional noise, evaluated per pixel.
 
     - coarsest_m: size of the coarsest octave's cells; each further octave is half as large
     - amplitudes: amplitude of each octave in the natural logarithm of albedo, coarsest first
@@ -141,8 +142,8 @@ _scattered_irradiance = cache(scattered_irradiance)
 def _spherical_albedo(lunar_fraction: float, surge_amplitude: float, surge_width: float) -> float:
     """Spherical albedo of the law with A = K = 1, by Gauss-Legendre quadrature over incidence, emission and azimuth.
 
-    ``2 int_0^1 [(1 / pi) int I/F cos e dOmega_e / cos i] cos i d(cos i)``. The substitution phi = pi s^3 samples the
-    surge's narrow peak densely.
+    ``2 int_0^1 [(1 / pi) int I/F cos e dOmega_e / cos i] cos i d(cos i)``. The substitution phi = pi s^3 gives dense
+    nodes at the surge's narrow peak.
     """
     nodes, weights = np.polynomial.legendre.leggauss(96)
     mu, mu_weights = 0.5 * (nodes + 1.0), 0.5 * weights
@@ -157,9 +158,9 @@ def _spherical_albedo(lunar_fraction: float, surge_amplitude: float, surge_width
     return float(2.0 * np.sum(flux * mu_weights))
 
 
-#: Cells along each side of the periodic layer, and its period in mean sizes of a cloud.
+#: Cells along each side of the periodic layer, and its period divided by the mean cloud size.
 CELLS, PERIOD_SIZES = 1024, 32.0
-#: Relative lengths and variances of the field's octaves; the finer ones make the clouds' outlines ragged.
+#: Relative lengths and variances of the field's octaves; the fine octaves give the clouds irregular outlines.
 OCTAVES = ((1.0, 1.0), (0.5, 1.0 / 16.0), (0.25, 1.0 / 256.0))
 
 
@@ -169,45 +170,43 @@ class CloudParameters(Parameters):
     base_m: Annotated[float, Field(gt=0.0, le=20000.0, description="height of the layer above the ground, m")] = 2500.0
     cover: Annotated[float, Field(ge=0.0, le=0.9, description="fraction of the ground in the clouds' shadows")] = 0.3
     size_m: Annotated[
-        float, Field(ge=50.0, le=10000.0, description="mean length of a straight line's passage through a cloud, m")
+        float, Field(ge=50.0, le=10000.0, description="mean chord length of a cloud along a horizontal line, m")
     ] = 800.0
     edge_m: Annotated[
-        float, Field(ge=0.0, le=1000.0, description="RMS width of a shadow's edge, the sun's disc included, m")
+        float, Field(ge=0.0, le=1000.0, description="RMS width of a shadow's edge, including the penumbra, m")
     ] = 40.0
     optical_depth: Annotated[float, Field(ge=0.0, le=100.0, description="vertical optical depth of a cloud")] = 10.0
-    asymmetry: Annotated[
-        float, Field(ge=0.0, lt=1.0, description="mean cosine of the angle by which a droplet scatters light")
-    ] = 0.85
+    asymmetry: Annotated[float, Field(ge=0.0, lt=1.0, description="mean cosine of the scattering angle")] = 0.85
     wind_east_m_s: Annotated[float, Field(ge=-100.0, le=100.0, description="drift to the east, m/s")] = 6.0
     wind_north_m_s: Annotated[float, Field(ge=-100.0, le=100.0, description="drift to the north, m/s")] = 3.0
 
     def direct_transmittance(self, sun: Sun) -> float:
-        """Fraction of the direct sun that passes a cloud: ``exp(-tau / sin elevation)``; 0 for a sun that is down."""
+        """Fraction of direct sunlight behind a cloud: ``exp(-tau / sin elevation)``; 0 for a sun below the horizon."""
         up = float(sun.direction[2])
         return float(np.exp(-self.optical_depth / up)) if up > 0.0 else 0.0
 
     def sky_light(self, sun: Sun) -> float:
-        """Irradiance that the clouds scatter down, over the direct sun's on a plane facing it.
+        """Irradiance scattered down by the clouds, divided by that of direct sunlight on a plane facing the sun.
 
-        A cloud that absorbs nothing lets ``2 / (2 + (1 - g) tau)`` of the light through (two streams; Bohren, Am. J.
-        Phys. 55, 1987), of which `direct_transmittance` keeps its direction. The rest is spread evenly over the ground:
-        the clouds are about as high as they are wide apart.
+        The transmittance of a cloud without absorption is ``2 / (2 + (1 - g) tau)`` (two-stream approximation; Bohren,
+        Am. J. Phys. 55, 1987). The part `direct_transmittance` is not scattered. The scattered light is assumed uniform
+        over the ground, as the height of the clouds is similar to their distances.
         """
-        passed = 2.0 / (2.0 + (1.0 - self.asymmetry) * self.optical_depth)
-        scattered = max(passed - self.direct_transmittance(sun), 0.0)
+        transmittance = 2.0 / (2.0 + (1.0 - self.asymmetry) * self.optical_depth)
+        scattered = max(transmittance - self.direct_transmittance(sun), 0.0)
         return self.cover * scattered * max(float(sun.direction[2]), 0.0)
 
 
 @dataclass(frozen=True)
 class CloudLayer:
-    """One realisation of the clouds: a thin, periodic layer that keeps its shape and drifts with the wind.
+    """One realisation of the clouds: a thin, periodic layer of constant shape that drifts with the wind.
 
-    The layer dims the direct sun where the line from a point to the sun passes a cloud; skylight remains and grows by
-    the light that all clouds scatter down. The clouds themselves are not drawn: pictures from above the layer, or of
-    the sky, lack them. The layer has no thickness, so a low sun meets no more cover than a high one.
+    A cloud between a point and the sun attenuates direct sunlight. Skylight increases by the light that all clouds
+    scatter down. The clouds are not visible in pictures from above the layer or of the sky. The layer has no thickness,
+    so the cover does not depend on the sun's elevation.
 
-    - height_m: height of the layer above the world's datum
-    - cover: fraction of the light's path through cloud, read-only: y grows with the row, one cell every `cell_m`
+    - height_m: height of the layer above z = 0
+    - cover: cloud fraction of each cell, read-only; y increases with the row, and cells are `cell_m` apart
     """
 
     parameters: CloudParameters
@@ -216,38 +215,39 @@ class CloudLayer:
 
     @classmethod
     def draw(cls, parameters: CloudParameters, rng: np.random.Generator, *, ground_m: float = 0.0) -> CloudLayer:
-        """Draw a layer over ground of this mean height.
+        """Generate a random layer above ground of this mean height.
 
-        A Gaussian field of three octaves is cut at the level that leaves `cover` above it. Lines through it meet
-        cloud ``sqrt(m2) exp(-u**2 / 2) / 2 pi`` times a metre (Rice 1944), m2 the mean square of its slope along the
-        line and u the cut, both in standard deviations: that sets the octaves' length so that the mean passage is
-        `size_m`. The edge is softened by a Gaussian, which keeps the mean cover.
+        Clouds are the regions where a Gaussian random field with three octaves exceeds a threshold; the threshold is
+        set by `cover`. The number of clouds per metre along a line is ``sqrt(m2) exp(-u**2 / 2) / 2 pi`` (Rice 1944)
+        with the threshold u and the mean square slope m2 of the field, both for a standard deviation of 1. This
+        determines the length of the octaves for the mean chord `size_m`. A Gaussian filter smooths the edges.
         """
         noise = np.fft.rfft2(rng.standard_normal((CELLS, CELLS)))
         if parameters.cover == 0.0:
-            return cls(parameters, ground_m + parameters.base_m, _frozen(np.zeros((CELLS, CELLS))))
+            return cls(parameters, ground_m + parameters.base_m, _read_only(np.zeros((CELLS, CELLS))))
         # squared wave numbers of the real transform's terms, rad2/m2
         spacing = parameters.size_m * PERIOD_SIZES / CELLS
         y, x = 2.0 * np.pi * np.fft.fftfreq(CELLS, spacing), 2.0 * np.pi * np.fft.rfftfreq(CELLS, spacing)
         wave = y[:, None] ** 2 + x**2
-        cut = float(ndtri(1.0 - parameters.cover))
+        threshold = float(ndtri(1.0 - parameters.cover))
         total = sum(variance for _, variance in OCTAVES)
-        bend = sum(variance / (2.0 * length**2) for length, variance in OCTAVES) / total
-        length = parameters.size_m * np.sqrt(bend) * np.exp(-0.5 * cut**2) / (2.0 * np.pi * parameters.cover)
+        mean_square_slope = sum(variance / (2.0 * scale**2) for scale, variance in OCTAVES) / total
+        length = parameters.size_m * np.sqrt(mean_square_slope) * np.exp(-0.5 * threshold**2)
+        length /= 2.0 * np.pi * parameters.cover
         power = sum(
-            variance * (part * length) ** 2 * np.exp(-wave * (part * length) ** 2) for part, variance in OCTAVES
+            variance * (scale * length) ** 2 * np.exp(-wave * (scale * length) ** 2) for scale, variance in OCTAVES
         )
         field = np.fft.irfft2(noise * np.sqrt(power), s=(CELLS, CELLS))
         above = field - np.quantile(field, 1.0 - parameters.cover)
-        # a cell that the outline crosses is cloud by about the fraction that lies inside
+        # cloud fraction of a cell at an outline, by linear interpolation
         slope = np.hypot(*(0.5 * (np.roll(above, -1, k) - np.roll(above, 1, k)) for k in (0, 1)))
         inside = np.clip(0.5 + above / np.maximum(slope, 1e-12), 0.0, 1.0)
-        soft = np.fft.irfft2(np.fft.rfft2(inside) * np.exp(-0.5 * wave * parameters.edge_m**2), s=inside.shape)
-        return cls(parameters, ground_m + parameters.base_m, _frozen(np.clip(soft, 0.0, 1.0)))
+        smoothed = np.fft.irfft2(np.fft.rfft2(inside) * np.exp(-0.5 * wave * parameters.edge_m**2), s=inside.shape)
+        return cls(parameters, ground_m + parameters.base_m, _read_only(np.clip(smoothed, 0.0, 1.0)))
 
     @property
     def cell_m(self) -> float:
-        """Distance between cells."""
+        """Distance between cell centres, metres."""
         return self.parameters.size_m * PERIOD_SIZES / CELLS
 
     def coefficients(self, sun: Sun, time_s: float) -> Float64[np.ndarray, "5"]:
@@ -259,26 +259,27 @@ class CloudLayer:
     def transmittance(
         self, points: Float[np.ndarray, "*batch 3"], sun: Sun, time_s: float
     ) -> Float64[np.ndarray, "*batch"]:
-        """Fraction of the direct sun that reaches world points (metres) through the layer; NaN where they are NaN.
+        """Fraction of direct sunlight that reaches world points (metres) through the layer; NaN for NaN points.
 
-        The truth of a picture: ``clouds.transmittance(frame.points_world(), scene.sun, time_s)``.
+        Ground truth of a picture: ``clouds.transmittance(frame.points_world(), scene.sun, time_s)``.
         """
-        _cells, height, east, north, loss = self.coefficients(sun, time_s)
-        towards = np.asarray(sun.direction, dtype=np.float64)
-        up = np.maximum(height - points[..., 2], 0.0) / towards[2]
-        x, y = ((points[..., k] + up * towards[k] - drift) / self.cell_m for k, drift in ((0, east), (1, north)))
+        _cells, height, east, north, opacity = self.coefficients(sun, time_s)
+        direction = np.asarray(sun.direction, dtype=np.float64)
+        distance = np.maximum(height - points[..., 2], 0.0) / direction[2]
+        drifts = ((0, east), (1, north))
+        x, y = ((points[..., k] + distance * direction[k] - drift) / self.cell_m for k, drift in drifts)
         finite = np.isfinite(x) & np.isfinite(y)
         cells = np.where(finite, np.stack([y, x]), 0.0)
         cover = map_coordinates(self.cover.astype(np.float64), cells, order=1, mode="grid-wrap")
-        return np.asarray(np.where(finite, 1.0 - loss * cover, np.nan))
+        return np.asarray(np.where(finite, 1.0 - opacity * cover, np.nan))
 
 
 def no_cover() -> Float32[np.ndarray, "one one"]:
-    """The cover of a scene without clouds, of the same numba type as a layer's."""
-    return _frozen(np.zeros((1, 1)))
+    """Cover of a scene without clouds, with the same numba type as that of a cloud layer."""
+    return _read_only(np.zeros((1, 1)))
 
 
-def _frozen(cover: Float64[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "rows columns"]:
-    kept = np.ascontiguousarray(cover, dtype=np.float32)
-    kept.setflags(write=False)
-    return kept
+def _read_only(cover: Float64[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "rows columns"]:
+    array = np.ascontiguousarray(cover, dtype=np.float32)
+    array.setflags(write=False)
+    return array

@@ -11,32 +11,33 @@ from jaxtyping import Float32, Float64, UInt8
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.frames import turn_matrix
+from marsyard.sim.frames import rotation_matrix
 from marsyard.sim.render.backend import RenderingError
 from marsyard.sim.render.kernels.structs import Rays
 from marsyard.sim.render.kernels.views import max_image_radius, min_component, pixel_angles, sum_of_vectors
 from marsyard.sim.render.scene import Cone
 
-#: Samples along each side of the pinhole views: a camera takes the first that exceeds its own pixels by `_SPARE_PX`,
-#: else the last (full frames of 1024 x 1024 and 45 deg are drawn at about their own resolution).
+#: Sizes of the pinhole views, samples along a side. A camera uses the first that exceeds its image size by at least
+#: `_SPARE_PX`, otherwise the last (about the camera's resolution for 1024 x 1024 pixels and 45 deg).
 VIEW_SIDES_PX = (208, 288, 352, 544, 1088)
 VIEW_SIDE_PX = VIEW_SIDES_PX[-1]
 _SPARE_PX = 16
-#: Margin of samples around the pixels' field in a view.
+#: Margin around the rays' field of view in a pinhole view, in samples.
 MARGIN_PX = 2.0
-#: Largest angle of a view from its axis; a wider field is cut into quarters.
-WIDEST_HALF_ANGLE_RAD = np.radians(52.0)
+#: Maximum angle between a ray and the axis of its view; a wider field of view is divided into quarters.
+MAX_HALF_ANGLE_RAD = np.radians(52.0)
 
 
 @dataclass(frozen=True)
 class PixelRays:
-    """Every pixel's ray in body axes, and the pinhole views that contain them all.
+    """The ray of every pixel in body axes, and the pinhole views that contain all rays.
 
-    - centre: centre of projection in the body frame, metres; for CAHVORE the mean of the moving entrance pupil
+    - centre: centre of projection in the body frame, metres; for CAHVORE the mean position of the entrance pupil
     - origins, directions: rays relative to `centre`; directions are unit vectors
     - size: columns and rows
-    - pixel_angles: angle that each pixel subtends: the square root of its solid angle, radians
+    - pixel_angles: square root of each pixel's solid angle, radians
     - view_side_px: samples along each side of the pinhole views
+    - focal_px: focal length of each view, in samples
     - view_from_body: rotation matrices from body axes to those of each view (x right, y down, z forward)
     - view_of_pixel: number of the view that contains each pixel
     """
@@ -58,24 +59,25 @@ class PixelRays:
 
     @cached_property
     def axis(self) -> Float64[np.ndarray, "3"]:
-        """Unit vector along the mean of all rays, body axes."""
+        """Mean direction of all rays, unit vector in body axes."""
         mean = np.array(sum_of_vectors(self.directions))
         mean /= np.linalg.norm(mean)
         return mean
 
     @cached_property
     def pixel_rad(self) -> float:
-        """Median of the angles that pixels subtend."""
+        """Median pixel angle, radians."""
         return float(np.median(self.pixel_angles))
 
     @cached_property
     def half_angle_rad(self) -> float:
-        """Largest angle of a ray from the axis."""
+        """Maximum angle between a ray and the axis."""
         return float(np.arccos(np.clip(min_component(self.directions, self.axis), -1.0, 1.0)))
 
     def cone(self, world_from_body: RigidTransform) -> Cone:
         """The cone that contains all rays of a camera in this pose."""
-        return world_from_body.apply(self.centre.copy()), turn_matrix(world_from_body) @ self.axis, self.half_angle_rad
+        axis = rotation_matrix(world_from_body) @ self.axis
+        return world_from_body.apply(self.centre.copy()), axis, self.half_angle_rad
 
     @classmethod
     def of(cls, camera: CameraModel) -> PixelRays:
@@ -84,24 +86,24 @@ class PixelRays:
         starts, directions = camera.rays(camera.pixel_grid())
         if not np.isfinite(directions).all():
             raise RenderingError("the camera model has pixels without a ray")
-        side = next((one for one in VIEW_SIDES_PX if max(columns, rows) <= one - _SPARE_PX), VIEW_SIDE_PX)
+        side = next((size for size in VIEW_SIDES_PX if max(columns, rows) <= size - _SPARE_PX), VIEW_SIDE_PX)
         view_of_pixel = np.zeros((rows, columns), dtype=np.uint8)
         axes: list[Float64[np.ndarray, "3 3"]] = []
         focal: list[float] = []
-        # the picture is cut into quarters until each part fits a view
+        # the picture is divided into quarters until each part fits in a view
         pending = [(slice(0, rows), slice(0, columns))]
         while pending:
             part = pending.pop(0)
             part_axes = _view_axes(directions[part])
-            if (directions[part] @ part_axes[2]).min() >= np.cos(WIDEST_HALF_ANGLE_RAD):
+            if (directions[part] @ part_axes[2]).min() >= np.cos(MAX_HALF_ANGLE_RAD):
                 view_of_pixel[part] = len(axes)
                 axes.append(part_axes)
-                # the focal length at which these rays just fill the view
+                # focal length with which these rays fill the view
                 focal.append(float((side / 2.0 - MARGIN_PX) / max_image_radius(directions[part], part_axes)))
                 continue
             (top, bottom), (left, right) = ((extent.start, extent.stop) for extent in part)
             if bottom - top < 4 or right - left < 4:
-                raise RenderingError("neighbouring pixels of the camera look in wholly different directions")
+                raise RenderingError("the rays of neighbouring pixels have very different directions")
             row, column = (top + bottom) // 2, (left + right) // 2
             quarters = product((slice(top, row), slice(row, bottom)), (slice(left, column), slice(column, right)))
             pending += list(quarters)
@@ -124,7 +126,7 @@ class PixelRays:
 
 
 def _view_axes(directions: Float64[np.ndarray, "rows columns 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Right, down and forward, one row each in body axes, of a view along the mean direction of these rays."""
+    """Axes of a view along the mean direction of these rays: rows are right, down and forward, in body axes."""
     corners = directions[[0, 0, -1, -1], [0, -1, 0, -1]]
     forward = corners.mean(axis=0) + directions[directions.shape[0] // 2, directions.shape[1] // 2]
     forward /= np.linalg.norm(forward)

@@ -1,12 +1,13 @@
 """Radiance and truth of a scene through an exact camera model.
 
-OpenGL draws pinhole views that contain the camera's field: the depth of the ground, and the numbers of the triangles
-before it. They give each pixel's own ray, from the exact camera model, a first guess. The ray is then brought onto the
-terrain by Newton's method or onto its triangle by intersection, and shaded there: distortion is exact.
+OpenGL draws pinhole views that contain the camera's field of view: the depth of the ground, and the numbers of the
+object triangles in front of it. They are a first guess for each pixel's ray, which comes from the exact camera model.
+The intersection of the ray with the terrain is then solved by Newton's method, or its intersection with the triangle is
+computed. The surface is shaded at this point. The camera's distortion is therefore exact.
 
-One ray per pixel draws outlines ragged. Pixels at edges of objects, of ground before other ground or the sky, and of
-shadows are therefore traced again by several rays; their radiance is the mean. Range, body and normal remain those of
-the ray through the pixel's centre.
+One ray per pixel causes aliasing at edges of objects, terrain occlusions, the horizon and shadows. These pixels are
+traced again by several rays, and their radiance is the mean. Range, body and normal remain those of the ray through the
+pixel's centre.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.sim.frames import turn_matrix
+from marsyard.sim.frames import rotation_matrix
 from marsyard.sim.render.backend import Backend, DepthRenderer, RenderingError
 from marsyard.sim.render.kernels.edges import mark_edges, split_rays, trace_subpixel_rays
 from marsyard.sim.render.kernels.primary import GRAZING, trace_primary_rays
@@ -40,22 +41,22 @@ from marsyard.sim.terrain import Surface
 if TYPE_CHECKING:
     import trimesh
 
-#: Number of levels that kernels take: they are compiled for one number of arrays, which takes a minute. Terrains of
-#: 2**15 samples along a side have as many.
+#: Number of terrain levels in a kernel call: kernels are compiled for a fixed number of arrays. A terrain with 2**15
+#: samples along a side has 12 levels.
 LEVELS = 12
-#: Replaces the ceilings of a surface that are not worth their time: no ray is known to be clear.
+#: Infinite height bound, which disables block skipping where it does not save time.
 NO_CEILING = np.full((1, 1), np.inf, dtype=np.float32)
-#: Pixels below which starting threads costs more than they save.
+#: Minimum number of pixels for multithreading.
 MIN_PIXELS = 20_000
-#: Options of glibc's mallopt (malloc.h): size from which memory is mapped separately, and size of the free end of the
-#: heap from which it is returned to the system.
+#: Options of glibc's mallopt (malloc.h).
 _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
-#: Terrains are larger than this and mapped, pictures smaller.
-_MAPPED_FROM_BYTES = 32 << 20
-_KEPT_BYTES = 1 << 30
-#: Scenes after which freed memory is returned to the system; after every scene it would take a tenth of a rover's run.
-_SCENES_KEPT = 16
-#: Rays along each side of a picture by which the visible ground is bounded.
+#: Size from which memory is mapped separately: terrains are larger, pictures are smaller.
+_MMAP_THRESHOLD_BYTES = 32 << 20
+#: Size of the free end of the heap from which it is returned to the system.
+_TRIM_THRESHOLD_BYTES = 1 << 30
+#: Number of scenes between returns of freed memory; a return after each scene takes 10 % of a rover case's time.
+_TRIM_INTERVAL_SCENES = 16
+#: Rays along each side of a picture that determine the visible ground.
 _PROBES = 9
 
 
@@ -64,14 +65,14 @@ def edge_pixels(
     distance: Float64[np.ndarray, "rows columns"],
     body: Int32[np.ndarray, "rows columns"],
 ) -> Int64[np.ndarray, "pixels"]:
-    """Numbers, row by row, of the pixels on both sides of visible edges."""
-    marked = np.zeros(radiance.shape, dtype=np.bool_)
-    mark_edges(radiance, distance, body, marked)
-    return np.flatnonzero(marked)
+    """Flat indices of the pixels on both sides of visible edges."""
+    is_edge = np.zeros(radiance.shape, dtype=np.bool_)
+    mark_edges(radiance, distance, body, is_edge)
+    return np.flatnonzero(is_edge)
 
 
-def rays_within(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side: int) -> Rays:
-    """Spread `side` x `side` rays over each of some pixels; each takes the pixel angle of its pixel."""
+def supersample_rays(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side: int) -> Rays:
+    """Compute `side` x `side` rays in each of these pixels, with the pixel angle of the pixel."""
     columns, rows = rays.size
     count = len(pixels) * side**2
     origins, directions = np.empty((count, 3), dtype=np.float32), np.empty((count, 3), dtype=np.float32)
@@ -82,7 +83,7 @@ def rays_within(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side: int)
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture without detector, and its truth.
+    """A picture before the detector model, and its ground truth.
 
     - radiance: radiance factor (I/F)
     - range_m: distance along each pixel's ray from its origin, infinite for the sky
@@ -105,19 +106,19 @@ class Frame:
             vectors.reshape(*self.range_m.shape, 3)[::step_px, ::step_px].reshape(-1, 3)
             for vectors in (self.rays.origins, self.rays.directions)
         )
-        along = np.where(np.isfinite(distance), distance, np.nan).reshape(-1, 1)
-        points_body = self.rays.centre + origins + along * directions.astype(np.float64)
+        finite_distance = np.where(np.isfinite(distance), distance, np.nan).reshape(-1, 1)
+        points_body = self.rays.centre + origins + finite_distance * directions.astype(np.float64)
         return np.asarray(self.world_from_body.apply(points_body)).reshape(*distance.shape, 3)
 
 
 class Renderer:
-    """Renders scenes through cameras. One per process, created inside the worker that uses it."""
+    """Renderer of scenes through cameras. Create one per process, in the process that uses it."""
 
     def __init__(self, backend: Backend) -> None:
         self._backend = backend
         self._views: dict[int, DepthRenderer] = {}
-        self._last: Scene | None = None
-        self._scenes = 0
+        self._last_scene: Scene | None = None
+        self._scene_count = 0
         keep_freed_memory()
 
     def description(self) -> str:
@@ -125,11 +126,11 @@ class Renderer:
         return self._view_renderer(VIEW_SIDE_PX).description()
 
     def render(self, scene: Scene, rays: PixelRays, world_from_body: RigidTransform, time_s: float = 0.0) -> Frame:
-        """Render the scene through a camera in the body frame, its clouds drifted to their positions at this time.
+        """Render the scene through a camera in the body frame, with the clouds at their positions at this time.
 
-        Raises RenderingError where the camera is at or below the ground.
+        Raises RenderingError if the camera is at or below the ground.
         """
-        pose = Pose(turn_matrix(world_from_body), world_from_body.apply(rays.centre))
+        pose = Pose(rotation_matrix(world_from_body), world_from_body.apply(rays.centre))
         clearance = pose.position[2] - float(scene.surface.height(pose.position[0], pose.position[1]))
         if clearance <= 0.0:
             raise RenderingError(f"the camera is {-clearance:.2f} m below the ground at {pose.position}")
@@ -140,29 +141,30 @@ class Renderer:
         ground = ground_struct(scene.surface, scene.extent_m, ceilings=grazing)
         hits, light, tree = _empty_hits(rows * columns, scene), scene.light(time_s), scene.objects.hierarchy
 
-        def trace(part: slice) -> None:
-            some = views._replace(view_of_pixel=rays.view_of_pixel[part])
-            trace_primary_rays(ground, some, pose, Rays(*_part(rays.rays, part)), tree, Hits(*_part(hits, part)))
+        def trace_part(part: slice) -> None:
+            part_views = views._replace(view_of_pixel=rays.view_of_pixel[part])
+            part_rays, part_hits = Rays(*_slice_arrays(rays.rays, part)), Hits(*_slice_arrays(hits, part))
+            trace_primary_rays(ground, part_views, pose, part_rays, tree, part_hits)
 
-        run_in_parts(trace, rows * columns)
+        run_in_parts(trace_part, rows * columns)
         picture = _shade(scene, ground, pose, rays.rays, hits, light)
         radiance, body = picture.radiance.reshape(rows, columns), picture.body.reshape(rows, columns)
         range_m, normal = hits.distance.reshape(rows, columns), picture.normal.reshape(rows, columns, 3)
         if scene.edge_rays > 1:
             pixels = edge_pixels(radiance, range_m, body)
-            subpixel_rays = rays_within(rays, pixels, scene.edge_rays)
+            subpixel_rays = supersample_rays(rays, pixels, scene.edge_rays)
             subpixel_hits = _empty_hits(len(subpixel_rays.directions), scene)
             trace_subpixel_rays(ground, pose, tree, columns, pixels, subpixel_rays, hits, subpixel_hits)
-            finer = _shade(scene, ground, pose, subpixel_rays, subpixel_hits, light).radiance
-            picture.radiance[pixels] = finer.reshape(len(pixels), scene.edge_rays**2).mean(axis=1)
+            subpixel_radiance = _shade(scene, ground, pose, subpixel_rays, subpixel_hits, light).radiance
+            picture.radiance[pixels] = subpixel_radiance.reshape(len(pixels), scene.edge_rays**2).mean(axis=1)
         return Frame(radiance, range_m, body, normal, world_from_body, rays)
 
     def close(self) -> None:
-        """Release the OpenGL contexts."""
+        """Delete the OpenGL contexts."""
         for view in self._views.values():
             view.close()
         self._views.clear()
-        self._last = None
+        self._last_scene = None
 
     def _view_renderer(self, side_px: int) -> DepthRenderer:
         if side_px not in self._views:
@@ -170,30 +172,30 @@ class Renderer:
         return self._views[side_px]
 
     def _draw_views(self, scene: Scene, rays: PixelRays, pose: Pose, clearance_m: float) -> Views:
-        if self._last is not scene:
-            self._last = scene
-            self._scenes += 1
-            if self._scenes % _SCENES_KEPT == 0:
+        if self._last_scene is not scene:
+            self._last_scene = scene
+            self._scene_count += 1
+            if self._scene_count % _TRIM_INTERVAL_SCENES == 0:
                 return_freed_memory()
-        # the visible ground lies between two planes: a ray ends at the lower one, or where the mesh does
+        # the visible ground lies between two horizontal planes: a ray ends at the lower one, or at the mesh's border
         columns, rows = rays.size
         probes = np.ix_(np.linspace(0, rows - 1, _PROBES).astype(int), np.linspace(0, columns - 1, _PROBES).astype(int))
         directions = rays.directions.reshape(rows, columns, 3)[probes].reshape(-1, 3) @ pose.rotation.T
         position, (low, high) = pose.position, scene.height_range_m
-        falls = np.minimum(directions[:, 2], -1e-9)
-        levels = (low, max(high, position[2]))
-        ends = [np.clip((level - position[2]) / falls, 0.0, 2.0 * scene.mesh_reach_m) for level in levels]
-        points = np.concatenate([position[:2] + end[:, None] * directions[:, :2] for end in ends])
-        # between the probes the border bulges by a small fraction of their span at most
+        descent_rates = np.minimum(directions[:, 2], -1e-9)
+        plane_z = (low, max(high, position[2]))
+        end_distances = [np.clip((z - position[2]) / descent_rates, 0.0, 2.0 * scene.mesh_reach_m) for z in plane_z]
+        points = np.concatenate([position[:2] + distance[:, None] * directions[:, :2] for distance in end_distances])
+        # between the probe rays the border of the visible ground deviates little from a straight line
         margin = 0.02 * (points.max(axis=0) - points.min(axis=0)) + 2.0 * scene.mesh_finest_m
         corners = margin * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
         points = (points[:, None] + corners).reshape(-1, 2)
         x, y = (
-            lines_in_view(centre + scene.mesh_offsets, first, last)
+            grid_lines_between(centre + scene.mesh_offsets, first, last)
             for centre, first, last in zip(scene.centre_m, points.min(axis=0), points.max(axis=0), strict=True)
         )
         numbers = scene.objects.in_cone(pose.position, pose.rotation @ rays.axis, rays.half_angle_rad)
-        ground = ground_mesh(scene.surface, x, y, cells_in_hull(x, y, points))
+        ground = ground_mesh(scene.surface, x, y, cell_spans_in_hull(x, y, points))
         renderer = self._view_renderer(rays.view_side_px)
         renderer.load(ground, scene.objects.triangles[numbers], numbers)
         pictures = []
@@ -201,23 +203,21 @@ class Renderer:
             world_from_view = np.eye(4)
             world_from_view[:3, :3] = pose.rotation @ view_from_body.T
             world_from_view[:3, 3] = pose.position
-            # a twentieth of the height above the ground: nearer relief and objects are cut off; depth is only a first
-            # guess, so its coarseness far away is harmless
+            # near plane at 5 % of the height above the ground: nearer surfaces are clipped; the depth is only a first
+            # guess, so its low resolution at large distances has no effect on the picture
             far = 2.0 * scene.mesh_reach_m + clearance_m
             pictures.append(renderer.draw(world_from_view, float(focal), 0.05 * clearance_m, far))
         # a single view is not copied
-        depth, ids = (one[0][np.newaxis] if len(one) == 1 else np.stack(one) for one in zip(*pictures, strict=True))
+        depth, ids = (maps[0][np.newaxis] if len(maps) == 1 else np.stack(maps) for maps in zip(*pictures, strict=True))
         return Views(depth, ids, rays.focal_px, rays.view_from_body, rays.view_of_pixel)
 
 
 def _empty_hits(count: int, scene: Scene) -> Hits:
-    weighted = count if len(scene.objects) > 0 else 0
-    return Hits(
-        np.empty(count), np.empty(count, np.int32), np.empty((weighted, 2), np.float32), np.empty(count, np.int8)
-    )
+    weights = np.empty((count if len(scene.objects) > 0 else 0, 2), np.float32)
+    return Hits(np.empty(count), np.empty(count, np.int32), weights, np.empty(count, np.int8))
 
 
-def _part(arrays: Iterable[NDArray[Any]], part: slice) -> list[NDArray[Any]]:
+def _slice_arrays(arrays: Iterable[NDArray[Any]], part: slice) -> list[NDArray[Any]]:
     return [array[part] for array in arrays]
 
 
@@ -227,8 +227,8 @@ def _shade(scene: Scene, ground: Ground, pose: Pose, rays: Rays, hits: Hits, lig
     occluders, materials = scene.occluders, scene.materials
 
     def shade_part(part: slice) -> None:
-        some_rays, some_hits, some_pixels = (_part(arrays, part) for arrays in (rays, hits, picture))
-        shade(ground, pose, Rays(*some_rays), Hits(*some_hits), light, occluders, materials, Picture(*some_pixels))
+        part_rays, part_hits, part_picture = (_slice_arrays(arrays, part) for arrays in (rays, hits, picture))
+        shade(ground, pose, Rays(*part_rays), Hits(*part_hits), light, occluders, materials, Picture(*part_picture))
 
     run_in_parts(shade_part, count)
     return picture
@@ -241,15 +241,15 @@ def process_renderer(backend: Backend) -> Renderer:
 
 
 def run_in_parts(work: Callable[[slice], None], pixels: int, threads: int | None = None) -> None:
-    """Run `work` on slices of all pixels in threads; the result does not depend on their number.
+    """Run `work` on slices of all pixels in threads; the result does not depend on the number of threads.
 
-    `threads` is by default numba's (`NUMBA_NUM_THREADS`; one in a campaign's worker). Kernels release Python's lock.
+    The default of `threads` is numba's `NUMBA_NUM_THREADS` (1 in a campaign's worker). Kernels release the GIL.
     """
     count = config.NUMBA_NUM_THREADS if threads is None else threads
     if count == 1 or pixels < MIN_PIXELS:
         work(slice(0, pixels))
         return
-    # parts begin where kernels begin a strip of pixels anyway
+    # align the slices with the kernels' pixel strips
     size = -(-pixels // count // STRIP) * STRIP
     parts = [slice(first, min(first + size, pixels)) for first in range(0, pixels, size)]
     list(_pool(count).map(work, parts))
@@ -261,27 +261,27 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def keep_freed_memory() -> None:
-    """Keep memory that pictures free for the next ones, where the C library is glibc: 4 % of a descent's case."""
+    """Configure glibc to reuse the memory of freed pictures; this saves 4 % of the run time of a descent case."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
-        mallopt(_M_MMAP_THRESHOLD, _MAPPED_FROM_BYTES)
-        mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+        mallopt(_M_MMAP_THRESHOLD, _MMAP_THRESHOLD_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, _TRIM_THRESHOLD_BYTES)
 
 
 def return_freed_memory() -> None:
-    """Return freed memory to the system; without this the C library keeps some 1 MB a scene."""
+    """Return freed memory to the system; otherwise the memory of the process grows by about 1 MB per scene."""
     malloc_trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if malloc_trim is not None:
         malloc_trim(0)
 
 
 def pyramid(surface: Surface) -> tuple[Array32, ...]:
-    """The levels of a surface, the last of them repeated."""
+    """Return `LEVELS` levels of a surface; the last level is repeated."""
     return surface.levels + surface.levels[-1:] * (LEVELS - len(surface.levels))
 
 
 def ground_struct(surface: Surface, extent_m: Extent, *, ceilings: bool) -> Ground:
-    """Pack a surface for kernels, with or without upper bounds of its levels' heights."""
+    """Pack a surface for kernels, with or without the height bounds of its levels."""
     bounds = surface.ceilings if ceilings else (NO_CEILING,)
     bounds += bounds[-1:] * (LEVELS - len(bounds))
     return Ground(pyramid(surface), bounds, len(surface.levels) - 1, surface.spacing_m, extent_m)
@@ -293,13 +293,12 @@ def ground_mesh(
     y: Float[np.ndarray, "rows"],
     spans: Int[np.ndarray, "strips 2"] | None = None,
 ) -> trimesh.Trimesh:
-    """Triangulate the ground over the grid of these lines, in world coordinates.
+    """Triangulate the ground over a grid with lines at `x` and `y`, world coordinates.
 
-    Each vertex takes its height from the level whose samples are about as far apart as the grid's lines there, so that
-    the mesh does not alias the terrain. `spans` holds the first cell and the end of those to include in each strip
-    between two lines of y; by default all.
+    To avoid aliasing, each vertex takes its height from the terrain level with about the same spacing as the grid.
+    `spans` contains the first cell and the end of the cells in each strip between two lines of y; by default all cells.
     """
-    import trimesh  # here, as it is slow to import
+    import trimesh  # imported late, as the import is slow
 
     if spans is None:
         spans = np.tile([0, x.size - 1], (y.size - 1, 1))
@@ -311,15 +310,15 @@ def ground_mesh(
     return trimesh.Trimesh(vertices, faces, process=False, validate=False)
 
 
-def cells_in_hull(
+def cell_spans_in_hull(
     x: Float[np.ndarray, "columns"], y: Float[np.ndarray, "rows"], points: Float[np.ndarray, "points 2"]
 ) -> Int[np.ndarray, "strips 2"]:
-    """Spans of a grid's cells, for `ground_mesh`, that reach into the convex hull of points not all on one line."""
+    """Spans of a grid's cells, for `ground_mesh`, that overlap the convex hull of points, not all on one line."""
     return np.asarray(spans_in_hull(x, y, points[ConvexHull(points).vertices]))
 
 
-def lines_in_view(lines: Float[np.ndarray, "count"], low: float, high: float) -> Float[np.ndarray, "kept"]:
-    """Select the lines between two bounds and one more to either side."""
+def grid_lines_between(lines: Float[np.ndarray, "count"], low: float, high: float) -> Float[np.ndarray, "selected"]:
+    """Select the grid lines between two bounds, with a margin of two lines on each side; at least three lines."""
     first = max(int(np.searchsorted(lines, low)) - 2, 0)
     last = min(int(np.searchsorted(lines, high)) + 2, lines.size)
     if last - first < 3:

@@ -1,4 +1,4 @@
-"""Terrain: heightfields with albedo and rocks, synthesised from a seed or imported, and their cache on disk."""
+"""Terrain: heightfields with albedo and rocks, synthesised from a seed or imported from files; cached on disk."""
 
 from marsyard.sim.terrain.bank import TerrainBank, synthesise
 from marsyard.sim.terrain.parameters import TerrainParameters

@@ -1,4 +1,4 @@
-"""Terrain models (DTM) from files, embedded in a periodic synthetic surround."""
+"""Digital terrain models (DTM) from files, embedded in periodic synthetic terrain."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ Mask = Bool[np.ndarray, "rows columns"]
 
 
 class TerrainFileError(ValueError):
-    """A terrain file cannot be used; the message says which, why, and what is allowed."""
+    """A terrain file cannot be used; the message contains the file, the reason and the allowed values."""
 
 
 class RealTerrain(Parameters):
-    """A digital terrain model (DTM) from a file, that replaces the fractal ground within its borders.
+    """A digital terrain model (DTM) from a file; it replaces the synthetic ground inside its borders.
 
     The file is a GeoTIFF (rows from north to south, projected, metres; needs the extra `geo`) or an ``.npz`` with
     ``dem`` (heights, m, row 0 in the north) and ``dem_gsd`` (m), and optionally ``ortho``, ``ortho_gsd`` and
-    ``ortho_valid``. Its middle lies at the middle of the periodic terrain, whose y axis is the grid's north: azimuths,
-    the sun's too, count from there, which is not true north off a projection's central meridian.
+    ``ortho_valid``. Its centre is the centre of the periodic terrain. Azimuths, including the sun's, are relative to
+    grid north (y axis), which differs from true north away from the projection's central meridian.
 
-    Posts without height are filled smoothly, up to `max_hole_fraction` of them; ground that is filled is not real.
+    Missing heights are interpolated, up to a fraction `max_hole_fraction`. Filled samples are excluded from statistics.
     """
 
     dtm: Annotated[Path, Field(description="GeoTIFF or .npz with the heights")]
-    ortho: Annotated[Path | None, Field(description="GeoTIFF with the picture; an .npz has its own")] = None
-    use_ortho: Annotated[bool, Field(description="whether brightness is taken from the picture")] = True
-    ortho_east_m: Annotated[float, Field(description="how far east of the DTM the picture lies, m")] = 0.0
-    ortho_north_m: Annotated[float, Field(description="how far north of the DTM the picture lies, m")] = 0.0
-    border_m: Annotated[float, Field(gt=0.0, description="width of the seam to the surround, in the DTM, m")] = 20.0
+    ortho: Annotated[Path | None, Field(description="GeoTIFF with the orthoimage; an .npz can contain it")] = None
+    use_ortho: Annotated[bool, Field(description="whether the orthoimage determines the albedo")] = True
+    ortho_east_m: Annotated[float, Field(description="eastward offset of the orthoimage from the DTM, m")] = 0.0
+    ortho_north_m: Annotated[float, Field(description="northward offset of the orthoimage from the DTM, m")] = 0.0
+    border_m: Annotated[float, Field(gt=0.0, description="width of the blending zone inside the DTM, m")] = 20.0
     max_hole_fraction: Annotated[float, Field(ge=0.0, lt=1.0, description="maximum fraction without height")] = 0.05
     roughen: Annotated[bool, Field(description="add fractal detail finer than twice the DTM's posting")] = True
 
     def input_files(self) -> tuple[str, ...]:
-        """Paths of the files that the terrain is made from."""
+        """Paths of the DTM's files."""
         return tuple(str(path) for path in (self.dtm, self.ortho) if path is not None)
 
 
@@ -61,7 +61,7 @@ class Raster:
 
 
 def read_rasters(source: RealTerrain) -> tuple[Raster, Raster | None]:
-    """Read heights, and brightness where there is an image that shall be used. Raises TerrainFileError."""
+    """Read heights, and brightness if an orthoimage is used. Raises TerrainFileError."""
     if not source.dtm.exists():
         raise TerrainFileError(f"terrain file {source.dtm} does not exist")
     heights, ortho = _read_npz(source.dtm) if source.dtm.suffix == ".npz" else (_read_geotiff(source.dtm), None)
@@ -74,15 +74,15 @@ def read_rasters(source: RealTerrain) -> tuple[Raster, Raster | None]:
 
 
 def check_holes(source: RealTerrain, heights: Grid) -> None:
-    """Raise TerrainFileError where more heights are missing (not finite) than the source allows."""
+    """Raise TerrainFileError if more heights are missing (not finite) than the source allows."""
     fraction = float(np.mean(~np.isfinite(heights)))
     if fraction == 1.0:
         raise TerrainFileError(f"{source.dtm}: has no valid height at all")
     if fraction > source.max_hole_fraction:
         raise TerrainFileError(
             f"{source.dtm}: {fraction:.1%} of its posts have no height; allowed: up to {source.max_hole_fraction:.1%}. "
-            "Cut out a part without holes (rio clip --bounds), or allow them to be filled smoothly by "
-            "max_hole_fraction (marsyard terrain stats and render: --max-holes)"
+            "Clip the file to a part without holes (rio clip --bounds), or increase max_hole_fraction "
+            "(marsyard terrain stats and render: --max-holes) to fill the holes by interpolation"
         )
 
 
@@ -91,7 +91,7 @@ def _read_npz(path: Path) -> tuple[Raster, Raster | None]:
         missing = [key for key in ("dem", "dem_gsd") if key not in file]
         if missing:
             allowed = "dem, dem_gsd, ortho, ortho_gsd, ortho_valid"
-            raise TerrainFileError(f"{path} lacks {', '.join(missing)}; allowed: {allowed}")
+            raise TerrainFileError(f"{path} does not contain {', '.join(missing)}; allowed: {allowed}")
         heights = _from_north(file["dem"], float(file["dem_gsd"]), path)
         if "ortho" not in file:
             return heights, None
@@ -102,7 +102,7 @@ def _read_npz(path: Path) -> tuple[Raster, Raster | None]:
 
 
 def _from_north(values: Any, posting_m: float, path: Path) -> Raster:
-    """A raster from rows that run from north to south; the origin is the outer corner of the north-western cell."""
+    """Make a raster from rows in north-to-south order; the origin is the outer corner of the north-western cell."""
     array = np.asarray(values, dtype=np.float64)
     if array.ndim != 2 or min(array.shape) < 4:
         raise TerrainFileError(f"{path} has a grid of shape {array.shape}; at least 4 x 4 values are needed")
@@ -121,7 +121,7 @@ def _read_geotiff(path: Path) -> Raster:
         values = file.read(1, masked=True).astype(np.float64).filled(np.nan)
         transform, crs = file.transform, file.crs
     if crs is not None and crs.is_geographic:
-        raise TerrainFileError(f"{path} is in degrees ({crs}); project it to metres first, with rio warp --dst-crs")
+        raise TerrainFileError(f"{path} is in degrees ({crs}); project it to metres with rio warp --dst-crs")
     if transform.b or transform.d or abs(transform.a + transform.e) > 1e-6 * abs(transform.a):
         raise TerrainFileError(f"{path} has rotated or oblong cells; square cells, north up, are needed")
     factor = 1.0 if crs is None else float(crs.linear_units_factor[1])
@@ -131,36 +131,34 @@ def _read_geotiff(path: Path) -> Raster:
 
 
 def fill_holes(values: Grid) -> tuple[Grid, int]:
-    """Fill holes smoothly from their rims; return the values, and how many were missing.
+    """Interpolate missing values; return the values, and the number of missing values.
 
-    Every missing value starts as its nearest valid one; then Laplace's equation is relaxed.
+    The first guess of a missing value is the nearest valid value; then Laplace's equation is solved by relaxation.
     """
     missing: Mask = np.isnan(values)
     holes = int(missing.sum())
     if holes == 0:
         return values, 0
     nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
-    nearest_value = values[tuple(nearest)]
+    filled = values[tuple(nearest)]
     for _ in range(200):
-        padded = np.pad(nearest_value, 1, mode="edge")
-        around = 0.25 * (padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:])
-        nearest_value[missing] = around[missing]
-    return nearest_value, holes
+        padded = np.pad(filled, 1, mode="edge")
+        neighbour_mean = 0.25 * (padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:])
+        filled[missing] = neighbour_mean[missing]
+    return filled, holes
 
 
-MEMBRANE_SIDE = 128  #: Side of the grid on which the surround is deformed to meet the real terrain.
-MAX_SIDE = 8192  #: Largest number of samples along a side of a terrain.
-TORN_EDGE_PX = 3  #: Pixels next to missing ones that resampling has mixed with black.
+MEMBRANE_SIDE = 128  #: Cells along a side of the grid on which the synthetic terrain is deformed to meet the DTM.
+MAX_SIDE = 8192  #: Maximum number of samples along a side of a terrain.
+ORTHO_EDGE_MARGIN_PX = 3  #: Width of the margin around missing pixels where resampling has mixed values with black.
 
 
 @dataclass(frozen=True)
 class RealExtent:
-    """Borders of the DTM in terrain coordinates, and the defects of its file, which are filled from around.
+    """Borders of the DTM in terrain coordinates, and the number of missing values in its files.
 
-    Within `border_m` of the borders the DTM blends into its surround.
-
-    - holes, hole_fraction: posts without a height, and their fraction of all posts
-    - ortho_holes: pixels without a brightness
+    - holes, hole_fraction: number of posts without a height, and their fraction of all posts
+    - ortho_holes: number of pixels without a brightness
     """
 
     west_m: float
@@ -174,14 +172,14 @@ class RealExtent:
 
 
 @dataclass(frozen=True)
-class Embedded:
-    """A real terrain resampled on the grid of its surround.
+class EmbeddedDtm:
+    """A DTM resampled on the grid of the terrain.
 
-    - rows, columns: the part of the grid that it covers
-    - height: control values there: the B-spline passes through the DTM's interpolated heights
-    - tone: natural logarithm of brightness over its mean
-    - weight: 1 inside, falling to 0 at the border
-    - real: whether the DTM has a height at the post nearest to each sample; elsewhere a hole is filled
+    - rows, columns: the part of the grid that the DTM covers
+    - height: control values of the B-spline through the DTM's interpolated heights
+    - tone: natural logarithm of brightness divided by its mean
+    - weight: blending weight, 1 inside, decreasing to 0 at the border
+    - has_data: whether the DTM has a height at the post nearest to each sample
     """
 
     rows: slice
@@ -189,50 +187,51 @@ class Embedded:
     height: Part
     tone: Part | None
     weight: Part
-    real: Mask
+    has_data: Mask
     extent: RealExtent
 
     def real_samples(self, side: int) -> Bool[np.ndarray, "side side"]:
-        """Mask of the whole terrain's samples on posts with a height: statistics are computed from these."""
-        return self._mask(side, self.real)
+        """Mask of the terrain's samples at posts with a height, which are used for statistics."""
+        return self._mask(side, self.has_data)
 
     def filled_samples(self, side: int) -> Bool[np.ndarray, "side side"]:
-        """Mask of the whole terrain's samples in filled holes of the DTM."""
-        return self._mask(side, ~self.real)
+        """Mask of the terrain's samples in filled holes of the DTM."""
+        return self._mask(side, ~self.has_data)
 
-    def _mask(self, side: int, part: Mask) -> Bool[np.ndarray, "side side"]:
-        samples = np.zeros((side, side), dtype=np.bool_)
-        samples[self.rows, self.columns] = part
-        return samples
+    def _mask(self, side: int, dtm_mask: Mask) -> Bool[np.ndarray, "side side"]:
+        mask = np.zeros((side, side), dtype=np.bool_)
+        mask[self.rows, self.columns] = dtm_mask
+        return mask
 
 
-def embed(source: RealTerrain, side: int, spacing_m: float) -> Embedded:
-    """Resample the file's terrain for the middle of a grid of this side and spacing. Raises TerrainFileError."""
+def embed(source: RealTerrain, side: int, spacing_m: float) -> EmbeddedDtm:
+    """Resample the DTM at the centre of a grid with this side, in samples, and spacing. Raises TerrainFileError."""
     raster, ortho = read_rasters(source)
     period = side * spacing_m
     rows, columns = raster.values.shape
     width, length = (columns - 1) * raster.posting_m, (rows - 1) * raster.posting_m
     if max(width, length) > period - 2.0 * spacing_m:
         raise TerrainFileError(
-            f"{source.dtm} covers {width:g} m x {length:g} m; the terrain repeats after {period:g} m: "
-            "choose more terrain.samples or a larger terrain.spacing_m"
+            f"{source.dtm} covers {width:g} m x {length:g} m; the terrain's period is {period:g} m: "
+            "increase terrain.samples or terrain.spacing_m"
         )
     if min(width, length) <= 2.0 * source.border_m:
         raise TerrainFileError(
-            f"{source.dtm} covers {width:g} m x {length:g} m; a border of {source.border_m:g} m leaves nothing of it"
+            f"{source.dtm} covers {width:g} m x {length:g} m; "
+            f"it must be wider than twice the border ({source.border_m:g} m)"
         )
     heights, holes = fill_holes(raster.values)
-    # aligned with the grid, so that posts coincide with samples where the postings allow it
+    # aligned with the grid, so that posts coincide with samples if the posting is a multiple of the spacing
     west, south = (round(0.5 * (period - span) / spacing_m) * spacing_m for span in (width, length))
     i = np.arange(int(np.ceil(south / spacing_m)), int(np.floor((south + length) / spacing_m)) + 1)
     j = np.arange(int(np.ceil(west / spacing_m)), int(np.floor((west + width) / spacing_m)) + 1)
     y, x = i * spacing_m, j * spacing_m
     posts_y, posts_x = south + raster.posting_m * np.arange(rows), west + raster.posting_m * np.arange(columns)
-    # cubic between the DTM's posts, then control values of the B-spline through the interpolated heights
+    # cubic interpolation between the DTM's posts, then control values of the B-spline through these heights
     resampled = RectBivariateSpline(posts_y, posts_x, heights - heights.mean(), kx=3, ky=3)(y, x)
     control = spline_filter(resampled, order=3, mode="mirror", output=np.float64).astype(np.float32)
-    inward_y, inward_x = np.minimum(y - south, south + length - y), np.minimum(x - west, west + width - x)
-    fraction = np.clip(np.minimum(inward_y[:, None], inward_x[None, :]) / source.border_m, 0.0, 1.0)
+    margin_y, margin_x = np.minimum(y - south, south + length - y), np.minimum(x - west, west + width - x)
+    fraction = np.clip(np.minimum(margin_y[:, None], margin_x[None, :]) / source.border_m, 0.0, 1.0)
     weight = (fraction * fraction * (3.0 - 2.0 * fraction)).astype(np.float32)
     tone, ortho_holes = (None, 0) if ortho is None else _log_brightness(source, raster, ortho, x - west, y - south)
     borders = (west, south, west + width, south + length)
@@ -241,19 +240,20 @@ def embed(source: RealTerrain, side: int, spacing_m: float) -> Embedded:
         np.clip(np.rint(offset / raster.posting_m).astype(int), 0, count - 1)
         for offset, count in ((y - south, rows), (x - west, columns))
     )
-    real = np.isfinite(raster.values)[np.ix_(*nearest)]
-    return Embedded(slice(i[0], i[-1] + 1), slice(j[0], j[-1] + 1), control, tone, weight, real, extent)
+    has_data = np.isfinite(raster.values)[np.ix_(*nearest)]
+    return EmbeddedDtm(slice(i[0], i[-1] + 1), slice(j[0], j[-1] + 1), control, tone, weight, has_data, extent)
 
 
 def _log_brightness(source: RealTerrain, raster: Raster, ortho: Raster, x: Line, y: Line) -> tuple[Part, int]:
-    """Log brightness of the image over its mean at positions relative to the DTM's south-western post; missing pixels.
+    """Logarithm of the orthoimage's brightness divided by its mean, and the number of missing pixels.
 
-    The image's own shading remains: it is taken for albedo. Black is limited to a fifth of the mean.
+    Positions are relative to the DTM's south-western post, metres. Shading in the image is not removed: it becomes part
+    of the albedo. Values are clipped from below at 0.2 of the mean.
     """
     missing = ~(ortho.values > 0.0)
     holes = int(missing.sum())
     if holes:
-        missing = binary_dilation(missing, iterations=TORN_EDGE_PX)
+        missing = binary_dilation(missing, iterations=ORTHO_EDGE_MARGIN_PX)
     brightness, _ = fill_holes(np.where(missing, np.nan, ortho.values))
     logarithm = np.log(np.maximum(brightness / float(brightness.mean()), 0.2))
     rows, columns = logarithm.shape
@@ -265,64 +265,65 @@ def _log_brightness(source: RealTerrain, raster: Raster, ortho: Raster, x: Line,
 
 
 def choose_grid(source: RealTerrain) -> tuple[int, float]:
-    """Choose samples and spacing of a terrain that holds the DTM at its own posting, with a surround.
+    """Choose samples and spacing of a terrain that contains the DTM, with the DTM's posting as spacing.
 
-    Raises TerrainFileError for a DTM that is too large.
+    Raises TerrainFileError if the DTM is too large.
     """
     raster, _ = read_rasters(source)
     longest = max(raster.values.shape)
     samples = max(64, 1 << int(np.ceil(np.log2(1.5 * longest))))
     if samples > MAX_SIDE:
-        raise TerrainFileError(f"{source.dtm} has {longest} posts along a side; at most 5461 fit")
+        raise TerrainFileError(f"{source.dtm} has {longest} posts along a side; maximum: 5461")
     return samples, raster.posting_m
 
 
-#: Heights and tones finer than a DTM's posting.
+#: Height and tone detail below a DTM's posting.
 Detail = tuple[Part, Part]
 
 
-def detail_below_posting(ground: Ground, real: Embedded) -> Detail:
-    """Extract the ground's waves shorter than twice the DTM's posting, where the DTM lies.
+def detail_below_posting(ground: Ground, dtm: EmbeddedDtm) -> Detail:
+    """Extract the synthetic ground's wavelengths below twice the DTM's posting, in the area of the DTM.
 
-    The remainder of a Gaussian low-pass whose amplitude is a half at that wavelength.
+    This is a Gaussian high-pass filter with an amplitude of 0.5 at that wavelength.
     """
-    sigma = real.extent.posting_m * np.sqrt(2.0 * np.log(2.0)) / np.pi / ground.spacing_m
+    sigma = dtm.extent.posting_m * np.sqrt(2.0 * np.log(2.0)) / np.pi / ground.spacing_m
     grids = (ground.height, ground.tone)
-    height, tone = ((grid - gaussian_filter(grid, sigma, mode="wrap"))[real.rows, real.columns] for grid in grids)
+    height, tone = ((grid - gaussian_filter(grid, sigma, mode="wrap"))[dtm.rows, dtm.columns] for grid in grids)
     return height, tone
 
 
-def blend_into_ground(ground: Ground, real: Embedded, detail: Detail | None) -> None:
-    """Blend the real terrain into the ground, in place, after deforming the surround to meet it at the border.
+def blend_into_ground(ground: Ground, dtm: EmbeddedDtm, detail: Detail | None) -> None:
+    """Blend the DTM into the synthetic ground, in place.
 
-    The deformation is a membrane: the height difference along the border, continued by Laplace's equation on a coarse
-    periodic grid.
+    First the synthetic ground is deformed to meet the DTM at its border. The deformation continues the height
+    difference at the border by Laplace's equation on a coarse periodic grid.
     """
-    height = real.height if detail is None else real.height + detail[0]
+    height = dtm.height if detail is None else dtm.height + detail[0]
     step = max(ground.side // MEMBRANE_SIDE, 1)
-    covered = np.zeros((ground.side, ground.side), dtype=bool)
-    covered[real.rows, real.columns] = real.weight > 0.0
+    is_covered = np.zeros((ground.side, ground.side), dtype=bool)
+    is_covered[dtm.rows, dtm.columns] = dtm.weight > 0.0
     difference = np.zeros((ground.side, ground.side), dtype=np.float32)
-    difference[real.rows, real.columns] = real.height - ground.height[real.rows, real.columns]
-    membrane = _membrane(difference[::step, ::step].astype(np.float64), covered[::step, ::step])
-    np.add(ground.height, refine(membrane.astype(np.float32), ground.side), out=ground.height)
-    area = ground.height[real.rows, real.columns]
-    area += real.weight * (height - area)
-    if real.tone is not None:
-        tone = real.tone if detail is None else real.tone + detail[1]
-        area = ground.tone[real.rows, real.columns]
-        area += real.weight * (tone - area)
+    difference[dtm.rows, dtm.columns] = dtm.height - ground.height[dtm.rows, dtm.columns]
+    deformation = _extrapolate_smoothly(difference[::step, ::step].astype(np.float64), is_covered[::step, ::step])
+    np.add(ground.height, refine(deformation.astype(np.float32), ground.side), out=ground.height)
+    area = ground.height[dtm.rows, dtm.columns]
+    area += dtm.weight * (height - area)
+    if dtm.tone is not None:
+        tone = dtm.tone if detail is None else dtm.tone + detail[1]
+        area = ground.tone[dtm.rows, dtm.columns]
+        area += dtm.weight * (tone - area)
 
 
-def _membrane(
-    values: Float64[np.ndarray, "side side"], known: Bool[np.ndarray, "side side"]
+def _extrapolate_smoothly(
+    values: Float64[np.ndarray, "side side"], has_value: Bool[np.ndarray, "side side"]
 ) -> Float64[np.ndarray, "side side"]:
-    """Continue values where they are not known as the mean of the neighbours, by successively finer relaxation."""
-    if known.shape[0] > 8 and known[::2, ::2].any():
-        field = np.repeat(np.repeat(_membrane(values[::2, ::2], known[::2, ::2]), 2, axis=0), 2, axis=1)
+    """Continue values on a periodic grid by Laplace's equation, relaxed on successively finer grids."""
+    if has_value.shape[0] > 8 and has_value[::2, ::2].any():
+        coarse = _extrapolate_smoothly(values[::2, ::2], has_value[::2, ::2])
+        field = np.repeat(np.repeat(coarse, 2, axis=0), 2, axis=1)
     else:
-        field = np.full(values.shape, float(values[known].mean()))
+        field = np.full(values.shape, float(values[has_value].mean()))
     for _ in range(60):
-        around = np.roll(field, 1, 0) + np.roll(field, -1, 0) + np.roll(field, 1, 1) + np.roll(field, -1, 1)
-        field = np.where(known, values, 0.25 * around)
+        neighbour_sum = np.roll(field, 1, 0) + np.roll(field, -1, 0) + np.roll(field, 1, 1) + np.roll(field, -1, 1)
+        field = np.where(has_value, values, 0.25 * neighbour_sum)
     return field

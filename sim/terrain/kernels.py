@@ -1,4 +1,4 @@
-"""Compiled kernels of the terrain: evaluation of the cubic B-spline, its upper bounds, reduction to coarser levels."""
+"""Compiled kernels of the terrain: evaluation of the cubic B-spline, upper height bounds, and coarser levels."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 #: A level of the pyramid, shape (side, side, 2): height and albedo; side is a power of two.
 Level = NDArray[np.float32]
 Array = NDArray[np.float64]
-Eight = tuple[float, float, float, float, float, float, float, float]
+#: Weights of four control values, and their derivatives.
+WeightsAndDerivatives = tuple[float, float, float, float, float, float, float, float]
 
 
 @njit(cache=True, inline="always")
-def bspline_weights(t: float) -> Eight:
+def bspline_weights(t: float) -> WeightsAndDerivatives:
     """Weights of the four control values around a point at fraction t of its cell, and their derivatives."""
     s = 1.0 - t
     t2 = t * t
@@ -47,9 +48,9 @@ def sample(field: Level, inverse_spacing: float, x: float, y: float) -> tuple[fl
     for k in range(4):
         row = field[(i + k - 1) & mask]
         h0, h1, h2, h3 = row[j0, 0], row[j1, 0], row[j2, 0], row[j3, 0]
-        across = wx0 * h0 + wx1 * h1 + wx2 * h2 + wx3 * h3
-        height += wy[k] * across
-        slope_y += wy[k + 4] * across
+        row_height = wx0 * h0 + wx1 * h1 + wx2 * h2 + wx3 * h3
+        height += wy[k] * row_height
+        slope_y += wy[k + 4] * row_height
         slope_x += wy[k] * (dx0 * h0 + dx1 * h1 + dx2 * h2 + dx3 * h3)
         albedo += wy[k] * (wx0 * row[j0, 1] + wx1 * row[j1, 1] + wx2 * row[j2, 1] + wx3 * row[j3, 1])
     return height, slope_x * inverse_spacing, slope_y * inverse_spacing, albedo
@@ -57,18 +58,18 @@ def sample(field: Level, inverse_spacing: float, x: float, y: float) -> tuple[fl
 
 @njit(cache=True, inline="always")
 def collapse(field: Level, gy: float, out: Array) -> None:
-    """Control values of a level along the line y = gy, counted in samples: both fields become splines of x alone."""
+    """Reduce a level to cubic splines in x on the line y = `gy` (in samples); `out` are their control values."""
     mask = field.shape[0] - 1
     fy = math.floor(gy)
     i = int(fy)
     wy = bspline_weights(gy - fy)
     for j in range(field.shape[1]):
-        for part in range(2):
-            out[j, part] = (
-                wy[0] * field[(i - 1) & mask, j, part]
-                + wy[1] * field[i & mask, j, part]
-                + wy[2] * field[(i + 1) & mask, j, part]
-                + wy[3] * field[(i + 2) & mask, j, part]
+        for c in range(2):
+            out[j, c] = (
+                wy[0] * field[(i - 1) & mask, j, c]
+                + wy[1] * field[i & mask, j, c]
+                + wy[2] * field[(i + 1) & mask, j, c]
+                + wy[3] * field[(i + 2) & mask, j, c]
             )
 
 
@@ -82,15 +83,15 @@ def evaluate_field(field: Level, spacing: float, x: Array, y: Array) -> Array:
     return out
 
 
-#: Samples along each side of the blocks that have ceilings; with half as many, rays are no faster.
+#: Block size of the height bounds, in samples; smaller blocks do not speed up ray tracing.
 CEILING_BLOCK = 4
 
 
 @njit(cache=True)
 def block_ceilings(field: Level) -> NDArray[np.float32]:
-    """Upper bounds of a level's height over blocks of samples: the highest control value that affects a block.
+    """Upper height bound of each block of samples: the maximum of all control values that affect the block.
 
-    Block (a, b) lies between the samples ``CEILING_BLOCK * a`` and ``CEILING_BLOCK * (a + 1)`` along y; b along x.
+    Block (a, b) covers the samples ``CEILING_BLOCK * a`` to ``CEILING_BLOCK * (a + 1)`` along y; b is the same along x.
     """
     side = field.shape[0]
     mask = side - 1
@@ -113,23 +114,23 @@ def block_ceilings(field: Level) -> NDArray[np.float32]:
 
 @njit(cache=True)
 def reduce_level(fine: Level) -> Level:
-    """Compute the next coarser level: binomial (1 4 6 4 1)/16 along both axes, every second sample kept, periodic."""
+    """Compute the next coarser level: binomial filter (1 4 6 4 1)/16 along x and y, every second sample, periodic."""
     side = fine.shape[0]
     half = side // 2
     mask = side - 1
     weights = np.array([1.0, 4.0, 6.0, 4.0, 1.0], dtype=np.float32) / np.float32(16.0)
-    narrow = np.zeros((side, half, 2), dtype=np.float32)
+    half_width = np.zeros((side, half, 2), dtype=np.float32)
     for i in range(side):
         for j in range(half):
             for k in range(5):
                 source = (2 * j + k - 2) & mask
                 for c in range(2):
-                    narrow[i, j, c] += weights[k] * fine[i, source, c]
+                    half_width[i, j, c] += weights[k] * fine[i, source, c]
     coarse = np.zeros((half, half, 2), dtype=np.float32)
     for i in range(half):
         for k in range(5):
             source = (2 * i + k - 2) & mask
             for j in range(half):
                 for c in range(2):
-                    coarse[i, j, c] += weights[k] * narrow[source, j, c]
+                    coarse[i, j, c] += weights[k] * half_width[source, j, c]
     return coarse

@@ -1,4 +1,4 @@
-"""Sites: planet and atmosphere, reflectance of the ground, and terrain parameters at two scales."""
+"""Sites: planet and atmosphere, ground reflectance, and terrain parameters at two scales."""
 
 from __future__ import annotations
 
@@ -15,60 +15,60 @@ from pydantic import Field
 from marsyard.sim.parameters import Parameters, Positive
 from marsyard.sim.terrain.parameters import TerrainParameters
 
-LOWEST_SUN_SINE = 0.05  #: Lowest sine of the sun's elevation for which a plane-parallel atmosphere is used.
+MIN_SUN_SINE = 0.05  #: Lower limit of the sine of the sun's elevation in the plane-parallel atmosphere model.
 SUN_RADIUS_AT_1_AU_RAD = 0.00465  #: Angular radius of the sun at 1 AU.
 
 
 class Environment(Parameters):
-    """A planet's gravity, rotation, sunlight and dusty air at a site."""
+    """Gravity, planet rotation, sunlight and dusty atmosphere at a site."""
 
-    planet: Annotated[str, Field(description="which planet")] = "Mars"
+    planet: Annotated[str, Field(description="name of the planet")] = "Mars"
     gravity_m_s2: Annotated[Positive, Field(description="gravity, m/s2")] = 3.72
     rotation_rad_s: Annotated[float, Field(ge=0.0, description="sidereal rotation rate, rad/s")] = 7.0882e-5
-    solar_irradiance: Annotated[Positive, Field(description="sunlight above the air over that at 1 AU")] = 0.44
-    optical_depth: Annotated[float, Field(ge=0.0, le=10.0, description="extinction optical depth of the air")] = 0.5
-    single_scattering_albedo: Annotated[float, Field(ge=0.0, lt=1.0, description="scattering over extinction")] = 0.94
+    solar_irradiance: Annotated[Positive, Field(description="solar irradiance relative to that at 1 AU")] = 0.44
+    optical_depth: Annotated[float, Field(ge=0.0, le=10.0, description="optical depth of the atmosphere")] = 0.5
+    single_scattering_albedo: Annotated[float, Field(ge=0.0, lt=1.0, description="scattering / extinction")] = 0.94
     asymmetry: Annotated[float, Field(gt=-1.0, lt=1.0, description="mean cosine of the scattering angle")] = 0.65
     scale_height_m: Annotated[Positive, Field(description="height over which the extinction falls by e, m")] = 11100.0
 
     @property
     def sun_radius_rad(self) -> float:
-        """Angular radius of the sun's disc: it falls with distance as the square root of the irradiance does."""
+        """Angular radius of the sun's disc, proportional to the square root of the irradiance."""
         return float(SUN_RADIUS_AT_1_AU_RAD * np.sqrt(self.solar_irradiance))
 
     def direct_share(self, sun_elevation_rad: float) -> float:
-        """Fraction of sunlight that reaches a plane facing the sun, with the aureole scattered forward around it.
+        """Fraction of sunlight that reaches a plane facing the sun, including light scattered by a few degrees.
 
-        ``exp(-tau' / sin elevation)``, tau' the optical depth less the forward peak (delta scaling, Joseph et al.
-        1976): light scattered by a few degrees shades the ground as the sun's own does.
+        ``exp(-tau' / sin elevation)``, where tau' is the optical depth without the forward peak of scattering (delta
+        scaling, Joseph et al. 1976).
         """
-        return float(np.exp(-self._delta_scaled()[0] / max(np.sin(sun_elevation_rad), LOWEST_SUN_SINE)))
+        return float(np.exp(-self._delta_scaled()[0] / max(np.sin(sun_elevation_rad), MIN_SUN_SINE)))
 
     def sky_share(self, sun_elevation_rad: float) -> float:
-        """Diffuse irradiance of level ground over the direct sun's on a plane facing it.
+        """Diffuse irradiance of level ground, divided by that of direct sunlight on a plane facing the sun.
 
-        The delta-Eddington approximation (Joseph, Wiscombe & Weinman 1976) over black ground; it omits light that the
-        ground reflects and the air returns. An even sky of this radiance factor gives this irradiance.
+        Delta-Eddington approximation (Joseph, Wiscombe & Weinman 1976) over black ground, without light that the ground
+        reflects to the atmosphere. The value is also the radiance factor of a uniform sky with this irradiance.
         """
         tau, albedo, asymmetry = self._delta_scaled()
         if tau == 0.0:
             return 0.0
-        mu = max(float(np.sin(sun_elevation_rad)), LOWEST_SUN_SINE)
+        mu = max(float(np.sin(sun_elevation_rad)), MIN_SUN_SINE)
         k = np.sqrt(3.0 * (1.0 - albedo) * (1.0 - albedo * asymmetry))
         p = np.sqrt(3.0 * (1.0 - albedo) / (1.0 - albedo * asymmetry))
         # intensity I + I1 cos(angle from the nadir) for a solar flux of pi, particular solution -alpha, -beta
         alpha = 0.75 * albedo * mu**2 * (1.0 + asymmetry * (1.0 - albedo)) / (1.0 - (k * mu) ** 2)
         beta = 0.75 * albedo * mu * (1.0 + 3.0 * asymmetry * (1.0 - albedo) * mu**2) / (1.0 - (k * mu) ** 2)
-        # I = C1 e^-kt + C2 e^kt - alpha e^-t/mu, I1 = p (C1 e^-kt - C2 e^kt) - beta e^-t/mu; no diffuse light comes
-        # down at the top (I + 2/3 I1 = 0) nor up from the ground (I - 2/3 I1 = 0)
+        # I = C1 e^-kt + C2 e^kt - alpha e^-t/mu, I1 = p (C1 e^-kt - C2 e^kt) - beta e^-t/mu; boundary conditions: no
+        # downward diffuse light at the top (I + 2/3 I1 = 0), no upward light from the ground (I - 2/3 I1 = 0)
         two_thirds = 2.0 / 3.0
-        fade = np.exp(-tau / mu)
-        more, less = 1.0 + two_thirds * p, 1.0 - two_thirds * p
-        system = np.array([[more, less], [less * np.exp(-k * tau), more * np.exp(k * tau)]])
-        c1, c2 = np.linalg.solve(system, [alpha + two_thirds * beta, (alpha - two_thirds * beta) * fade])
-        mean = c1 * np.exp(-k * tau) + c2 * np.exp(k * tau) - alpha * fade
-        slant = p * (c1 * np.exp(-k * tau) - c2 * np.exp(k * tau)) - beta * fade
-        return float(max(mean + two_thirds * slant, 0.0) / fade)
+        direct = np.exp(-tau / mu)
+        plus, minus = 1.0 + two_thirds * p, 1.0 - two_thirds * p
+        system = np.array([[plus, minus], [minus * np.exp(-k * tau), plus * np.exp(k * tau)]])
+        c1, c2 = np.linalg.solve(system, [alpha + two_thirds * beta, (alpha - two_thirds * beta) * direct])
+        i0 = c1 * np.exp(-k * tau) + c2 * np.exp(k * tau) - alpha * direct
+        i1 = p * (c1 * np.exp(-k * tau) - c2 * np.exp(k * tau)) - beta * direct
+        return float(max(i0 + two_thirds * i1, 0.0) / direct)
 
     def mean_extinction_m(self, height_m: float) -> float:
         """Return the mean extinction coefficient between the ground and a height above it, 1/m."""
@@ -76,7 +76,7 @@ class Environment(Parameters):
         return float(-self.optical_depth * np.expm1(-height_m / self.scale_height_m) / height_m)
 
     def _delta_scaled(self) -> tuple[float, float, float]:
-        """Optical depth, single-scattering albedo and asymmetry without the forward peak g**2."""
+        """Optical depth, single-scattering albedo and asymmetry without the forward peak (fraction g**2)."""
         peak = self.asymmetry**2
         remainder = 1.0 - self.single_scattering_albedo * peak
         albedo = self.single_scattering_albedo * (1.0 - peak) / remainder
@@ -84,19 +84,19 @@ class Environment(Parameters):
 
 
 class SitePhotometry(Parameters):
-    """Parameters of the Lunar-Lambert law with an opposition surge, see `marsyard.sim.render.Photometry`."""
+    """Parameters of the Lunar-Lambert law with an opposition surge; see `marsyard.sim.render.Photometry`."""
 
     lunar_fraction: Annotated[float, Field(ge=0.0, le=1.0, description="L: 0 Lambert, 1 Lommel-Seeliger")] = 0.55
-    surge_amplitude: Annotated[float, Field(ge=0.0, le=3.0, description="B0")] = 0.7
-    surge_width: Annotated[float, Field(gt=0.0, le=1.0, description="h")] = 0.06
+    surge_amplitude: Annotated[float, Field(ge=0.0, le=3.0, description="B0: amplitude of the surge")] = 0.7
+    surge_width: Annotated[float, Field(gt=0.0, le=1.0, description="h: angular width of the surge")] = 0.06
     rock_albedo: Annotated[float, Field(gt=0.0, lt=1.0, description="albedo of rocks")] = 0.15
-    source: Annotated[str, Field(description="where these come from")] = "assumed"
+    source: Annotated[str, Field(description="source of these values")] = "assumed"
 
 
 class SiteTexture(Parameters):
-    """Albedo finer than the terrain's posts: octaves of noise in the natural logarithm of albedo.
+    """Albedo variation finer than the terrain's samples: octaves of noise in the natural logarithm of albedo.
 
-    The coarsest octave comes first; the cells of each octave are half as large as those of the one before.
+    The coarsest octave is the first; the cell size is halved with each octave.
     """
 
     coarsest_m: Annotated[Positive, Field(description="size of the coarsest octave's cells, m")]
@@ -104,10 +104,10 @@ class SiteTexture(Parameters):
 
 
 class Site(Parameters):
-    """A site to land, drive or fly.
+    """A site with its environment, photometry and terrain.
 
-    `descent` is its terrain from parachute heights (posts of metres over kilometres), `ground` from a mast or a
-    helicopter (posts of centimetres over 100-200 m); a site has at least one.
+    `descent` is the terrain for pictures of a descent (spacing of metres over kilometres). `ground` is the terrain for
+    pictures of a rover or a helicopter (spacing of centimetres over 100-200 m). A site has at least one of them.
     """
 
     name: str
@@ -127,13 +127,13 @@ class Site(Parameters):
         return self.model_copy(update={"environment": air})
 
     def terrain(self, scale: str | None = None, changes: Mapping[str, Any] | None = None) -> TerrainParameters:
-        """Return the terrain at a scale, 'descent' or 'ground', with some parameters changed; default: the coarsest.
+        """Return the terrain parameters at a scale, 'descent' or 'ground'; the default is the coarsest scale.
 
-        `changes` are those of `TerrainParameters.changed`: fewer samples for a large bank, a `source` of real terrain.
-        Raises ValueError where the site has no terrain at that scale, or a change is invalid.
+        `changes` are those of `TerrainParameters.with_changes`, for example fewer samples, or a DTM as `source`. Raises
+        ValueError if the site has no terrain at this scale, or a change is invalid.
         """
         if scale not in (None, "descent", "ground"):
-            raise ValueError(f"'{scale}' is no scale of terrain; allowed: descent, ground")
+            raise ValueError(f"'{scale}' is not a valid scale of terrain; allowed: descent, ground")
         terrain = (self.descent or self.ground) if scale is None else getattr(self, scale)
         if not isinstance(terrain, TerrainParameters):
             raise ValueError(f"site {self.name} has no terrain at the scale '{scale}'")
@@ -142,7 +142,7 @@ class Site(Parameters):
 
 @dataclass(frozen=True)
 class PaperFigures:
-    """Published figures of a site: ranges from lowest to highest; slopes hold for baselines of 30 m and 90 m."""
+    """Published values of a site: minimum and maximum; slopes are those for baselines of 30 m and 90 m."""
 
     albedo: tuple[float, float]
     mean_slope_deg: tuple[float, float]
@@ -151,7 +151,7 @@ class PaperFigures:
 
 
 _MER_SITE = PaperFigures((0.1, 0.3), (1.0, 2.0), None, "MOC: a lower limit, seen through dust")
-#: DIMES field test paper, section III.A; it gives the MER landing sites together.
+#: DIMES field test paper, section III.A; it contains common values for the MER landing sites.
 PAPER: dict[str, PaperFigures] = {
     "pisgah": PaperFigures((0.1, 0.1), (2.0, 3.0), None, "very little; like synthesised images of most MER sites"),
     "kelso": PaperFigures((0.5, 0.5), (2.0, 3.0), (200.0, float("inf")), "repetitive"),
@@ -163,7 +163,7 @@ PAPER: dict[str, PaperFigures] = {
 
 @cache
 def sites() -> dict[str, Site]:
-    """Return all sites of ``sites.toml`` by name."""
+    """Return all sites in ``sites.toml`` by name."""
     tables = tomllib.loads(Path(__file__).with_name("sites.toml").read_text("utf-8"))
     loaded = {}
     for name, entry in tables["sites"].items():
@@ -171,23 +171,23 @@ def sites() -> dict[str, Site]:
         for scale in {"descent", "ground"} & set(entry):
             entry[scale] = _with_base(entry[scale], tables["grounds"])
         for texture, coarsest_m in (("ground_texture", 3.0), ("rock_texture", 0.2)):
-            # octaves down to a millimetre, each `decay` times as strong as the one before
-            strongest, decay = entry[texture]["amplitude"], entry[texture]["decay"]
+            # octaves down to 1 mm; amplitudes decrease by the factor `decay`
+            first_amplitude, decay = entry[texture]["amplitude"], entry[texture]["decay"]
             octaves = range(int(np.log2(coarsest_m / 0.001)) + 1)
-            amplitudes = tuple(round(strongest * decay**n, 5) for n in octaves)
+            amplitudes = tuple(round(first_amplitude * decay**n, 5) for n in octaves)
             entry[texture] = SiteTexture(coarsest_m=coarsest_m, amplitudes=amplitudes)
         loaded[name] = Site(name=name, **entry)
     return loaded
 
 
 def _with_base(entry: dict[str, Any], bases: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Fill in the values of the entry's base."""
-    own = {key: value for key, value in entry.items() if key != "base"}
-    return {**_with_base(bases[entry["base"]], bases), **own} if "base" in entry else own
+    """Merge an entry with the values of its base."""
+    values = {key: value for key, value in entry.items() if key != "base"}
+    return {**_with_base(bases[entry["base"]], bases), **values} if "base" in entry else values
 
 
 def site(name: str) -> Site:
-    """Return the site of this name. Raises ValueError, naming the existing ones."""
+    """Return the site with this name. Raises ValueError if there is none; the message lists the sites."""
     if name not in sites():
         raise ValueError(f"no site is called '{name}'; allowed: {', '.join(sites())}")
     return sites()[name]

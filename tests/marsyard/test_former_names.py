@@ -18,7 +18,7 @@ from marsyard.cli.app import main
 from marsyard.reports.stored import read_run
 from marsyard.scenarios.systems import row_columns, scenario, scenario_names
 from marsyard.sim import parameters
-from marsyard.sim.parameters import RenamedWarning
+from marsyard.sim.parameters import DeprecatedNameWarning
 
 TABLE = tomllib.loads(Path(parameters.__file__).with_name("renamed.toml").read_text())
 CAMPAIGN = """
@@ -60,7 +60,7 @@ def files(tmp_path: Path) -> tuple[Path, Path]:
 
 def test_a_campaign_with_former_names_is_the_same_campaign(files: tuple[Path, Path]) -> None:
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", RenamedWarning)
+        warnings.simplefilter("always", DeprecatedNameWarning)
         former = load_campaign(str(files[0]))
     expected = load_campaign(str(files[1]))
     assert former.configuration == expected.configuration
@@ -71,7 +71,7 @@ def test_a_campaign_with_former_names_is_the_same_campaign(files: tuple[Path, Pa
 
 
 def test_an_option_with_a_former_name_sets_the_parameter(files: tuple[Path, Path]) -> None:
-    with pytest.warns(RenamedWarning, match="'place' is now 'location'"):
+    with pytest.warns(DeprecatedNameWarning, match="'place' is now 'location'"):
         campaign = load_campaign(str(files[1]), ["place.terrain=1"])
     assert campaign.configuration.parameters["location"]["terrain"] == 1
     assert set(campaign.configuration.dispersions) == {"descent.cone_minor_fraction"}
@@ -102,7 +102,10 @@ def test_a_stored_campaign_is_read_by_the_current_names(files: tuple[Path, Path]
 
 def test_a_former_option_is_accepted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(sys, "argv", ["marsyard", "replay", str(tmp_path), "0", "--step"])
-    with pytest.warns(RenamedWarning, match="'--step' is now '--save-stages'"), pytest.raises(SystemExit) as ended:
+    with (
+        pytest.warns(DeprecatedNameWarning, match="'--step' is now '--save-stages'"),
+        pytest.raises(SystemExit) as ended,
+    ):
         main()
     assert ended.value.code == 2
     assert sys.argv[-1] == "--save-stages"

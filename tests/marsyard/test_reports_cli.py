@@ -206,7 +206,7 @@ def _read_record(directory: Path) -> str:
 
 def test_undecidable_requirements_are_rejected(tmp_path: Path) -> None:
     campaign = load_campaign(str(write_campaign(tmp_path, requirement="")))
-    with pytest.raises(CampaignError, match="no requirement that is decided"):
+    with pytest.raises(CampaignError, match="no requirement with a confidence level"):
         run_until_decided(campaign, tmp_path / "run", ExecutorConfig(jobs=1), RecordingWatch())
     latin = write_campaign(tmp_path, more='[design]\nkind = "latin-hypercube"\n')
     with pytest.raises(CampaignError, match="only independent random samples"):

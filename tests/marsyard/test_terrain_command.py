@@ -50,7 +50,7 @@ def test_file_statistics_report_real_and_filled_posts(tile: str) -> None:
     message = " ".join(output.split())
     assert "Filled: 1 posts without height" in message
     assert "mean slope over 30 m, deg" in message
-    assert "synthetic around it" in message
+    assert "the terrain around it is synthetic" in message
     assert json.loads(run_terrain_command("stats", tile, "--json")[1])["real"]["posting_m"] == 2.0
 
 

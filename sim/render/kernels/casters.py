@@ -1,9 +1,9 @@
-"""Occlusion of the sun by triangles, listed by their position across the sun's rays.
+"""Occlusion of the sun by triangles, with a two-level grid perpendicular to the sun's direction.
 
-All rays to the sun are parallel: seen along it, each is a point (u, v), and its distance s to a triangle's plane and
-the weights of the corners there are linear in u and v. The triangles of a body are listed in the cells of a grid over
-the body's outline as the sun sees it, and bodies in the cells of one grid over them all. A ray is then tested against
-the few triangles of one cell of each body in whose outline it lies.
+All rays to the sun are parallel. Projected along the sun's direction, a ray is a point (u, v). The coordinate s of a
+triangle's plane and the barycentric weights are linear in u and v. The triangles of each body are listed in the cells
+of a grid over the body's projection. The bodies are listed in the cells of one grid over all bodies. A ray is tested
+only against the triangles of one cell of each body with a projection that contains the ray.
 """
 
 from __future__ import annotations
@@ -17,28 +17,29 @@ from marsyard.sim.render.kernels.strips import rotate, unpack_matrix
 from marsyard.sim.render.kernels.structs import Flags, Longs
 from marsyard.sim.terrain.kernels import Array
 
-#: Cells of a grid: least u and v, cells per metre along u and v; cells along a side; the first item of each cell, and
-#: the end of the last; the items.
+#: Grid over all bodies: (minimum u and v, cells per metre along u and v); cells along a side; start of each cell's list
+#: and the end of the last; bodies listed in the cells.
 Grid = tuple[Array, Longs, Longs, Longs]
-#: The same for every body: rows of outlines (least u and v, cells per metre along both, greatest s) and of side and
-#: first cell; first item of each cell; triangles in cells; greatest s of each of these.
+#: Grids of the bodies: one row of (minimum u and v, cells per metre along u and v, maximum s) per body; one row of
+#: (cells along a side, first cell) per body; start of each cell's list and the end of the last; triangles listed in
+#: the cells; maximum s of each listed triangle.
 BodyGrids = tuple[Array, Longs, Longs, Longs, Array]
-#: Linear functions of each triangle (constant, slope along u, slope along v): the weights of its second and third
-#: corner, and s of its plane; unit vectors u and v across the sun's direction, and s along it; grids.
+#: Linear functions of each triangle (constant, slope along u, slope along v): the weights of the second and third
+#: corner, and s of its plane; unit vectors u and v perpendicular to the sun's direction, and s along it; grids.
 Casters = tuple[Array, Array, Grid, BodyGrids]
-#: Least u and v, greatest u, v and s; or least u and v, cells per metre along both, and greatest s.
+#: Minimum u and v, maximum u, v and s; or minimum u and v, cells per metre along u and v, and maximum s.
 Rect = tuple[float, float, float, float, float]
-#: Triangles per cell of a body's grid, if each lay in one cell, and the largest number of cells along a side.
-PER_CELL, MAX_CELLS = 4, 1024
-#: Slack of all bounds, metres: more than rounding.
+#: Average number of triangles per cell of a body's grid, and the maximum number of cells along a side.
+TRIANGLES_PER_CELL, MAX_CELLS = 4, 1024
+#: Margin of all bounds, metres; larger than rounding errors.
 SLACK_M = 1e-6
-#: Twice the area in which the sun sees a triangle, square metres, below which it is seen edge-on and hides nothing.
-EDGE_ON = 1e-18
+#: Twice the projected area of a triangle, square metres, below which it is edge-on and casts no shadow.
+MIN_DOUBLE_AREA_M2 = 1e-18
 
 
 @njit(cache=True)
 def _project_along_sun(triangles: Array, axes: Array) -> tuple[Array, Array]:
-    """Bounds of each triangle (least u and v, greatest u, v and s), and its linear coefficients (`Casters`)."""
+    """Bounds of each triangle (minimum u and v, maximum u, v and s), and its linear coefficients (`Casters`)."""
     bounds = np.empty((triangles.shape[0], 5))
     linear = np.empty((triangles.shape[0], 9))
     at = np.empty((3, 3))
@@ -55,7 +56,7 @@ def _project_along_sun(triangles: Array, axes: Array) -> tuple[Array, Array]:
         u2, v2, s2 = at[0, 1] - u, at[1, 1] - v, at[2, 1] - s
         u3, v3, s3 = at[0, 2] - u, at[1, 2] - v, at[2, 2] - s
         area = u2 * v3 - u3 * v2
-        if abs(area) < EDGE_ON:
+        if abs(area) < MIN_DOUBLE_AREA_M2:
             linear[n] = math.nan
             continue
         second_u, second_v = v3 / area, -u3 / area
@@ -69,7 +70,7 @@ def _project_along_sun(triangles: Array, axes: Array) -> tuple[Array, Array]:
 
 @njit(cache=True)
 def _joint_bounds(bounds: Array, first: int, end: int) -> Rect:
-    """Joint bounds of some rows of bounds."""
+    """Joint bounds of the rows from `first` to before `end`."""
     u0, v0, u1, v1, s1 = math.inf, math.inf, -math.inf, -math.inf, -math.inf
     for n in range(first, end):
         u0 = min(u0, bounds[n, 0])
@@ -82,22 +83,21 @@ def _joint_bounds(bounds: Array, first: int, end: int) -> Rect:
 
 @njit(cache=True)
 def _cells_per_side(items: float) -> int:
-    """Cells along a side for about one of so many items to a cell."""
+    """Number of cells along a side for about one item per cell."""
     return min(max(math.ceil(math.sqrt(items)), 1), MAX_CELLS)
 
 
 @njit(cache=True, inline="always")
 def _cell(value: float, low: float, per_metre: float, count: int) -> int:
-    """The cell of a coordinate; those at the borders include values beyond by rounding."""
+    """Cell index of a coordinate; values outside the grid by rounding errors belong to its border cells."""
     return min(max(int((value - low) * per_metre), 0), count - 1)
 
 
 @njit(cache=True)
 def _add_to_cells(bounds: Array, n: int, outline: Array, side: int, first: int, ends: Longs, items: Longs) -> None:
-    """Add a row of bounds to the list of each cell that it touches, of a grid over an outline.
+    """Add the n-th row of bounds to the list of each cell of a grid that it overlaps.
 
-    `first` is the grid's first cell; `ends` are the current ends of cells' lists, updated. Without space for items,
-    they are only counted.
+    `first` is the grid's first cell; `ends`, the ends of the cells' lists, are updated. An empty `items` only counts.
     """
     low, high = _cell(bounds[n, 1], outline[1], outline[3], side), _cell(bounds[n, 3], outline[1], outline[3], side)
     left, right = _cell(bounds[n, 0], outline[0], outline[2], side), _cell(bounds[n, 2], outline[0], outline[2], side)
@@ -113,16 +113,16 @@ def _add_to_cells(bounds: Array, n: int, outline: Array, side: int, first: int, 
 def _list_in_cells(
     bounds: Array, first_row: Longs, outlines: Array, sides: Longs, first_cells: Longs
 ) -> tuple[Longs, Longs]:
-    """List rows of bounds in the cells of grids: rows from `first_row[g]` to the next belong to grid g.
+    """List the rows of bounds in the cells of grids; rows `first_row[g]` to `first_row[g + 1] - 1` belong to grid g.
 
-    Returns the start of each cell's list and the end of the last, and the items.
+    Returns the start of each cell's list and the end of the last, and the listed rows.
     """
     grids = sides.size
     cells = first_cells[-1] + sides[-1] ** 2 if grids > 0 else 0
     starts = np.zeros(cells + 1, dtype=np.int64)
     items = np.empty(0, dtype=np.int64)
     for filling in range(2):
-        # count, one cell ahead, then list
+        # the first pass counts the entries of each cell, the second lists them
         ends = starts[:-1].copy() if filling else starts[1:]
         for grid in range(grids):
             for n in range(first_row[grid], first_row[grid + 1]):
@@ -135,14 +135,14 @@ def _list_in_cells(
 
 
 @njit(cache=True)
-def _outline(rect: Rect, side: int) -> Rect:
-    """Least u and v, cells per metre along both, and greatest s of a grid over some bounds."""
+def _grid_rect(rect: Rect, side: int) -> Rect:
+    """Minimum u and v, cells per metre along u and v, and maximum s of a grid over these bounds."""
     return rect[0], rect[1], side / (rect[2] - rect[0]), side / (rect[3] - rect[1]), rect[4]
 
 
 @njit(cache=True)
 def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Casters:
-    """List the triangles of bodies, contiguous ranges, for a sun in the direction of the third axis."""
+    """Build the grids of bodies' triangles, in contiguous ranges, for a sun in the direction of the third axis."""
     bodies = first_triangle.size - 1
     bounds, linear = _project_along_sun(triangles, axes)
     rects = np.empty((bodies, 5))
@@ -151,9 +151,9 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
     cells = 0
     for body in range(bodies):
         first, end = first_triangle[body], first_triangle[body + 1]
-        side = _cells_per_side((end - first) / PER_CELL)
+        side = _cells_per_side((end - first) / TRIANGLES_PER_CELL)
         rect = _joint_bounds(bounds, first, end)
-        rects[body], outlines[body] = rect, _outline(rect, side)
+        rects[body], outlines[body] = rect, _grid_rect(rect, side)
         shapes[body, 0], shapes[body, 1] = side, cells
         cells += side * side
     starts, items = _list_in_cells(bounds, first_triangle, outlines, shapes[:, 0].copy(), shapes[:, 1].copy())
@@ -164,7 +164,7 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
     sides = np.array([_cells_per_side(float(bodies))])
     joint = np.array([[0.0, 0.0, 1.0, 1.0, 0.0]])
     if bodies > 0:
-        joint[0] = _outline(_joint_bounds(rects, 0, bodies), sides[0])
+        joint[0] = _grid_rect(_joint_bounds(rects, 0, bodies), sides[0])
     first_items, bodies_listed = _list_in_cells(rects, np.array([0, bodies]), joint, sides, np.zeros(1, dtype=np.int64))
     grid: Grid = (joint[0, :4].copy(), sides, first_items, bodies_listed)
     return linear, axes, grid, (outlines, shapes, starts, items, tops)
@@ -172,9 +172,9 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
 
 @njit(cache=True)
 def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) -> None:
-    """Test whether a triangle stands between positions and the sun; `hidden` is the output.
+    """Test whether a triangle occludes the sun at each position; `hidden` is the output.
 
-    All positions in one call: passing so many arrays takes longer than most positions do.
+    All positions are tested in one call, as passing the arrays takes longer than testing most positions.
     """
     linear, axes, (grid, sides, starts, items), (outlines, shapes, first_items, listed, tops) = casters
     to_axes = unpack_matrix(axes)
@@ -185,23 +185,23 @@ def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) ->
         hidden[position] = False
         column = (u - west) * per_u
         row = (v - south) * per_v
-        # bounds have slack: a ray on the border meets nothing
+        # bounds have a margin: a ray on the border hits no triangle
         if not (0.0 <= column < side and 0.0 <= row < side):
             continue
-        of_all = int(row) * side + int(column)
-        k = starts[of_all]
-        while k < starts[of_all + 1] and not hidden[position]:
+        cell = int(row) * side + int(column)
+        k = starts[cell]
+        while k < starts[cell + 1] and not hidden[position]:
             body = items[k]
             k += 1
             if outlines[body, 4] < s:
                 continue
-            fine = shapes[body, 0]
+            body_side = shapes[body, 0]
             column = (u - outlines[body, 0]) * outlines[body, 2]
             row = (v - outlines[body, 1]) * outlines[body, 3]
-            if not (0.0 <= column < fine and 0.0 <= row < fine):
+            if not (0.0 <= column < body_side and 0.0 <= row < body_side):
                 continue
-            cell = shapes[body, 1] + int(row) * fine + int(column)
-            for m in range(first_items[cell], first_items[cell + 1]):
+            body_cell = shapes[body, 1] + int(row) * body_side + int(column)
+            for m in range(first_items[body_cell], first_items[body_cell + 1]):
                 if tops[m] < s:
                     continue
                 n = listed[m]

@@ -1,4 +1,4 @@
-"""Kernels of pixels at edges: their selection, the rays in them, and the hits of these."""
+"""Antialiasing kernels: select pixels at edges, compute subpixel rays, and intersect these with the scene."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from marsyard.sim.render.kernels.ground import cross_ground, entry_distance, exit_distance
+from marsyard.sim.render.kernels.ground import entry_distance, exit_distance, intersect_ground
 from marsyard.sim.render.kernels.hierarchy import Hierarchy, TriangleHit, list_in_beam, nearer_hit, nearest_hit
 from marsyard.sim.render.kernels.structs import (
     Array32,
@@ -24,58 +24,58 @@ from marsyard.sim.render.kernels.structs import (
 )
 from marsyard.sim.terrain.kernels import Array
 
-#: Relative difference of brightness from which an edge between two objects matters: four times the noise at SNR 100:1.
-EDGE_CONTRAST = 0.04
-#: Relative difference of brightness from which there is an edge of a shadow; texture seldom reaches it.
-LIGHT_CONTRAST = 0.25
-#: Jump in inverse range, relative, and as a multiple of the change next to it, from which one surface occludes another.
-JUMP, STEEPER = 0.02, 3.0
+#: Minimum relative contrast of an edge between two objects: four times the noise at a signal-to-noise ratio of 100.
+MIN_EDGE_CONTRAST = 0.04
+#: Minimum relative contrast of a shadow edge; texture rarely has this contrast.
+MIN_SHADOW_CONTRAST = 0.25
+#: Minimum jump of an occlusion in range, relative to the range, and in inverse range, relative to neighbouring changes.
+MIN_RANGE_JUMP, MIN_JUMP_RATIO = 0.02, 3.0
 #: Limits of the search for the ground, relative to the range of a neighbouring pixel.
-AHEAD, BEYOND = 0.95, 1.05
-#: The same next to the sky, where range grows without bound from pixel to pixel.
-TO_HORIZON = 5.0
-#: Largest number of triangles listed for a pixel's beam; with more, each ray traverses the hierarchy.
+SEARCH_START, SEARCH_END = 0.95, 1.05
+#: Far limit next to the sky, where range grows without bound from pixel to pixel.
+HORIZON_SEARCH_END = 5.0
+#: Maximum number of triangles listed for a pixel's beam; with more triangles, each ray traverses the hierarchy.
 MAX_LISTED = 96
-#: Half a pixel's diagonal, in pixels, and a margin, as pixels are not quite square.
-BEAM_PX = 0.8
+#: Half a pixel's diagonal, in pixels, with a margin because pixels are not exactly square.
+BEAM_RADIUS_PX = 0.8
 
 
 @njit(cache=True, inline="always")
-def _jumps(before: float, here: float, there: float, after: float) -> bool:
-    """Whether range jumps between the middle two of four distances along a line, where a plane's would not.
+def _is_range_jump(range0: float, range1: float, range2: float, range3: float) -> bool:
+    """Whether the range jumps between the second and the third of four pixels in a line.
 
-    A plane's inverse range is linear over the picture.
+    The inverse range of a plane is linear in the picture, so it has no jump.
     """
-    if not abs(there - here) > JUMP * max(here, there):
+    if not abs(range2 - range1) > MIN_RANGE_JUMP * max(range1, range2):
         return False
-    q0, q1, q2, q3 = 1.0 / before, 1.0 / here, 1.0 / there, 1.0 / after
+    q0, q1, q2, q3 = 1.0 / range0, 1.0 / range1, 1.0 / range2, 1.0 / range3
     step = abs(q2 - q1)
-    return bool(step > STEEPER * max(abs(q1 - q0), abs(q3 - q2)))
+    return bool(step > MIN_JUMP_RATIO * max(abs(q1 - q0), abs(q3 - q2)))
 
 
 @njit(cache=True)
-def _differ(
-    line: Array32, next_line: Array32, far: Array, next_far: Array, body: Ints, next_body: Ints, differs: Flags
+def _find_candidates(
+    line: Array32, next_line: Array32, t: Array, next_t: Array, body: Ints, next_body: Ints, is_candidate: Flags
 ) -> None:
-    """Test a necessary condition of an edge between neighbouring pixels of two lines; few meet it."""
+    """Test a necessary condition of an edge between neighbouring pixels of two lines; `t` are distances."""
     for j in range(next_line.size):
-        here, there = line[j], next_line[j]
-        brighter = here if here > there else there
-        change = abs(there - here)
-        farther = far[j] if far[j] > next_far[j] else next_far[j]
-        jumps = abs(next_far[j] - far[j]) > JUMP * farther
-        other = (body[j] != next_body[j]) | (change > np.float32(LIGHT_CONTRAST) * brighter) | jumps
-        differs[j] = (change >= np.float32(EDGE_CONTRAST) * brighter) & other
+        first, second = line[j], next_line[j]
+        brighter = first if first > second else second
+        change = abs(second - first)
+        farther = t[j] if t[j] > next_t[j] else next_t[j]
+        has_jump = abs(next_t[j] - t[j]) > MIN_RANGE_JUMP * farther
+        has_cause = (body[j] != next_body[j]) | (change > np.float32(MIN_SHADOW_CONTRAST) * brighter) | has_jump
+        is_candidate[j] = (change >= np.float32(MIN_EDGE_CONTRAST) * brighter) & has_cause
 
 
 @njit(cache=True)
 def mark_edges(radiance: Array32, distance: Array, body: Ints, marked: Flags) -> None:
-    """Mark the pixels on both sides of every visible edge of an object, of ground before ground, or of a shadow.
+    """Mark the pixels on both sides of each visible edge of an object, a terrain occlusion or a shadow.
 
-    `marked` is the output, all False before.
+    `marked` is the output; all its values must be False before the call.
     """
     rows, columns = radiance.shape
-    differs = np.empty(columns, dtype=np.bool_)
+    is_candidate = np.empty(columns, dtype=np.bool_)
     for i in range(rows):
         for side in range(2):
             i2 = i + side
@@ -83,28 +83,28 @@ def mark_edges(radiance: Array32, distance: Array, body: Ints, marked: Flags) ->
                 continue
             last = columns - 1 + side
             shift = 1 - side
-            far, next_far = distance[i], distance[i2, shift:]
-            _differ(radiance[i], radiance[i2, shift:], far, next_far, body[i], body[i2, shift:], differs)
+            t, next_t = distance[i], distance[i2, shift:]
+            _find_candidates(radiance[i], radiance[i2, shift:], t, next_t, body[i], body[i2, shift:], is_candidate)
             for j in range(last):
-                if not differs[j]:
+                if not is_candidate[j]:
                     continue
                 j2 = j + shift
-                here, there = radiance[i, j], radiance[i2, j2]
-                edge = body[i, j] != body[i2, j2] or abs(there - here) > LIGHT_CONTRAST * max(here, there)
-                if not edge:
+                first, second = radiance[i, j], radiance[i2, j2]
+                is_edge = body[i, j] != body[i2, j2] or abs(second - first) > MIN_SHADOW_CONTRAST * max(first, second)
+                if not is_edge:
                     i0, j0 = max(i - side, 0), max(j - 1 + side, 0)
                     i3, j3 = min(i2 + side, rows - 1), min(j2 + 1 - side, columns - 1)
-                    edge = _jumps(distance[i0, j0], distance[i, j], distance[i2, j2], distance[i3, j3])
-                if edge:
+                    is_edge = _is_range_jump(distance[i0, j0], distance[i, j], distance[i2, j2], distance[i3, j3])
+                if is_edge:
                     marked[i, j], marked[i2, j2] = True, True
 
 
 @njit(cache=True)
 def split_rays(rays: Array32, size: tuple[int, int], pixels: Longs, side: int, unit: bool, out: Array32) -> None:
-    """Interpolate vectors at side x side positions within each of some pixels, from those at all pixels' centres.
+    """Interpolate vectors at side x side positions within each of these pixels, from those at all pixels' centres.
 
-    The positions are a square grid rotated so that no two share a row or a column: an edge along either is resolved to
-    1 / side**2. `size` is rows and columns; `unit` normalises the vectors; `out` is the output.
+    The positions are a rotated square grid: no two positions are in the same row or column, so a horizontal or vertical
+    edge is resolved to 1 / side**2. `size` is rows and columns; `unit` normalises the vectors; `out` is the output.
     """
     rows, columns = size
     number = 0
@@ -143,9 +143,10 @@ def split_rays(rays: Array32, size: tuple[int, int], pixels: Longs, side: int, u
 def _gather_neighbours(
     hits: Hits, pixel: int, columns: int, ranges: Array, levels: Longs
 ) -> tuple[int, bool, bool, float]:
-    """Ranges at which a pixel and the eight around it meet the ground, in increasing order, and the level of each.
+    """Sort the ground ranges of a 3 x 3 neighbourhood of pixels, with their terrain levels, in increasing order.
 
-    Returns their number, whether one pixel sees the sky, whether one sees an object, and the greatest range.
+    `ranges` and `levels` are outputs. Returns the number of ground pixels, whether a pixel shows the sky, whether a
+    pixel shows an object, and the maximum range.
     """
     row = pixel // columns
     column = pixel - row * columns
@@ -174,13 +175,13 @@ def _gather_neighbours(
 
 @njit(cache=True, fastmath={"contract"})
 def trace_subpixel_rays(
-    ground: Ground, pose: Pose, tree: Hierarchy, columns: int, pixels: Longs, rays: Rays, seen: Hits, hits: Hits
+    ground: Ground, pose: Pose, tree: Hierarchy, columns: int, pixels: Longs, rays: Rays, primary: Hits, hits: Hits
 ) -> None:
-    """Trace the rays within some pixels, among what these pixels and the eight around each see.
+    """Trace the subpixel rays of these pixels, with the hits of each pixel's 3 x 3 neighbourhood as first guesses.
 
-    Triangles are tested that a beam around the pixel may meet. The ground is searched near the ranges of the pixels
-    around, on their levels, so that neighbouring pixels show one ground. `rays` has equally many of each pixel in
-    order; `seen` holds the hits of all pixels, `hits` is the output.
+    Only triangles inside a beam around the pixel are tested. The ground is searched near the ranges of the neighbouring
+    pixels, on their terrain levels, so that the ground is continuous. `rays` contains the same number of rays for each
+    pixel, in order; `primary` are the hits of all pixels; `hits` is the output.
     """
     fields, ceilings, _top_level, spacing, extent = ground
     rays_per_pixel = rays.directions.shape[0] // max(pixels.size, 1)
@@ -190,57 +191,58 @@ def trace_subpixel_rays(
     origin, direction = np.empty((1, 3), dtype=np.float32), np.empty((1, 3), dtype=np.float32)
     for k in range(pixels.size):
         pixel = pixels[k]
-        count, sky, objects, farthest = _gather_neighbours(seen, pixel, columns, ranges, levels)
-        in_list = -1
+        count, sky, objects, farthest = _gather_neighbours(primary, pixel, columns, ranges, levels)
+        listed_count = -1
         first, last = k * rays_per_pixel, (k + 1) * rays_per_pixel
         if objects:
-            # the ray through the pixel's centre is the mean of its first ray and its last
+            # the ray through the pixel's centre is the mean of the first and the last subpixel ray
             for axis in range(3):
                 origin[0, axis] = 0.5 * (rays.origins[first, axis] + rays.origins[last - 1, axis])
                 direction[0, axis] = 0.5 * (rays.directions[first, axis] + rays.directions[last - 1, axis])
-            middle = world_ray(pose, Rays(origin, direction, rays.pixel_angles), 0)
-            spread = BEAM_PX * rays.pixel_angles[first]
-            in_list = list_in_beam(tree, middle, spread, math.inf if sky else BEYOND * farthest, listed)
+            centre_ray = world_ray(pose, Rays(origin, direction, rays.pixel_angles), 0)
+            half_angle = BEAM_RADIUS_PX * rays.pixel_angles[first]
+            max_range = math.inf if sky else SEARCH_END * farthest
+            listed_count = list_in_beam(tree, centre_ray, half_angle, max_range, listed)
         for n in range(first, last):
             ray = world_ray(pose, rays, n)
             hit = TriangleHit(math.inf, -1, 0.0, 0.0)
-            for m in range(in_list):
+            for m in range(listed_count):
                 hit = nearer_hit(hit, tree[0], listed[m], ray, 0.0)
             t = math.inf
             level = 0
             end = math.inf
             c = 0
             while c < count and t == math.inf:
-                # ranges on one level form one interval; it begins where the one before has ended
+                # consecutive ranges on one level form one interval, which starts at the end of the previous interval
                 level = levels[c]
-                start = max(min(AHEAD * ranges[c], end), entry_distance(extent, ray))
+                start = max(min(SEARCH_START * ranges[c], end), entry_distance(extent, ray))
                 # ground behind an object is hidden
                 if start >= hit.distance:
                     break
                 while c + 1 < count and levels[c + 1] == level:
                     c += 1
-                end = (TO_HORIZON if sky and c + 1 == count else BEYOND) * ranges[c]
+                end = (HORIZON_SEARCH_END if sky and c + 1 == count else SEARCH_END) * ranges[c]
                 end = min(end, exit_distance(extent, ray))
                 m = max(level, 0)
                 ground_level = GroundLevel(fields[m], ceilings[m], 1.0 / spacing / (1 << m))
-                t = cross_ground(ground_level, ray, start, min(end, hit.distance))
+                t = intersect_ground(ground_level, ray, start, min(end, hit.distance))
                 c += 1
-            if in_list < 0 and objects:
+            if listed_count < 0 and objects:
                 hit = nearest_hit(tree, ray, t)
             if not hit.distance < t:
                 hit = TriangleHit(t, -1, 0.0, 0.0)
             if hit.distance == math.inf and not sky:
                 if count > 0:
-                    # grazes the ground without dipping below it
+                    # the ray grazes the ground without an intersection
                     hit = TriangleHit(ranges[count - 1], -1, 0.0, 0.0)
                 else:
-                    # a sliver of ground that no neighbouring pixel sees
-                    level = int(seen.level[pixel])
-                    triangle: Any = np.int64(seen.triangle[pixel])
+                    # no pixel of the neighbourhood shows ground: use the pixel's primary hit
+                    level = int(primary.level[pixel])
+                    triangle: Any = np.int64(primary.triangle[pixel])
                     second, third = 0.0, 0.0
                     if triangle >= 0:
-                        second, third = float(seen.weights[pixel, 0]), float(seen.weights[pixel, 1])
-                    hit = TriangleHit(seen.distance[pixel], triangle, second, third)
+                        second, third = float(primary.weights[pixel, 0]), float(primary.weights[pixel, 1])
+                    hit = TriangleHit(primary.distance[pixel], triangle, second, third)
             hits.distance[n] = hit.distance
             hits.triangle[n] = hit.triangle
             hits.level[n] = level

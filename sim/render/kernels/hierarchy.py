@@ -1,7 +1,7 @@
 """A bounding volume hierarchy over triangles, and the intersection of rays with it.
 
-Triangles are sorted along a Morton curve; runs of `LEAF` are the leaves of a complete binary tree, whose boxes are
-built bottom-up: a million triangles in a fraction of a second, the same tree every time.
+Triangles are sorted along a Morton curve. Groups of `LEAF` successive triangles are the leaves of a complete binary
+tree. The bounding boxes of its nodes are computed bottom-up. The tree is deterministic.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from marsyard.sim.terrain.kernels import Array
 
 
 class TriangleHit(NamedTuple):
-    """Distance along a ray, number of the triangle, -1 for none, and weights of its second and third corner there."""
+    """Distance along a ray, triangle number (-1 for none), and barycentric weights of its second and third corner."""
 
     distance: float
     triangle: int
@@ -27,9 +27,9 @@ class TriangleHit(NamedTuple):
 
 @njit(cache=True, inline="always")
 def hit_triangle(triangles: Array, n: int, ray: Ray) -> tuple[float, float, float]:
-    """Intersect a ray with a triangle's plane: distance, and weights of the second and third corner there.
+    """Intersect a ray with a triangle's plane: distance, and barycentric weights of the second and third corner.
 
-    Moeller & Trumbore (1997). The distance is infinite where the ray is parallel to the plane.
+    Moeller & Trumbore (1997). The distance is infinite if the ray is parallel to the plane.
     """
     ax, ay, az = triangles[n, 0, 0], triangles[n, 0, 1], triangles[n, 0, 2]
     ux, uy, uz = triangles[n, 1, 0] - ax, triangles[n, 1, 1] - ay, triangles[n, 1, 2] - az
@@ -48,9 +48,7 @@ def hit_triangle(triangles: Array, n: int, ray: Ray) -> tuple[float, float, floa
 
 @njit(cache=True, inline="always")
 def nearer_hit(best: TriangleHit, triangles: Array, n: int, ray: Ray, slack: float) -> TriangleHit:
-    """Return the hit of the n-th triangle if it is nearer than the best so far, else the best; `slack` widens its
-    edges.
-    """
+    """Return the hit of the n-th triangle if it is nearer than `best`, else `best`; `slack` enlarges the triangle."""
     t, second, third = hit_triangle(triangles, n, ray)
     inside = second >= -slack and third >= -slack and second + third <= 1.0 + slack
     return TriangleHit(t, n, second, third) if 0.0 < t < best.distance and inside else best
@@ -58,7 +56,7 @@ def nearer_hit(best: TriangleHit, triangles: Array, n: int, ray: Ray, slack: flo
 
 @njit(cache=True)
 def body_spheres(triangles: Array, first: Longs) -> Array:
-    """Centre of each body's bounding box, and the distance of its farthest corner from there."""
+    """Bounding sphere of each body: centre of its bounding box, and maximum distance of its corners from the centre."""
     bodies = first.size - 1
     spheres = np.empty((bodies, 4))
     for body in range(bodies):
@@ -83,30 +81,30 @@ def body_spheres(triangles: Array, first: Longs) -> Array:
 
 @njit(cache=True)
 def select_facing(triangles: Array, numbers: Longs, x: float, y: float, z: float) -> Longs:
-    """Select the triangles, by number, whose outer side faces a position."""
-    kept = np.empty(numbers.size, dtype=np.int64)
+    """Select the numbers of the triangles that face a position."""
+    selected = np.empty(numbers.size, dtype=np.int64)
     count = 0
     for n in numbers:
         ax, ay, az = triangles[n, 0, 0], triangles[n, 0, 1], triangles[n, 0, 2]
         ux, uy, uz = triangles[n, 1, 0] - ax, triangles[n, 1, 1] - ay, triangles[n, 1, 2] - az
         vx, vy, vz = triangles[n, 2, 0] - ax, triangles[n, 2, 1] - ay, triangles[n, 2, 2] - az
         nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        kept[count] = n
+        selected[count] = n
         count += nx * (x - ax) + ny * (y - ay) + nz * (z - az) > 0.0
-    return kept[:count]
+    return selected[:count]
 
 
-#: Triangles, their order along the curve, and the boxes of the tree's nodes: node k has the children 2 k + 1, 2 k + 2.
+#: Triangles, their order along the Morton curve, and the boxes of the nodes: node k has the children 2 k + 1, 2 k + 2.
 Hierarchy = tuple[Array, Longs, Array32]
-#: A side of a frustum: outward normal, offset along it, and the indices of a box's innermost corner.
+#: A side of a frustum: outward normal, offset along it, and the indices of a box's corner with the smallest offset.
 Plane = tuple[float, float, float, float, int, int, int]
-#: Triangles of a leaf.
+#: Triangles per leaf.
 LEAF = 4
 
 
 @njit(cache=True)
 def _spread_bits(value: int) -> int:
-    """Spread the bits of a number of 20 bits three apart."""
+    """Move bit k of a 20-bit number to bit 3 k (interleaving of Morton codes)."""
     value &= 0xFFFFF
     value = (value | value << 32) & 0x1F00000000FFFF
     value = (value | value << 16) & 0x1F0000FF0000FF
@@ -117,29 +115,29 @@ def _spread_bits(value: int) -> int:
 
 @njit(cache=True)
 def morton_codes(triangles: Array) -> Longs:
-    """Morton code of each triangle's centroid in the cube that contains them all."""
+    """Morton code of each triangle's centroid in the cube that contains all centroids."""
     count = triangles.shape[0]
     low = np.full(3, np.inf)
     high = np.full(3, -np.inf)
     for n in range(count):
         for axis in range(3):
-            middle = (triangles[n, 0, axis] + triangles[n, 1, axis] + triangles[n, 2, axis]) / 3.0
-            low[axis] = min(low[axis], middle)
-            high[axis] = max(high[axis], middle)
+            centroid = (triangles[n, 0, axis] + triangles[n, 1, axis] + triangles[n, 2, axis]) / 3.0
+            low[axis] = min(low[axis], centroid)
+            high[axis] = max(high[axis], centroid)
     side = max(high[0] - low[0], high[1] - low[1], high[2] - low[2], 1e-12)
     codes = np.empty(count, dtype=np.int64)
     for n in range(count):
         code = 0
         for axis in range(3):
-            middle = (triangles[n, 0, axis] + triangles[n, 1, axis] + triangles[n, 2, axis]) / 3.0
-            code |= _spread_bits(int((middle - low[axis]) / side * 1048575.0)) << axis
+            centroid = (triangles[n, 0, axis] + triangles[n, 1, axis] + triangles[n, 2, axis]) / 3.0
+            code |= _spread_bits(int((centroid - low[axis]) / side * 1048575.0)) << axis
         codes[n] = code
     return codes
 
 
 @njit(cache=True)
 def node_boxes(triangles: Array, order: Longs) -> Array32:
-    """Boxes (low x, y, z, high x, y, z) of a complete tree over the triangles in this order."""
+    """Bounding boxes (minimum x, y, z, maximum x, y, z) of a complete tree over the triangles in this order."""
     leaves = 1
     while leaves * LEAF < order.size:
         leaves *= 2
@@ -147,7 +145,7 @@ def node_boxes(triangles: Array, order: Longs) -> Array32:
     for leaf in range(leaves):
         node = leaves - 1 + leaf
         if leaf > 0 and leaf * LEAF >= order.size:
-            # an empty leaf is a point of the leaf before, which enlarges no box above it
+            # an empty leaf is a point of the previous leaf, so it does not enlarge its parent's box
             boxes[node, :3] = boxes[node - 1, :3]
             boxes[node, 3:] = boxes[node - 1, :3]
             continue
@@ -171,7 +169,7 @@ def node_boxes(triangles: Array, order: Longs) -> Array32:
 
 @njit(cache=True, inline="always")
 def _next_node(node: int) -> int:
-    """The next node outside this one's subtree, depth first; 0 after the last."""
+    """Next node in depth-first order outside this node's subtree; 0 after the last node."""
     while node > 0 and node % 2 == 0:
         node = (node - 1) // 2
     return node + 1 if node > 0 else 0
@@ -179,7 +177,7 @@ def _next_node(node: int) -> int:
 
 @njit(cache=True, inline="always")
 def _entry_distance(boxes: Array32, node: int, ray: Ray, inverse: tuple[float, float, float]) -> float:
-    """Distance at which a ray enters a box, 0 from within, infinite where it does not."""
+    """Distance at which a ray enters a node's box: 0 if it starts inside, infinite if it misses the box."""
     a, b = (boxes[node, 0] - ray.x) * inverse[0], (boxes[node, 3] - ray.x) * inverse[0]
     near, far = min(a, b), max(a, b)
     a, b = (boxes[node, 1] - ray.y) * inverse[1], (boxes[node, 4] - ray.y) * inverse[1]
@@ -196,7 +194,7 @@ def _inverse(component: float) -> float:
 
 @njit(cache=True)
 def nearest_hit(tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
-    """Find the nearest triangle that a ray meets; `farthest` and the number -1 where none is nearer than that."""
+    """Find the nearest triangle that a ray hits; distance `farthest` and number -1 if no hit is nearer than this."""
     triangles, order, boxes = tree
     best = TriangleHit(farthest, -1, 0.0, 0.0)
     if order.size == 0:
@@ -219,7 +217,7 @@ def nearest_hit(tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
 
 @njit(cache=True, inline="always")
 def _outside_beam(triangles: Array, n: int, sides: tuple[Plane, ...]) -> bool:
-    """Whether a triangle lies entirely outside one of a frustum's four sides (the fifth is the far one)."""
+    """Whether a triangle is entirely outside one of a frustum's four lateral sides (the fifth is the far side)."""
     for nx, ny, nz, offset, _ix, _iy, _iz in sides[:4]:
         outside = True
         for corner in range(3):
@@ -231,26 +229,26 @@ def _outside_beam(triangles: Array, n: int, sides: tuple[Plane, ...]) -> bool:
 
 
 @njit(cache=True, inline="always")
-def _plane(ray: Ray, nx: float, ny: float, nz: float, beyond: float) -> Plane:
-    """The plane normal to a vector, displaced by `beyond` from a ray's origin."""
-    offset = nx * ray.x + ny * ray.y + nz * ray.z + beyond
+def _plane(ray: Ray, nx: float, ny: float, nz: float, distance: float) -> Plane:
+    """The plane with this normal at a distance from a ray's origin."""
+    offset = nx * ray.x + ny * ray.y + nz * ray.z + distance
     return nx, ny, nz, offset, 0 if nx > 0.0 else 3, 1 if ny > 0.0 else 4, 2 if nz > 0.0 else 5
 
 
 @njit(cache=True)
-def list_in_beam(tree: Hierarchy, ray: Ray, spread: float, farthest: float, listed: Longs) -> int:
-    """List the triangles within an angle `spread` of a ray; return their number, or -1 where `listed` is too small."""
+def list_in_beam(tree: Hierarchy, ray: Ray, half_angle: float, farthest: float, listed: Longs) -> int:
+    """List the triangles within an angle of a ray, in `listed`; return their number, or -1 if `listed` is too small."""
     triangles, order, boxes = tree
     if order.size == 0:
         return 0
-    # a frustum around the beam: two directions across it, four sides and the far one
+    # a frustum around the beam: two perpendicular directions, four lateral sides and the far side
     dx, dy, dz = ray.dx, ray.dy, ray.dz
     rx, ry, rz = (dy, -dx, 0.0) if abs(dz) < 0.9 else (0.0, dz, -dy)
     length = math.sqrt(rx * rx + ry * ry + rz * rz)
     rx, ry, rz = rx / length, ry / length, rz / length
     ux, uy, uz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
-    widening = math.tan(spread)
-    sx, sy, sz = widening * dx, widening * dy, widening * dz
+    tangent = math.tan(half_angle)
+    sx, sy, sz = tangent * dx, tangent * dy, tangent * dz
     sides = (
         _plane(ray, rx - sx, ry - sy, rz - sz, 0.0),
         _plane(ray, -rx - sx, -ry - sy, -rz - sz, 0.0),

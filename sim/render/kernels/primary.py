@@ -1,4 +1,4 @@
-"""Kernel that traces the ray of each pixel to the ground or to a triangle."""
+"""Kernel that traces the ray of each pixel to the ground or to an object's triangle."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from marsyard.sim.render.kernels.ground import CLOSING, first_ground
+from marsyard.sim.render.kernels.ground import MAX_NEWTON_RATE, intersect_grazing_ray
 from marsyard.sim.render.kernels.hierarchy import Hierarchy, TriangleHit, nearer_hit, nearest_hit
 from marsyard.sim.render.kernels.strips import (
     ROW,
@@ -24,66 +24,71 @@ from marsyard.sim.render.kernels.strips import (
 from marsyard.sim.render.kernels.structs import Array32, Ground, GroundLevel, Hits, Ints, Longs, Pose, Ray, Rays, Views
 from marsyard.sim.terrain.kernels import Array, Level
 
-#: Smallest sine of the angle between ray and ground by which a footprint is elongated.
+#: Minimum sine of the angle between ray and horizontal, for the length of a pixel's footprint.
 FLATTEST = 0.01
-#: Footprint, in samples, up to which a ray is traced to the finest level of the terrain.
-FINE_UNTIL = 8.0
-#: Sine of the angle below which a ray may meet crests that the mesh does not resolve.
+#: Maximum footprint, in samples, of a ray that is traced on the finest level of the terrain.
+MAX_FINE_FOOTPRINT = 8.0
+#: Sine of the angle between ray and horizontal below which the ray may hit crests that the mesh does not resolve.
 GRAZING = 0.4
-#: Largest number of Newton steps, and the fraction by which they may change the first guess.
-STEPS, FARTHEST = 8, 0.05
+#: Maximum number of Newton steps, and the maximum relative change of the first guess.
+MAX_STEPS, MAX_CHANGE = 8, 0.05
 #: Relative tolerance at a triangle's edges, so that no ray passes between two triangles.
 SLACK = 1e-9
-#: Rows of a strip's buffer: origins and directions in world axes; positions in a view's picture (first in samples, then
-#: as fractions between four of them), and the component along its axis; the depths of these four.
+#: Rows of a strip's buffer: origins and directions in world axes; positions in a view (first in samples, then as
+#: fractions between four samples), and components along the view's axis; the depths at these four samples.
 X0, Y0, Z0, DX, DY, DZ, U, V, FORWARD, UPPER_LEFT, UPPER_RIGHT, LOWER_LEFT, LOWER_RIGHT = (ROW * n for n in range(13))
-#: The first guess of distance, and the pixel's footprint along the line of sight there; then, during the search for the
-#: ground, distance, initial distance, positions, samples per metre, and whether the search continues.
-GUESS, STRETCHED, MET, START, X, Y, SCALE, ACTIVE = (ROW * n for n in range(13, 21))
+#: First guess of the distance, and length of the pixel's footprint there. During the search for the ground: distance,
+#: initial distance, positions, samples per metre, and whether the search continues.
+GUESS, FOOTPRINT, DISTANCE, START, X, Y, SCALE, ACTIVE = (ROW * n for n in range(13, 21))
 ROWS = 21
 
 
 class _Strip(NamedTuple):
-    """Buffers of a strip of rays: rows of `work`, the upper left of the four samples around each ray in its view, their
-    triangle numbers combined by OR, the level on which it meets the ground, and the rays to refine.
+    """Buffers of a strip of rays.
+
+    - work: rows of numbers, `ROW` apart
+    - row, column: the upper left of the four samples around each ray in its view
+    - ids: bitwise OR of the triangle numbers of these samples
+    - level: terrain level of each ray
+    - refined: indices of the rays to refine
     """
 
     work: Array
     row: Longs
     column: Longs
-    shown: Ints
+    ids: Ints
     level: Longs
     refined: Longs
 
 
 @njit(cache=True, inline="always")
-def _nearest_depth(depth: Array32, ids: Ints, shown: int, face: int, i: int, j: int, fu: float, fv: float) -> float:
-    """Depth of the nearest ground sample among the four around a position between samples; 0 where there is none.
+def _nearest_depth(depth: Array32, ids: Ints, any_id: int, view: int, i: int, j: int, fu: float, fv: float) -> float:
+    """Depth of the nearest ground sample among the four samples around a position; 0 if there is none.
 
-    `shown` is 0 where none of them shows a triangle.
+    `any_id` is 0 if none of the four samples shows a triangle.
     """
     nearest = 0.0
     min_offset = math.inf
     for di in range(2):
         for dj in range(2):
-            value = depth[face, i + di, j + dj]
-            far = abs(fv - di) + abs(fu - dj)
-            if value > 0.0 and far < min_offset and (shown == 0 or ids[face, i + di, j + dj] == 0):
-                min_offset, nearest = far, value
+            value = depth[view, i + di, j + dj]
+            offset = abs(fv - di) + abs(fu - dj)
+            if value > 0.0 and offset < min_offset and (any_id == 0 or ids[view, i + di, j + dj] == 0):
+                min_offset, nearest = offset, value
     return nearest
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _hit_object(ids: Ints, face: int, i: int, j: int, tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
-    """Intersect a ray with the triangles that the four samples around it show; return the nearest hit.
+def _hit_object(ids: Ints, view: int, i: int, j: int, tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
+    """Intersect a ray with the triangles in the four samples around it; return the nearest hit.
 
-    Where samples show triangles and the ray meets none of them, it passes an outline, or triangles are smaller than
-    samples: then the hierarchy is searched for one nearer than `farthest`.
+    If the ray misses all of these triangles, it is near an outline, or triangles are smaller than samples. Then the
+    hierarchy is searched for a triangle nearer than `farthest`.
     """
     best = TriangleHit(math.inf, -1, 0.0, 0.0)
     last = 0
     for k in range(4):
-        identifier = ids[face, i + k // 2, j + k % 2]
+        identifier = ids[view, i + k // 2, j + k % 2]
         if identifier <= 0 or identifier == last:
             continue
         last = identifier
@@ -119,21 +124,21 @@ def _rotate_rays(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _project(
-    view: Matrix, focal: float, middle: float, directions: Array32, u: Array, v: Array, forward: Array
+    view: Matrix, focal: float, centre: float, directions: Array32, u: Array, v: Array, forward: Array
 ) -> None:
-    """Project rays into a view's picture; `forward` is their component along its axis."""
+    """Project rays into a view: outputs are positions `u` and `v`, and components along the view's axis."""
     for k in range(min(u.size, STRIP)):
         x, y, z = rotate(view, directions[3 * k], directions[3 * k + 1], directions[3 * k + 2])
-        u[k] = focal * x / z + middle
-        v[k] = focal * y / z + middle
+        u[k] = focal * x / z + centre
+        v[k] = focal * y / z + centre
         forward[k] = z
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _interpolate_guesses(pixel_angles: Array32, width: int, work: Array) -> None:
-    """First guesses of distance from four samples of continuous ground, and footprints there; 0 where it is not.
+    """First guesses of distance, and footprints, from the four samples around each ray; 0 if depth is discontinuous.
 
-    Inverse depth, linear over a plane's picture, is interpolated.
+    Inverse depth is interpolated, as the inverse depth of a plane is linear in the picture.
     """
     for k in range(min(width, STRIP)):
         a, b, c, d = work[UPPER_LEFT + k], work[UPPER_RIGHT + k], work[LOWER_LEFT + k], work[LOWER_RIGHT + k]
@@ -145,24 +150,24 @@ def _interpolate_guesses(pixel_angles: Array32, width: int, work: Array) -> None
         depth = 1.0 / ((1.0 - fv) * above + fv * below)
         t = depth / work[FORWARD + k] if smallest > 0.0 and largest < 1.1 * smallest else 0.0
         work[GUESS + k] = t
-        work[STRETCHED + k] = t * pixel_angles[k] / max(-work[DZ + k], FLATTEST)
+        work[FOOTPRINT + k] = t * pixel_angles[k] / max(-work[DZ + k], FLATTEST)
 
 
 @njit(cache=True, error_model="numpy")
 def _take_newton_step(fetched: FetchedCells, width: int, work: Array) -> None:
-    """Newton step of the followed rays; `ACTIVE` is 1 for those that continue, else 0."""
+    """Take a Newton step for the active rays; `ACTIVE` becomes 0 for rays that have converged or failed."""
     for k in range(min(width, STRIP)):
         height, slope_x, slope_y, _albedo = spline(fetched[0], fetched[1], k)
-        t, start, scale, dz = work[MET + k], work[START + k], work[SCALE + k], work[DZ + k]
-        miss = work[Z0 + k] + t * dz - height
-        closing = dz - slope_x * scale * work[DX + k] - slope_y * scale * work[DY + k]
-        step = miss / closing
-        failed = closing > CLOSING or abs(t - step - start) > FARTHEST * start
-        # after so short a step the error is below 1e-6 of the distance, as curvature is at most about 1 / spacing
-        far = step * step >= 2e-6 * start / scale
-        active = work[ACTIVE + k] > 0.0
-        work[MET + k] = (start if failed else t - step) if active else t
-        work[ACTIVE + k] = 1.0 if active and far and not failed else 0.0
+        t, start, scale, dz = work[DISTANCE + k], work[START + k], work[SCALE + k], work[DZ + k]
+        clearance = work[Z0 + k] + t * dz - height
+        rate = dz - slope_x * scale * work[DX + k] - slope_y * scale * work[DY + k]
+        step = clearance / rate
+        has_failed = rate > MAX_NEWTON_RATE or abs(t - step - start) > MAX_CHANGE * start
+        # after a shorter step the error is below 1e-6 of the distance, as curvature is at most about 1 / spacing
+        is_far = step * step >= 2e-6 * start / scale
+        is_active = work[ACTIVE + k] > 0.0
+        work[DISTANCE + k] = (start if has_failed else t - step) if is_active else t
+        work[ACTIVE + k] = 1.0 if is_active and is_far and not has_failed else 0.0
 
 
 @njit(cache=True)
@@ -176,24 +181,23 @@ def _refine_on_ground(
     work: Array,
     fetched: FetchedCells,
 ) -> None:
-    """Bring rays of a strip from their first guess, `MET`, onto the ground by Newton's method; where it fails they
-    stay.
+    """Intersect the active rays of a strip with the ground by Newton's method, starting from `DISTANCE`.
 
-    All rays take a step before any takes the next, so that the processor works on several at once. `active` holds the
-    numbers of the `count` followed rays; it is overwritten. `fetched` is a buffer for control values.
+    If the method fails, the first guess remains. All rays take a step together, so that the loop vectorises. `active`
+    contains the indices of the `count` active rays and is overwritten. `fetched` is a buffer for control values.
     """
     for k in range(width):
-        work[START + k] = work[MET + k]
+        work[START + k] = work[DISTANCE + k]
         work[ACTIVE + k] = 0.0
     for m in range(count):
         work[ACTIVE + active[m]] = 1.0
         work[SCALE + active[m]] = inverse_spacing / (1 << level_of[active[m]])
-    for _ in range(STEPS):
+    for _ in range(MAX_STEPS):
         if count == 0:
             break
         for k in range(min(width, STRIP)):
-            work[X + k] = work[X0 + k] + work[MET + k] * work[DX + k]
-            work[Y + k] = work[Y0 + k] + work[MET + k] * work[DY + k]
+            work[X + k] = work[X0 + k] + work[DISTANCE + k] * work[DX + k]
+            work[Y + k] = work[Y0 + k] + work[DISTANCE + k] * work[DY + k]
         fetch_levels(levels, inverse_spacing, level_of, active, count, work[X : X + ROW], work[Y : Y + ROW], fetched)
         _take_newton_step(fetched, width, work)
         remaining = 0
@@ -206,21 +210,21 @@ def _refine_on_ground(
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _sample_views(views: Views, directions: Array32, first: int, width: int, strip: _Strip) -> None:
-    """Project the rays of a strip into their views, and read the four samples around each."""
+    """Project the rays of a strip into their views, and read the four samples around each ray."""
     depth, ids, view_of_pixel = views.depth, views.numbers, views.view_of_pixel
-    work, row, column, shown = strip.work, strip.row, strip.column, strip.shown
+    work, row, column, any_id = strip.work, strip.row, strip.column, strip.ids
     side = depth.shape[1]
     objects = ids.shape[1] > 0
     start = 0
     while start < width:
         # pixels of one view are contiguous
-        face = view_of_pixel[first + start]
+        view = view_of_pixel[first + start]
         end = start + 1
-        while end < width and view_of_pixel[first + end] == face:
+        while end < width and view_of_pixel[first + end] == view:
             end += 1
         _project(
-            unpack_matrix(views.view_from_body[face]),
-            views.focal[face],
+            unpack_matrix(views.view_from_body[view]),
+            views.focal[view],
             side / 2.0 - 0.5,
             directions[3 * start : 3 * end],
             work[U + start : U + end],
@@ -229,56 +233,56 @@ def _sample_views(views: Views, directions: Array32, first: int, width: int, str
         )
         start = end
     for k in range(width):
-        face = view_of_pixel[first + k]
+        view = view_of_pixel[first + k]
         u, v = work[U + k], work[V + k]
         i = min(max(math.floor(v), 0), side - 2)
         j = min(max(math.floor(u), 0), side - 2)
         row[k], column[k] = i, j
         work[U + k], work[V + k] = u - j, v - i
-        work[UPPER_LEFT + k], work[UPPER_RIGHT + k] = depth[face, i, j], depth[face, i, j + 1]
-        work[LOWER_LEFT + k], work[LOWER_RIGHT + k] = depth[face, i + 1, j], depth[face, i + 1, j + 1]
+        work[UPPER_LEFT + k], work[UPPER_RIGHT + k] = depth[view, i, j], depth[view, i, j + 1]
+        work[LOWER_LEFT + k], work[LOWER_RIGHT + k] = depth[view, i + 1, j], depth[view, i + 1, j + 1]
         if objects:
-            shown[k] = ids[face, i, j] | ids[face, i, j + 1] | ids[face, i + 1, j] | ids[face, i + 1, j + 1]
+            any_id[k] = ids[view, i, j] | ids[view, i, j + 1] | ids[view, i + 1, j] | ids[view, i + 1, j + 1]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _select_levels(
     spacing: float, top_level: int, views: Views, pixel_angles: Array32, first: int, width: int, strip: _Strip
 ) -> None:
-    """Distance at which each ray of a strip meets the mesh, and the ground's level there."""
+    """Distance at which each ray of a strip hits the mesh, and the terrain level for its footprint there."""
     depth, ids, view_of_pixel = views.depth, views.numbers, views.view_of_pixel
-    work, row, column, shown, level_of = strip.work, strip.row, strip.column, strip.shown, strip.level
+    work, row, column, any_id, level_of = strip.work, strip.row, strip.column, strip.ids, strip.level
     for k in range(width):
-        if shown[k] != 0 or work[GUESS + k] == 0.0:
-            face = view_of_pixel[first + k]
-            nearest = _nearest_depth(depth, ids, shown[k], face, row[k], column[k], work[U + k], work[V + k])
+        if any_id[k] != 0 or work[GUESS + k] == 0.0:
+            view = view_of_pixel[first + k]
+            nearest = _nearest_depth(depth, ids, any_id[k], view, row[k], column[k], work[U + k], work[V + k])
             work[GUESS + k] = nearest / work[FORWARD + k]
-            work[STRETCHED + k] = work[GUESS + k] * pixel_angles[k] / max(-work[DZ + k], FLATTEST)
+            work[FOOTPRINT + k] = work[GUESS + k] * pixel_angles[k] / max(-work[DZ + k], FLATTEST)
         level_of[k] = 0
         if work[GUESS + k] == 0.0:
             work[GUESS + k] = -1.0
-            work[MET + k] = math.inf
+            work[DISTANCE + k] = math.inf
             continue
-        # far away and at a flat angle a pixel covers many samples along its line of sight: a coarser level
-        if work[STRETCHED + k] > FINE_UNTIL * spacing:
-            level_of[k] = min(int(math.log2(work[STRETCHED + k] / (FINE_UNTIL * spacing))) + 1, top_level)
-        work[MET + k] = work[GUESS + k]
+        # a coarser level if the pixel's footprint covers many samples
+        if work[FOOTPRINT + k] > MAX_FINE_FOOTPRINT * spacing:
+            level_of[k] = min(int(math.log2(work[FOOTPRINT + k] / (MAX_FINE_FOOTPRINT * spacing))) + 1, top_level)
+        work[DISTANCE + k] = work[GUESS + k]
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _write_hits(views: Views, tree: Hierarchy, first: int, width: int, strip: _Strip, hits: Hits) -> None:
-    """Write the hits of a strip's rays: the ground, or a triangle before it."""
+    """Write the hits of a strip's rays: the ground, or a triangle in front of it."""
     ids, view_of_pixel = views.numbers, views.view_of_pixel
-    work, row, column, shown, level_of, _refined = strip
+    work, row, column, any_id, level_of, _refined = strip
     distance, triangle, weights, level = hits
     for k in range(width):
         n = first + k
-        t = work[MET + k]
+        t = work[DISTANCE + k]
         on_terrain = level_of[k] == 0 and t != work[GUESS + k]
         level[n] = 0 if on_terrain else (level_of[k] if level_of[k] > 0 else -1)
         distance[n] = t
         triangle[n] = -1
-        if shown[k] != 0:
+        if any_id[k] != 0:
             hit = _hit_object(ids, view_of_pixel[n], row[k], column[k], tree, _ray(work, k), t)
             if hit.triangle >= 0 and hit.distance < t:
                 distance[n], triangle[n] = hit.distance, hit.triangle
@@ -299,21 +303,21 @@ def trace_primary_rays(ground: Ground, views: Views, pose: Pose, rays: Rays, tre
     strip = _Strip(work, longs[0], longs[1], np.zeros(STRIP, dtype=np.int32), level_of, refined)
     for first in range(0, pixels, STRIP):
         width = min(STRIP, pixels - first)
-        here = slice(3 * first, 3 * (first + width))
+        vectors = slice(3 * first, 3 * (first + width))
         angles = rays.pixel_angles[first : first + width]
-        _rotate_rays(rotation, centre, origins[here], directions[here], width, work)
-        _sample_views(views, directions[here], first, width, strip)
+        _rotate_rays(rotation, centre, origins[vectors], directions[vectors], width, work)
+        _sample_views(views, directions[vectors], first, width, strip)
         _interpolate_guesses(angles, width, work)
         _select_levels(spacing, top_level, views, angles, first, width, strip)
         count = 0
         for k in range(width):
-            if work[DZ + k] > -GRAZING and work[MET + k] < math.inf:
-                # to the first position where a grazing ray dips below the ground
+            if work[DZ + k] > -GRAZING and work[DISTANCE + k] < math.inf:
+                # first intersection of a grazing ray with the ground
                 n = level_of[k]
                 level = GroundLevel(levels[n], ceilings[n], 1.0 / spacing / (1 << n))
-                work[MET + k] = first_ground(level, extent, _ray(work, k), work[GUESS + k])
-            # a grazing ray that dips below the ground is already there; Newton's method refines the others
+                work[DISTANCE + k] = intersect_grazing_ray(level, extent, _ray(work, k), work[GUESS + k])
+            # Newton's method refines the rays without this intersection
             refined[count] = k
-            count += work[MET + k] == work[GUESS + k]
+            count += work[DISTANCE + k] == work[GUESS + k]
         _refine_on_ground(levels, 1.0 / spacing, level_of, refined, count, width, work, fetched)
         _write_hits(views, tree, first, width, strip, hits)

@@ -41,7 +41,7 @@ from marsyard.sim.render.kernels.structs import (
     Rays,
 )
 from marsyard.sim.render.kernels.sun import (
-    UNSURE,
+    COARSE_GRID_MARGIN,
     disc_above,
     disc_overlap,
     interpolate_bilinear,
@@ -334,7 +334,7 @@ def _cast_shadows(
     shadow, casters, footprint = occluders
     shadowed = shadow.height.shape[0] > 1
     objects = casters[0].shape[0] > 0
-    unsure = UNSURE * shadow.spacing
+    unsure = COARSE_GRID_MARGIN * shadow.spacing
     queried = 0
     for k in range(distance.size):
         if work[COS_I + k] <= 0.0 or body[k] == SKY:

@@ -1,4 +1,4 @@
-"""Visible fraction of the sun's disc: past the ground, past a round body, and through clouds."""
+"""Kernels of the visible fraction of the sun's disc: shadows of the ground and of a round body."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from numba import njit
 from marsyard.sim.render.kernels.structs import Array32, Bytes, GroundShadow, Longs
 from marsyard.sim.terrain.kernels import Array, Level, sample
 
-#: Rows of the grid per unit of a shadow's stored reach.
+#: Unit of the stored distances of shadow casters, in rows of the grid.
 REACH_ROWS = 4
-#: Height over a shadow's edge, in spacings of its grid, within which the grid is too coarse.
-UNSURE = 0.3
-#: Posts along a side of the blocks in which a grid is transposed: both sides of a block stay in the nearest cache.
+#: Margin above the shadow boundary, in grid spacings, within which the swept grid is not accurate enough.
+COARSE_GRID_MARGIN = 0.3
+#: Side of the blocks in which a grid is transposed: source and destination fit in the processor's first-level cache.
 BLOCK = 32
 
 
 @njit(cache=True)
 def heights_in_rows(field: Level, rows: Longs, columns: Longs, along_x: bool) -> Array32:
-    """Control values of height at some rows and columns of a level, with rows along y or along x.
+    """Copy the control values of height at these rows and columns of a level; transpose them if `along_x`.
 
-    As many as the level has are taken in order.
+    If the number of rows is that of the level, all rows and columns are copied in order.
     """
     side = rows.size
     heights = np.empty((side, side), dtype=np.float32)
@@ -43,51 +43,51 @@ def heights_in_rows(field: Level, rows: Longs, columns: Longs, along_x: bool) ->
 
 
 @njit(cache=True)
-def sweep_shadow(height: Array32, along: float, drop: float, slip: float, reach: int) -> tuple[Array32, Bytes]:
-    """Height of the shadow over every post of a periodic grid: below it the ground hides the centre of the sun.
+def sweep_shadow(height: Array32, row_sign: float, drop: float, shift: float, max_rows: int) -> tuple[Array32, Bytes]:
+    """Height of the shadow over each sample of a periodic grid; below it the ground hides the centre of the sun.
 
-    A shadow falls by `drop` metres and shifts by `-slip` columns from one row to the one before, away from the sun; the
-    ground and the shadow of a row cast the shadow of the row before. Rows run towards the sun where `along` is 1.0,
-    away from it where it is -1.0. The longest shadow covers `reach` rows: the sweep starts as many before the first.
+    The shadow height of a row is the maximum of the terrain height and the shadow height of the next row towards the
+    sun, minus `drop` metres and shifted by `-shift` columns. `row_sign` is 1.0 if the row number increases towards the
+    sun, else -1.0. `max_rows` is the length of the longest shadow in rows; the sweep starts at this distance.
 
-    Returns the shadow's height, and the distance of its caster in units of `REACH_ROWS` rows, rounded up.
+    Returns the shadow height, and the distance of the caster in units of `REACH_ROWS` rows, rounded up.
     """
     rows, columns = height.shape
     row_mask, column_mask = rows - 1, columns - 1
     shadow = np.empty_like(height)
-    away = np.empty(height.shape, dtype=np.uint8)
-    whole_columns = math.floor(slip)
-    fraction = np.float32(slip - whole_columns)
-    rest = np.float32(1.0) - fraction
-    fall = np.float32(drop)
-    before = np.full(columns, np.float32(-1e9), dtype=np.float32)
+    caster_distance = np.empty(height.shape, dtype=np.uint8)
+    whole_columns = math.floor(shift)
+    fraction = np.float32(shift - whole_columns)
+    weight = np.float32(1.0) - fraction
+    row_drop = np.float32(drop)
+    shadow_row = np.full(columns, np.float32(-1e9), dtype=np.float32)
     caster = np.empty(columns, dtype=np.float32)
-    rows_before = np.zeros(columns, dtype=np.int32)
-    rows_away = np.empty(columns, dtype=np.int32)
-    for k in range(rows + reach):
-        step = rows + reach - 1 - k
-        i = step & row_mask if along > 0.0 else (rows - 1 - step) & row_mask
-        source = (i + 1) & row_mask if along > 0.0 else (i - 1) & row_mask
+    shadow_rows = np.zeros(columns, dtype=np.int32)
+    caster_rows = np.empty(columns, dtype=np.int32)
+    for k in range(rows + max_rows):
+        step = rows + max_rows - 1 - k
+        i = step & row_mask if row_sign > 0.0 else (rows - 1 - step) & row_mask
+        source = (i + 1) & row_mask if row_sign > 0.0 else (i - 1) & row_mask
         for j in range(columns):
-            caster[j] = max(height[source, j], before[j])
-            rows_away[j] = 0 if height[source, j] >= before[j] else rows_before[j]
+            caster[j] = max(height[source, j], shadow_row[j])
+            caster_rows[j] = 0 if height[source, j] >= shadow_row[j] else shadow_rows[j]
         for j in range(columns):
             a = (j + whole_columns) & column_mask
             b = (a + 1) & column_mask
-            before[j] = rest * caster[a] + fraction * caster[b] - fall
-            rows_before[j] = max(rows_away[a], rows_away[b]) + 1
+            shadow_row[j] = weight * caster[a] + fraction * caster[b] - row_drop
+            shadow_rows[j] = max(caster_rows[a], caster_rows[b]) + 1
         if step < rows:
             for j in range(columns):
-                shadow[i, j] = before[j]
-                away[i, j] = min((rows_before[j] + REACH_ROWS - 1) // REACH_ROWS, 255)
-    return shadow, away
+                shadow[i, j] = shadow_row[j]
+                caster_distance[i, j] = min((shadow_rows[j] + REACH_ROWS - 1) // REACH_ROWS, 255)
+    return shadow, caster_distance
 
 
 @njit(cache=True, inline="always")
 def interpolate_bilinear(
     field: Array32, inverse_spacing: float, x: float, y: float
 ) -> tuple[float, tuple[int, int], tuple[int, int]]:
-    """Interpolate a periodic field bilinearly; return the value, and rows and columns of the four posts around."""
+    """Interpolate a periodic field bilinearly; return the value, and rows and columns of the four neighbours."""
     mask = field.shape[0] - 1
     gx, gy = x * inverse_spacing, y * inverse_spacing
     j, i = math.floor(gx), math.floor(gy)
@@ -101,36 +101,36 @@ def interpolate_bilinear(
 @njit(cache=True, inline="always")
 def shadow_clearance(shadow: GroundShadow, x: float, y: float, z: float) -> tuple[float, float]:
     """Height of a position above the ground's shadow, metres, and distance of the shadow's caster in rows."""
-    across, along = (y, x) if shadow.along_x else (x, y)
-    edge, (i0, i1), (j0, j1) = interpolate_bilinear(shadow.height, 1.0 / shadow.spacing, across, along)
-    away = shadow.reach
-    farthest = max(max(away[i0, j0], away[i0, j1]), max(away[i1, j0], away[i1, j1]))
+    column, row = (y, x) if shadow.along_x else (x, y)
+    edge, (i0, i1), (j0, j1) = interpolate_bilinear(shadow.height, 1.0 / shadow.spacing, column, row)
+    distance = shadow.reach
+    farthest = max(max(distance[i0, j0], distance[i0, j1]), max(distance[i1, j0], distance[i1, j1]))
     return z - edge, float(farthest * REACH_ROWS)
 
 
 @njit(cache=True, inline="always")
 def penumbra(shadow: GroundShadow, radius: float, distance: float, rows: float) -> float:
-    """Half the depth, metres, of the penumbra past an occluder at a distance plus some rows."""
+    """Half the depth of the penumbra, metres, for an occluder at `distance` plus `rows` grid rows."""
     return radius * (distance + rows * shadow.row_m) / shadow.across
 
 
 @njit(cache=True, inline="always")
 def disc_above(offset: float) -> float:
-    """Fraction of a disc above a straight line that lies `offset` radii below its centre."""
+    """Fraction of a disc above a straight line `offset` radii below its centre."""
     if offset >= 1.0:
         return 1.0
     return 0.0 if offset <= -1.0 else 0.5 + (offset * math.sqrt(1.0 - offset * offset) + math.asin(offset)) / math.pi
 
 
 @njit(cache=True, inline="always")
-def disc_overlap(first: float, second: float, apart: float) -> float:
-    """Fraction of the second disc that the first covers; radii and distance of their centres."""
-    if apart >= first + second:
+def disc_overlap(first: float, second: float, distance: float) -> float:
+    """Fraction of the second disc that the first disc covers, from their radii and the distance of their centres."""
+    if distance >= first + second:
         return 0.0
-    if apart <= abs(first - second):
+    if distance <= abs(first - second):
         return min((first / second) ** 2, 1.0)
-    alpha = math.acos((apart * apart + first * first - second * second) / (2.0 * apart * first))
-    beta = math.acos((apart * apart + second * second - first * first) / (2.0 * apart * second))
+    alpha = math.acos((distance * distance + first * first - second * second) / (2.0 * distance * first))
+    beta = math.acos((distance * distance + second * second - first * first) / (2.0 * distance * second))
     area = first * first * (alpha - 0.5 * math.sin(2.0 * alpha)) + second * second * (beta - 0.5 * math.sin(2.0 * beta))
     return area / (math.pi * second * second)
 
@@ -139,7 +139,7 @@ def disc_overlap(first: float, second: float, apart: float) -> float:
 def _clearance_ratio(
     field: Level, per_metre: float, position: tuple[float, float, float], sun: Array, t: float
 ) -> float:
-    """Clearance over distance of the line to the sun at a distance."""
+    """Clearance above the ground divided by distance, at a distance along the line to the sun."""
     x, y, z = position
     height, _slope_x, _slope_y, _albedo = sample(field, per_metre, x + t * sun[0], y + t * sun[1])
     ratio: float = (z + t * sun[2] - height) / t
@@ -150,17 +150,17 @@ def _clearance_ratio(
 def _min_clearance_ratio(
     field: Level, per_metre: float, position: tuple[float, float, float], sun: Array, nearest: float
 ) -> float:
-    """Least clearance over distance of the line to the sun near a distance: the vertex of a parabola."""
+    """Minimum of the clearance ratio near the distance `nearest`, at the vertex of a parabola."""
     step = min(0.25 / per_metre, 0.5 * nearest)
-    before = _clearance_ratio(field, per_metre, position, sun, nearest - step)
-    middle: float = _clearance_ratio(field, per_metre, position, sun, nearest)
-    after = _clearance_ratio(field, per_metre, position, sun, nearest + step)
-    bend = before - 2.0 * middle + after
-    if bend <= 0.0:
-        return middle
-    vertex = nearest + min(max(0.5 * (before - after) / bend, -1.0), 1.0) * step
-    lowest: float = min(middle, _clearance_ratio(field, per_metre, position, sun, vertex))
-    return lowest
+    ratio0 = _clearance_ratio(field, per_metre, position, sun, nearest - step)
+    ratio1: float = _clearance_ratio(field, per_metre, position, sun, nearest)
+    ratio2 = _clearance_ratio(field, per_metre, position, sun, nearest + step)
+    curvature = ratio0 - 2.0 * ratio1 + ratio2
+    if curvature <= 0.0:
+        return ratio1
+    vertex = nearest + min(max(0.5 * (ratio0 - ratio2) / curvature, -1.0), 1.0) * step
+    min_ratio: float = min(ratio1, _clearance_ratio(field, per_metre, position, sun, vertex))
+    return min_ratio
 
 
 @njit(cache=True)
@@ -172,20 +172,20 @@ def visible_sun_fraction(
     sun: Array,
     radius: float,
 ) -> float:
-    """Fraction of the sun's disc that a position on the ground sees over the ground, by steps towards the sun.
+    """Fraction of the sun's disc that terrain does not hide at a position on the ground, by ray marching.
 
-    The smallest angle between the sun's centre and the ground below it, in radii of the sun, gives the fraction, as if
-    the skyline were straight and level across the disc; ground turned away from the sun's centre has none. The search
-    ends where the swept shadow shows that the remaining path is clear. `field` is the finest level, `radius` the
-    angular radius of the disc.
+    The fraction follows from the minimum angle between the sun's centre and the terrain below it, in radii of the sun.
+    The skyline is approximated by a horizontal line across the disc. Ground that faces away from the sun has the
+    fraction 0. The search ends where the swept shadow shows that the remaining path is clear. `field` is the finest
+    terrain level, `radius` the angular radius of the disc.
     """
     x, y, z = position
     spacing = 1.0 / per_metre
     _height, slope_x, slope_y, _albedo = sample(field, per_metre, x, y)
     if sun[2] - slope_x * sun[0] - slope_y * sun[1] <= 0.0:
         return 0.0
-    across = shadow.across
-    lowest = radius
+    cos_elevation = shadow.across
+    min_angle = radius
     nearest = 0.0
     t = 0.25 * spacing
     steps = 0
@@ -194,19 +194,19 @@ def visible_sun_fraction(
         px, py, pz = x + t * sun[0], y + t * sun[1], z + t * sun[2]
         height, _slope_x, _slope_y, _albedo = sample(field, per_metre, px, py)
         clearance = pz - height
-        if clearance * across / t < lowest:
-            lowest = clearance * across / t
+        if clearance * cos_elevation / t < min_angle:
+            min_angle = clearance * cos_elevation / t
             nearest = t
-        if lowest <= -radius:
+        if min_angle <= -radius:
             return 0.0
         steps += 1
         if steps % 4 == 0:
-            clear, rows = shadow_clearance(shadow, px, py, pz)
-            if clear > UNSURE * shadow.spacing + penumbra(shadow, radius, t, rows):
+            height_above_shadow, rows = shadow_clearance(shadow, px, py, pz)
+            if height_above_shadow > COARSE_GRID_MARGIN * shadow.spacing + penumbra(shadow, radius, t, rows):
                 break
-        # half the clearance: no slope up to 60 deg is stepped over
+        # with half the clearance a step does not pass through slopes of up to 60 deg
         t += max(0.5 * spacing, 0.5 * (clearance - radius * t))
-    if lowest < radius:
-        lowest = min(lowest, _min_clearance_ratio(field, per_metre, position, sun, nearest) * across)
-    fraction: float = disc_above(lowest / radius)
+    if min_angle < radius:
+        min_angle = min(min_angle, _min_clearance_ratio(field, per_metre, position, sun, nearest) * cos_elevation)
+    fraction: float = disc_above(min_angle / radius)
     return fraction

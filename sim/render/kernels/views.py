@@ -1,4 +1,4 @@
-"""Kernels of camera rays, of the depth of pinhole views, and of the ground's mesh."""
+"""Kernels for camera rays, the depth of pinhole views, and the ground's mesh."""
 
 from __future__ import annotations
 
@@ -16,23 +16,22 @@ from marsyard.sim.terrain.kernels import Array, Level, sample
 def pixel_angles(directions: Array) -> Array32:
     """Square root of each pixel's solid angle, radians, from the unit vectors along all rays, (rows, columns, 3).
 
-    A pixel's sides are half the difference of its neighbours on both sides, at the border the difference to the only
-    one.
+    The sides of a pixel are central differences of the unit vectors, one-sided differences at the border.
     """
     rows, columns = directions.shape[:2]
     angles = np.empty((rows, columns), dtype=np.float32)
     for i in range(rows):
         above, below = max(i - 1, 0), min(i + 1, rows - 1)
-        down = float(below - above)
+        row_step = float(below - above)
         for j in range(columns):
             left, right = max(j - 1, 0), min(j + 1, columns - 1)
-            across = float(right - left)
-            ax = (directions[i, right, 0] - directions[i, left, 0]) / across
-            ay = (directions[i, right, 1] - directions[i, left, 1]) / across
-            az = (directions[i, right, 2] - directions[i, left, 2]) / across
-            bx = (directions[below, j, 0] - directions[above, j, 0]) / down
-            by = (directions[below, j, 1] - directions[above, j, 1]) / down
-            bz = (directions[below, j, 2] - directions[above, j, 2]) / down
+            column_step = float(right - left)
+            ax = (directions[i, right, 0] - directions[i, left, 0]) / column_step
+            ay = (directions[i, right, 1] - directions[i, left, 1]) / column_step
+            az = (directions[i, right, 2] - directions[i, left, 2]) / column_step
+            bx = (directions[below, j, 0] - directions[above, j, 0]) / row_step
+            by = (directions[below, j, 1] - directions[above, j, 1]) / row_step
+            bz = (directions[below, j, 2] - directions[above, j, 2]) / row_step
             x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
             angles[i, j] = math.sqrt(math.sqrt(x * x + y * y + z * z))
     return angles
@@ -51,7 +50,7 @@ def sum_of_vectors(directions: Array32) -> tuple[float, float, float]:
 
 @njit(cache=True)
 def min_component(directions: Array32, axis: Array) -> float:
-    """Least component of vectors, shape (n, 3), along an axis."""
+    """Minimum component of vectors, shape (n, 3), along an axis."""
     lowest = math.inf
     for n in range(directions.shape[0]):
         lowest = min(lowest, directions[n, 0] * axis[0] + directions[n, 1] * axis[1] + directions[n, 2] * axis[2])
@@ -60,9 +59,9 @@ def min_component(directions: Array32, axis: Array) -> float:
 
 @njit(cache=True, error_model="numpy")
 def max_image_radius(directions: Array, view: Array) -> float:
-    """Largest image coordinate, across or down from the centre, of rays (rows, columns, 3) at a focal length of 1.
+    """Maximum absolute image coordinate (x or y) of rays, shape (rows, columns, 3), at a focal length of 1.
 
-    `view` holds right, down and forward of the view, one row each.
+    The rows of `view` are the right, down and forward axes of the view.
     """
     largest = 0.0
     for i in range(directions.shape[0]):
@@ -77,46 +76,46 @@ def max_image_radius(directions: Array, view: Array) -> float:
 
 @njit(cache=True, error_model="numpy")
 def depth_in_metres(depth_buffer: Array32, near: float, far: float) -> Array32:
-    """Convert OpenGL's depths to depth along the axis, metres, 0 where nothing was drawn; reverse the order of rows.
+    """Convert OpenGL's depths to depth along the axis, metres, 0 where there is no surface; reverse the order of rows.
 
-    `depth_buffer` is 0 at `near`, 1 at `far` and where nothing is, its lowest row first.
+    `depth_buffer` is 0 at `near`, and 1 at `far` and where there is no surface; its first row is the lowest.
     """
     rows, columns = depth_buffer.shape
     depth = np.empty((rows, columns), dtype=np.float32)
-    # single precision from the first to the last
-    minus_two, one, nothing = np.float32(-2.0), np.float32(1.0), np.float32(0.0)
-    span, both, product = np.float32(far - near), np.float32(far + near), np.float32(2.0 * near * far)
+    # all operations in single precision
+    minus_two, one, zero = np.float32(-2.0), np.float32(1.0), np.float32(0.0)
+    difference, total, product = np.float32(far - near), np.float32(far + near), np.float32(2.0 * near * far)
     for i in range(rows):
-        line, above = depth_buffer[rows - 1 - i], depth[i]
+        source, output = depth_buffer[rows - 1 - i], depth[i]
         for j in range(columns):
-            value = product / ((minus_two * line[j] + one) * span + both)
-            above[j] = nothing if line[j] == one else value
+            value = product / ((minus_two * source[j] + one) * difference + total)
+            output[j] = zero if source[j] == one else value
     return depth
 
 
 @njit(cache=True)
 def spans_in_hull(x: Array, y: Array, hull: Array) -> Longs:
-    """First cell of each strip between two lines of y that reaches into a convex polygon, and the end of these cells.
+    """First cell, and end of the cells, that overlap a convex polygon in each strip between two lines of y.
 
-    The lines increase; `hull` holds the polygon's corners in order, shape (corners, 2).
+    The lines increase; `hull` contains the polygon's corners in order, shape (corners, 2).
     """
     spans = np.empty((y.size - 1, 2), dtype=np.int64)
     for strip in range(y.size - 1):
         low, high = y[strip], y[strip + 1]
-        lowest, greatest = math.inf, -math.inf
+        min_x, max_x = math.inf, -math.inf
         for k in range(hull.shape[0]):
             x0, y0 = hull[k - 1, 0], hull[k - 1, 1]
             x1, y1 = hull[k, 0], hull[k, 1]
             if min(y0, y1) > high or max(y0, y1) < low:
                 continue
-            # a side of the polygon, from where it enters the strip to where it leaves it
-            for level, end in ((low, x0), (high, x1)):
-                at = end if y0 == y1 else x0 + min(max((level - y0) / (y1 - y0), 0.0), 1.0) * (x1 - x0)
-                lowest = min(lowest, at)
-                greatest = max(greatest, at)
-        first = min(max(int(np.searchsorted(x, lowest, side="right")) - 1, 0), x.size - 1)
+            # the part of the polygon's side inside the strip
+            for strip_y, corner_x in ((low, x0), (high, x1)):
+                edge_x = corner_x if y0 == y1 else x0 + min(max((strip_y - y0) / (y1 - y0), 0.0), 1.0) * (x1 - x0)
+                min_x = min(min_x, edge_x)
+                max_x = max(max_x, edge_x)
+        first = min(max(int(np.searchsorted(x, min_x, side="right")) - 1, 0), x.size - 1)
         spans[strip, 0] = first
-        spans[strip, 1] = min(max(int(np.searchsorted(x, greatest)), first), x.size - 1)
+        spans[strip, 1] = min(max(int(np.searchsorted(x, max_x)), first), x.size - 1)
     return spans
 
 
@@ -124,12 +123,12 @@ def spans_in_hull(x: Array, y: Array, hull: Array) -> Longs:
 def build_mesh(
     levels: tuple[Level, ...], spacing: float, x: Array, y: Array, level_of_x: Longs, level_of_y: Longs, spans: Longs
 ) -> tuple[Array, NDArray[np.uint32]]:
-    """Vertices, metres, and faces, counter-clockwise from above, of some cells of a grid, two triangles each.
+    """Triangulate the selected cells of a grid: vertices, metres, and faces, counter-clockwise seen from above.
 
     Heights come from the coarser level of the two lines at a vertex. `spans` are those of `spans_in_hull`.
     """
     lines = y.size
-    # a line has the corners of the selected cells to both its sides
+    # the vertices of a line are the corners of the selected cells on both sides of it
     left = np.full(lines, x.size, dtype=np.int64)
     right = np.full(lines, -1, dtype=np.int64)
     cells = 0
@@ -157,9 +156,9 @@ def build_mesh(
     n = 0
     for strip in range(lines - 1):
         for cell in range(spans[strip, 0], spans[strip, 1]):
-            corner, above = starts[strip] + cell, starts[strip + 1] + cell
-            # a cell's two triangles are adjacent: OpenGL then transforms shared corners once
-            faces[n, 0], faces[n, 1], faces[n, 2] = corner, corner + 1, above + 1
-            faces[n + 1, 0], faces[n + 1, 1], faces[n + 1, 2] = corner, above + 1, above
+            lower, upper = starts[strip] + cell, starts[strip + 1] + cell
+            # the two triangles of a cell are successive, so that OpenGL transforms their common vertices once
+            faces[n, 0], faces[n, 1], faces[n, 2] = lower, lower + 1, upper + 1
+            faces[n + 1, 0], faces[n + 1, 1], faces[n + 1, 2] = lower, upper + 1, upper
             n += 2
     return corners, faces

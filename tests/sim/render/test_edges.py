@@ -13,7 +13,7 @@ from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.kernels.hierarchy import nearest_hit
 from marsyard.sim.render.kernels.structs import Ray
-from marsyard.sim.render.renderer import edge_pixels, rays_within
+from marsyard.sim.render.renderer import edge_pixels, supersample_rays
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 
@@ -69,7 +69,7 @@ def test_subpixel_rays_are_evenly_distributed() -> None:
     camera = _make_camera((7, 5))
     rays = PixelRays.of(camera)
     pixels = np.array([0, 17, 34])
-    within = rays_within(rays, pixels, 3)
+    within = supersample_rays(rays, pixels, 3)
     result, _ = camera.project(within.directions.astype(np.float64))
     middles = np.stack([pixels % 7, pixels // 7], axis=-1)
     positions = result.reshape(3, 9, 2) - middles[:, None]

@@ -13,7 +13,7 @@ from marsyard.sim.camera import Cahvor
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.backend import RenderingError
-from marsyard.sim.render.kernels.ground import cross_ground, entry_distance, exit_distance, skip_empty_blocks
+from marsyard.sim.render.kernels.ground import entry_distance, exit_distance, intersect_ground, skip_empty_blocks
 from marsyard.sim.render.kernels.structs import GroundLevel, Ray
 from marsyard.sim.render.renderer import NO_CEILING
 from marsyard.sim.terrain import Surface
@@ -156,7 +156,7 @@ def test_grazing_rays_meet_the_first_occluding_crest(rough: Surface, bounded: bo
     begin = 0.0 if bounded else 0.8
     result = np.array(
         [
-            cross_ground(level, Ray(*origin, *ray), begin * t, 1.25 * t)
+            intersect_ground(level, Ray(*origin, *ray), begin * t, 1.25 * t)
             for origin, ray, t in zip(origins, rays, expected, strict=True)
         ]
     )
@@ -179,8 +179,8 @@ def test_search_finds_ground_only_up_to_its_end(rough: Surface, bounded: bool) -
         ray = direction(azimuth, -elevation)
         t = float(ground.cast(origin[None], ray[None], 2000.0, 0.05)[0])
         near = t - 4.0 * rough.spacing_m
-        assert cross_ground(level, Ray(*origin, *ray), near, t + 1e-3) == pytest.approx(t, rel=1e-6)
-        assert cross_ground(level, Ray(*origin, *ray), near, t - 1e-3) == np.inf
+        assert intersect_ground(level, Ray(*origin, *ray), near, t + 1e-3) == pytest.approx(t, rel=1e-6)
+        assert intersect_ground(level, Ray(*origin, *ray), near, t - 1e-3) == np.inf
 
 
 def test_entry_distance_is_where_a_ray_reaches_the_highest_ground() -> None:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from marsyard.sim.render.renderer import cells_in_hull, ground_mesh
+from marsyard.sim.render.renderer import cell_spans_in_hull, ground_mesh
 from marsyard.sim.render.scene import graded_offsets
 from marsyard.sim.terrain import Surface
 
@@ -44,7 +44,7 @@ def test_cells_in_hull_cover_it_closely(corners: list[tuple[float, float]], seed
     positions = np.array(corners) + np.array([[0.0, 0.0], [0.3, 0.1], [0.1, 0.4], *[[0.0, 0.0]] * (len(corners) - 3)])
     assume(np.linalg.matrix_rank(positions - positions[0], tol=1e-3) == 2)
     lines = graded_offsets(20.0, 0.2, 61)
-    spans = cells_in_hull(lines, lines, positions)
+    spans = cell_spans_in_hull(lines, lines, positions)
     weights = np.random.default_rng(seed).dirichlet(np.ones(len(positions)), 500)
     inside = weights @ positions
     inside = inside[np.abs(inside).max(axis=1) < 20.0]

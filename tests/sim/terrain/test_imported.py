@@ -129,11 +129,11 @@ def test_hirise_tile_is_imported(shared_data: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"dem": np.zeros((9, 9))}, "lacks dem_gsd"),
+        ({"dem": np.zeros((9, 9))}, "does not contain dem_gsd"),
         ({"dem": np.zeros(9), "dem_gsd": 1.0}, r"grid of shape \(9,\)"),
         ({"dem": np.full((9, 9), np.nan), "dem_gsd": 1.0}, "no valid height"),
-        ({"dem": np.zeros((400, 9)), "dem_gsd": 1.0}, r"choose more terrain\.samples"),
-        ({"dem": np.zeros((9, 9)), "dem_gsd": 1.0}, "leaves nothing of it"),
+        ({"dem": np.zeros((400, 9)), "dem_gsd": 1.0}, r"increase terrain\.samples"),
+        ({"dem": np.zeros((9, 9)), "dem_gsd": 1.0}, "wider than twice the border"),
     ],
 )
 def test_file_errors_are_reported(tmp_path: Path, content: dict[str, object], message: str) -> None:
