@@ -146,9 +146,9 @@ def _bin_grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]
     columns = _signed_parts(frame, metric)
     axes = [""] if columns == [metric] else [f" {split_unit(part)[0].rsplit('_', 1)[-1]}" for part in columns]
     unit = split_unit(metric)[1]
-    head = ["", "Cases", "Answered", "Interval"]
+    head = ["", "Cases", "Answered", f"{format_fraction(CONFIDENCE)} interval"]
     head += [f"{statistic}{axis} ({unit})" for axis in axes for statistic in ("Mean", "SD")]
-    head += [f"{format_fraction(QUANTILE)} bound", "Largest"]
+    head += [f"Bound of the {format_fraction(QUANTILE)} quantile ({unit})", f"Maximum ({unit})"]
     rows = []
     for row in bins:
         part_texts = [number(value) for pair in zip(row["means"], row["sds"], strict=True) for value in pair]

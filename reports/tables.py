@@ -43,7 +43,7 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
         table.add_column(heading, justify="right", no_wrap=True)
     for verdict in verdicts:
         requirement = Text(verdict.requirement_id, style="bold")
-        requirement.append(f"\n{requirement_text(verdict, verdict.metric)}", style="dim")
+        requirement.append(f"\n{requirement_text(verdict)}", style="dim")
         table.add_row(
             requirement,
             Text(str(verdict.status), style=_STYLES[verdict.status]),

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from marsyard.algorithms.interface import SiteOutcome
 from marsyard.reports.hda import products as stages
 from marsyard.reports.hda import sections
 from marsyard.reports.hda.case_figures import FIGURES, available_figures, write_hda_figures
@@ -85,4 +86,5 @@ _SECTIONS = (sections.THRESHOLD, sections.FAULTS, limits_section, sections.MAP_E
 HDA = Presentation(
     cases=(CaseKind(stages.is_hda_case, view, write_hda_figures, note_text("hda.legend")),),
     sections=(*_SECTIONS, sections.run_times_section),
+    outcomes=(SiteOutcome,),
 )
