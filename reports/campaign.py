@@ -92,16 +92,13 @@ def page_context(
     metric, bound = subject.metric, subject.bound
     text = f"{count(overall.crashed, 'case')} crashed: fix this before you use the verdict."
     cautions = [text] if overall.crashed else []
-    sources = {str(item.get("id")): str(item.get("source", "")).rstrip(".") for item in run.requirements}
     context: dict[str, Any] = {
         "run": run,
         "description": str(run.recorded("description") or ""),
         "overall_verdict": overall,
         "cautions": [*cautions, *sampling_cautions(run, metric)],
         "interrupted": run.recorded("state") not in (None, "finished"),
-        "verdicts": [
-            sections.verdict_row(verdict) | {"source": sources.get(verdict.requirement_id, "")} for verdict in verdicts
-        ],
+        "verdicts": [sections.verdict_row(verdict) for verdict in verdicts],
         "metric": metric,
         "metric_label": "" if metric is None else label(metric),
         "metric_title": "" if metric is None else label(metric)[:1].upper() + label(metric)[1:],
