@@ -249,7 +249,7 @@ def _distinct_values(frame: pd.DataFrame, column: str) -> str | None:
 
 def error_figures(frame: pd.DataFrame, all_cases: pd.DataFrame, metric: str, bound: float | None) -> list[SvgFigure]:
     """Draw a scatter plot of a metric for `frame`, and its histogram and distribution for `all_cases`."""
-    scatter = "Error of each case. the dashed circle is the requirement. Hollow: beyond the axes, at their edge."
+    scatter = "Error of each case. Dashed circle: the requirement. Hollow marks: cases beyond the axes."
     histogram = "Histogram of the error magnitude. Hatched: values beyond the axis."
     entries: list[tuple[str, Figure | None, str]] = [("scatter", figures.error_scatter(frame, metric, bound), scatter)]
     if figures.needs_enlarged_figure(frame, metric, bound):

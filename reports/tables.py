@@ -114,4 +114,4 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
         quantiles = [summary.quantiles[index] for summary in summaries]
         rows.append([name, *(number(q.estimate) for q in quantiles)])
         rows.append([f"{name}, {confidence} bounds", *(interval(q.lower, q.upper) for q in quantiles)])
-    return [*rows, ["largest magnitude", *(number(s.largest) for s in summaries)]]
+    return [*rows, ["maximum magnitude", *(number(s.largest) for s in summaries)]]

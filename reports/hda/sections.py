@@ -256,7 +256,7 @@ TOUCHDOWN = kinds.SectionDeclaration(
         kinds.RateTable(
             (
                 kinds.Rate("touchdown", "touchdown on safe ground", kinds.flag_rate("touchdown_safe")),
-                kinds.Rate("site", "safe site", kinds.flag_rate("site_safe")),
+                kinds.Rate("site", "reported site is truly safe", kinds.flag_rate("site_safe")),
             ),
             cases="Landings",
             heading="Safety of the touchdown point",
@@ -269,7 +269,7 @@ TOUCHDOWN = kinds.SectionDeclaration(
 #: Classes of the true ground in both pictures, best first, and outcomes of the search. The surroundings of a wide safe
 #: site are safe up to a lander's radius.
 GROUNDS = ("wide safe site", "narrow safe site", "no safe site")
-ANSWERS = ("safe site, truly safe", "site, not safe", "no safe site", "not converged", "not finished")
+ANSWERS = ("truly safe site", "unsafe site", "'no safe site'", "not converged", "not finished")
 
 
 def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
@@ -311,7 +311,7 @@ def draw_outcomes(frame: pd.DataFrame, subject: Subject, key: str) -> kinds.Bloc
     counts = outcome_counts(frame)
     rows = [[ground, *(f"{answer_counts[name]:,}" for name in ANSWERS)] for ground, answer_counts in counts.items()]
     note = note_text("hda.outcomes")
-    block = Block(heading="Answers by ground truth", grid=Grid(["Ground in the pictures", *ANSWERS], rows), note=note)
+    block = Block(heading="Answers by ground truth", grid=Grid(["Ground truth", *ANSWERS], rows), note=note)
     return [block], {"outcomes": counts}
 
 

@@ -163,7 +163,7 @@ GOAL = SectionDeclaration(
                 if (error := rates.finite_values(camera_rows, "position_error_m", 100.0)).size
             },
             ("position error at the goal (cm)", "fraction of completed runs"),
-            "Fraction of completed runs up to each error at the goal; dashed: the requirement.",
+            "Fraction of completed runs with a smaller error at the goal. Dashed line: the requirement.",
             bound=100.0 * MAX_ERROR_M,
         ),
         CustomBlocks(_draw_cameras),
