@@ -100,6 +100,8 @@ def page_context(
         "interrupted": run.recorded("state") not in (None, "finished"),
         "verdicts": [sections.verdict_row(verdict) for verdict in verdicts],
         "metric": metric,
+        "metric_label": "" if metric is None else label(metric),
+        "metric_title": "" if metric is None else label(metric)[:1].upper() + label(metric)[1:],
         "bound": bound,
         "extra_sections": extra,
         "outcomes": sections.outcome_grid(run.all_cases),

@@ -93,7 +93,7 @@ def answer_fractions(subject: Subject) -> Mapping[str, rates.CaseFraction]:
         fractions["no feasible overlap (of completed cases)"] = rates.fraction_of(~overlap[completed], frame[completed])
     if subject.metric is not None and subject.bound is not None:
         wrong = ~rates.success_mask(frame[answered], subject.metric, subject.bound)
-        name = f"wrong by more than {subject.bound:g} {split_unit(subject.metric)[1]}, of answers"
+        name = f"wrong answers: error above {subject.bound:g} {split_unit(subject.metric)[1]} (of answers)"
         fractions[name] = rates.fraction_of(wrong, frame[answered])
     return fractions
 
@@ -125,7 +125,9 @@ def scatter_section(subject: Subject) -> Section | None:
         f"{percent(ellipse.inside)} of these errors lie inside."
     )
     rows = [[format_fraction(c.probability), number(c.estimate), interval(c.lower, c.upper)] for c in circles]
-    grid = Grid(["Fraction of errors", f"Radius ({unit})", f"Bounds, {format_fraction(CONFIDENCE)} each"], rows)
+    grid = Grid(
+        ["Fraction of errors", f"Radius ({unit})", f"One-sided bounds at {format_fraction(CONFIDENCE)} each"], rows
+    )
     note = note_text("common.scatter")
     data = {"ellipse": asdict(ellipse), "circles": [asdict(circle) for circle in circles]}
     block = Block(text=text, grid=grid, note=note)
@@ -150,7 +152,7 @@ def drivers_section(subject: Subject) -> Section | None:
     if not ranked:
         return None
     note = note_text("common.drivers", confidence=format_fraction(CONFIDENCE))
-    headings = ["Condition", "Cases", "Rank correlation", "Interval", "Explained variance", "Interval", "p"]
+    headings = ["Condition", "Cases", "Rank correlation", "Its interval", "Fraction of variance", "Its interval", "p"]
     blocks = []
     for name, drivers in ranked.items():
         rows = []

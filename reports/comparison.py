@@ -173,7 +173,9 @@ def comparison_grids(
             "Algorithm": lambda result: result.name,
             "Answered": lambda result: percent(result.answered / result.cases),
             "Failed": lambda result: f"{result.failed:,}",
-            "Within bound": lambda r: NOTHING if r.succeeded is None else percent(r.succeeded / r.cases),
+            "Within the bound (of all cases)": lambda r: (
+                NOTHING if r.succeeded is None else percent(r.succeeded / r.cases)
+            ),
             f"Median{unit}": lambda result: number(result.median),
             f"95th percentile{unit}": lambda result: number(result.p95),
         },
@@ -188,7 +190,7 @@ def comparison_grids(
         ]
         for d in differences
     ]
-    head = ["Algorithm", f"Success only: {tested}", "Success only: other", "p (success)", "Pairs"]
+    head = ["Algorithm", f"Success only: {tested}", "Success only: other", "p (success)", "Cases answered by both"]
     return first, Grid([*head, f"Difference{unit}", "p (error)"], rows)
 
 

@@ -54,7 +54,14 @@ def conditions_section(subject: Subject) -> Section | None:
         return None
     blocks = [Block(heading=f"By {label(name)}", grid=_bin_grid(frame, metric, bins)) for name, bins in tables.items()]
     if terrain_rows:
-        head = ["", "Terrains", "SD within", "SD between", "Fraction of variance between terrains", "p"]
+        head = [
+            "",
+            "Terrains",
+            "SD within terrains",
+            "SD between terrains",
+            "Fraction of variance between terrains",
+            "p",
+        ]
         rows = []
         for row in terrain_rows:
             deviations = [number(row["within_sd"]), number(row["between_sd"])]
@@ -147,9 +154,9 @@ def _bin_grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]
     columns = _signed_parts(frame, metric)
     axes = [""] if columns == [metric] else [f" {split_unit(part)[0].rsplit('_', 1)[-1]}" for part in columns]
     unit = split_unit(metric)[1]
-    head = ["", "Cases", "Answered", "Interval"]
+    head = ["", "Cases", "Answered", f"{format_fraction(CONFIDENCE)} interval"]
     head += [f"{statistic}{axis} ({unit})" for axis in axes for statistic in ("Mean", "SD")]
-    head += [f"{format_fraction(QUANTILE)} bound", "Largest"]
+    head += [f"Bound of the {format_fraction(QUANTILE)} quantile ({unit})", f"Maximum ({unit})"]
     rows = []
     for row in bins:
         part_texts = [number(value) for pair in zip(row["means"], row["sds"], strict=True) for value in pair]

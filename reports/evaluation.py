@@ -58,7 +58,7 @@ def combine_verdicts(
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",
         Status.MET_BY_RATE: f"{fraction} met by the rate only, not at the required confidence.",
         Status.FAIL: f"{fraction} not met.",
-        Status.INSUFFICIENT: f"{fraction} cannot be decided by {count(len(frame), 'case')}.{_remedy_text(verdicts)}",
+        Status.INSUFFICIENT: f"{count(len(frame), 'case')} cannot decide {fraction}.{_remedy_text(verdicts)}",
     }[worst]
     return OverallVerdict(worst, crashed, sentence + crash_text)
 
@@ -85,7 +85,7 @@ def _remedy_text(verdicts: Sequence[Verdict]) -> str:
     largest = max(needed, key=lambda verdict: verdict.further_cases or 0)
     counts_terrains = largest.clustered is not None and largest.clustered.method is ClusterMethod.TERRAIN_COUNT
     terrain_text = ", each on a new terrain," if counts_terrains else ""
-    return f" {count(largest.further_cases or 0, 'additional case')} without a failure{terrain_text} would decide."
+    return f" {count(largest.further_cases or 0, 'additional case')} without a failure{terrain_text} would be enough."
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -66,11 +67,13 @@ class Presentation:
 
     cases: kinds of case; the first kind that matches the products is used
     sections, first: sections after and in front of those of every campaign; None for rows of other systems
+    outcomes: enumerations of the outcomes; the values describe them
     """
 
     cases: Sequence[CaseKind] = ()
     sections: Sequence[SectionMaker] = ()
     first: Sequence[SectionMaker] = ()
+    outcomes: Sequence[type[Enum]] = ()
 
 
 @cache

@@ -9,6 +9,7 @@ import math
 import shlex
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ from jaxtyping import Int
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from marsyard.algorithms.answers import Fault
 from marsyard.reports import figures
+from marsyard.reports.presentation import presentations
 from marsyard.reports.rates import CONFIDENCE, engine_failed, members, terrain_groups
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Grid, SvgFigure, svg_figure
@@ -80,7 +83,7 @@ def verdict_row(verdict: Verdict) -> dict[str, Any]:
         strip = {"left": f"{100.0 * start:.3g} %"} | {name: scale * (rate - start) for name, rate in rates.items()}
     return {
         "verdict": verdict,
-        "asked": requirement_text(verdict, label(verdict.metric)),
+        "asked": requirement_text(verdict),
         "evidence": [count(verdict.n, "case"), f"{verdict.failures:,} failed"],
         "bounds": bounds_text,
         "risk": "" if math.isnan(verdict.consumer_risk) else f"consumer's risk {percent(verdict.consumer_risk)}",
@@ -90,9 +93,14 @@ def verdict_row(verdict: Verdict) -> dict[str, Any]:
 
 
 def outcome_grid(frame: pd.DataFrame) -> Grid:
-    """Count the cases by outcome."""
-    rows = [[name, f"{cases:,}", percent(cases / len(frame))] for name, cases in outcome_counts(frame)]
-    return Grid(["Outcome", "Cases", "Fraction"], rows)
+    """Count the cases by outcome, with the meaning of each outcome."""
+    kinds: list[type[Enum]] = [Fault, *(kind for presentation in presentations() for kind in presentation.outcomes)]
+    meanings = {member.name: str(member.value) for kind in kinds for member in kind}
+    rows = [
+        [name, f"{cases:,}", percent(cases / len(frame)), meanings.get(name, NOTHING)]
+        for name, cases in outcome_counts(frame)
+    ]
+    return Grid(["Outcome", "Cases", "Fraction", "Meaning"], rows)
 
 
 def worst_cases(run: StoredRun, metric: str, with_images: Collection[str] = ()) -> CaseTable:
@@ -241,7 +249,7 @@ def _distinct_values(frame: pd.DataFrame, column: str) -> str | None:
 
 def error_figures(frame: pd.DataFrame, all_cases: pd.DataFrame, metric: str, bound: float | None) -> list[SvgFigure]:
     """Draw a scatter plot of a metric for `frame`, and its histogram and distribution for `all_cases`."""
-    scatter = "Error of each case. the dashed circle is the requirement. Hollow: beyond the axes, at their edge."
+    scatter = "Error of each case. Dashed circle: the requirement. Hollow marks: cases beyond the axes."
     histogram = "Histogram of the error magnitude. Hatched: values beyond the axis."
     entries: list[tuple[str, Figure | None, str]] = [("scatter", figures.error_scatter(frame, metric, bound), scatter)]
     if figures.needs_enlarged_figure(frame, metric, bound):

@@ -43,7 +43,7 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
         table.add_column(heading, justify="right", no_wrap=True)
     for verdict in verdicts:
         requirement = Text(verdict.requirement_id, style="bold")
-        requirement.append(f"\n{requirement_text(verdict, verdict.metric)}", style="dim")
+        requirement.append(f"\n{requirement_text(verdict)}", style="dim")
         table.add_row(
             requirement,
             Text(str(verdict.status), style=_STYLES[verdict.status]),
@@ -114,4 +114,4 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
         quantiles = [summary.quantiles[index] for summary in summaries]
         rows.append([name, *(number(q.estimate) for q in quantiles)])
         rows.append([f"{name}, {confidence} bounds", *(interval(q.lower, q.upper) for q in quantiles)])
-    return [*rows, ["largest magnitude", *(number(s.largest) for s in summaries)]]
+    return [*rows, ["maximum magnitude", *(number(s.largest) for s in summaries)]]

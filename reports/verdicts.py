@@ -148,18 +148,17 @@ class Verdict:
         evidence = self.clustered
         if evidence is None:
             return ""
-        effect = f", design effect {evidence.design_effect:.3g}"
+        effect = f"design effect {evidence.design_effect:.3g}"
         if math.isnan(evidence.design_effect):
-            assumed = self.n / evidence.effective_n
-            effect = f", the design effect assumed to be {assumed:.3g}: too few failures or terrains to estimate it"
+            effect = f"assumed design effect {self.n / evidence.effective_n:.3g}"
         text = (
-            f"{count(self.n, 'case')} share {count(self.terrains or 0, 'terrain')} and so are not independent; "
-            f"the bounds allow for that ({evidence.method}, effective n {evidence.effective_n:.4g}{effect})."
+            f"{count(self.n, 'case')} on {count(self.terrains or 0, 'terrain')}: {evidence.method}, "
+            f"effective number of cases {evidence.effective_n:.4g}, {effect}."
         )
         if self.plain_status is not None and self.plain_status is not self.status:
-            text += f" Independent cases would show at least {percent(self.plain_lower)}: {self.plain_status}."
+            text += f" For independent cases the lower bound would be {percent(self.plain_lower)}: {self.plain_status}."
         if evidence.method is ClusterMethod.TERRAIN_COUNT and self.further_cases and self.decide_by != ESTIMATE:
-            text += f" {count(self.further_cases, 'additional terrain')} without a failure would decide."
+            text += f" {count(self.further_cases, 'additional terrain')} without a failure would lead to PASS."
         return text
 
     def _look_text(self) -> str:

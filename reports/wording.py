@@ -24,11 +24,13 @@ _ROUNDING = 1e-9
 _POPULATIONS = {"all": "all cases", "completed": "completed cases", "valid": "valid answers"}
 
 
-def requirement_text(requirement: Any, metric: str) -> str:
-    """Describe a requirement (of a campaign or of a verdict) in words; `metric` is the metric's name for readers."""
-    unbounded = requirement.bound is None or math.isnan(requirement.bound)
-    scaled = "" if requirement.scale == 1.0 else f"{requirement.scale:g} × "
-    condition = metric if unbounded else f"{scaled}|{metric}| ≤ {requirement.bound:g}"
+def requirement_text(requirement: Any) -> str:
+    """Describe the criterion of a requirement (of a campaign or of a verdict) in words."""
+    metric, (name, unit) = requirement.metric, split_unit(requirement.metric)
+    condition = _notes()["metrics"].get(metric, _words(metric if requirement.bound is None else name))
+    if requirement.bound is not None and not math.isnan(requirement.bound):
+        scaled = "" if requirement.scale == 1.0 else f"{requirement.scale:g} × "
+        condition = f"{scaled}|{condition}| ≤ {requirement.bound:g} {unit}".rstrip()
     confidence = f"{format_fraction(requirement.confidence)} confidence"
     by_rate = requirement.decide_by == "estimate"
     decision = f"evaluated by observed rate; bounds at {confidence}" if by_rate else f"at {confidence}"
@@ -40,8 +42,10 @@ def population_text(population: str) -> str:
     """Describe a population: ``valid answers``, ``cases with feasible overlap``."""
     parts = population.split(" and ")
     base = next((_POPULATIONS[part] for part in parts if part in _POPULATIONS), "cases")
-    flags = [part.removeprefix("with_").replace("_", " ") for part in parts if part not in _POPULATIONS]
-    return f"{base} with {' and '.join(flags)}" if flags else base
+    phrases = _notes()["populations"]
+    flags = [part for part in parts if part not in _POPULATIONS]
+    texts = [phrases.get(flag, f"with {_words(flag.removeprefix('with_'))}") for flag in flags]
+    return f"{base} {', '.join(texts)}" if texts else base
 
 
 def number(value: float) -> str:
@@ -166,7 +170,8 @@ def split_unit(column: str) -> tuple[str, str]:
 def label(column: str) -> str:
     """The column in words, with its unit: ``velocity error (m/s)``."""
     name, unit = split_unit(column)
-    return f"{_words(name)} ({unit})" if unit else _words(name)
+    words = _notes()["labels"].get(column, _words(name))
+    return f"{words} ({unit})" if unit else words
 
 
 def magnitude_label(column: str) -> str:
@@ -186,7 +191,9 @@ def primary_metric(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]
     """Return the page's metric: that of the first requirement, else the first error column; None without one."""
     required = [str(requirement.get("metric", "")) for requirement in requirements]
     error_columns = [str(column) for column in frame.columns if "error_" in str(column) and split_unit(str(column))[1]]
-    return next((name for name in [*required, *error_columns] if name in frame and _is_number(frame, name)), None)
+    # rows of earlier versions have an empty column for a sum
+    names = [name for name in [*required, *error_columns] if " + " not in name]
+    return next((name for name in names if name in frame and _is_number(frame, name)), None)
 
 
 def numbers(frame: pd.DataFrame, column: str) -> Float[np.ndarray, " n"]:

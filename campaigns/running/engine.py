@@ -26,7 +26,7 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.store.products import ProductStore, select_kept_cases
 from marsyard.campaigns.store.record import folder_lock
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
-from marsyard.campaigns.store.table import TABLE_FILE, find_showcase, find_worst_cases, write_table
+from marsyard.campaigns.store.table import TABLE_FILE, find_showcase, find_worst_cases, numeric_metrics, write_table
 from marsyard.scenarios.systems import RowColumns, row_columns
 from marsyard.sim.kernel_cache import mark_ready
 
@@ -185,7 +185,7 @@ def _execute(run: _Run, store: RowStore, retries: Sequence[int]) -> None:
                 with report_compilation(configuration.scenario, run.watch.note) as first_case_ended:
                     _prepare_inputs(run, executor, itertools.chain(*missing, retries))
                     _run_cases(run, store, executor, [*missing, retries], first_case_ended)
-            write_table(table, store, [item.metric for item in configuration.requirements if item.bound is not None])
+            write_table(table, store, numeric_metrics(configuration.requirements))
             _keep_worst(run, store, executor)
     except BaseException:
         # on a full disk the record keeps the state "running"; the released lock shows that no process runs

@@ -6,14 +6,14 @@ import gc
 import itertools
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, Requirement
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.record import stored_configuration
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, ROWS_FILE, TRAILING_COLUMNS, Row, RowStore, readable_store
@@ -124,7 +124,12 @@ def refresh_table(directory: Path) -> None:
         return  # folder of an earlier version, which wrote the table at an interruption
     requirements = stored_configuration(directory).requirements
     with RowStore(directory / ROWS_FILE) as store:
-        write_table(directory / TABLE_FILE, store, [item.metric for item in requirements if item.bound is not None])
+        write_table(directory / TABLE_FILE, store, numeric_metrics(requirements))
+
+
+def numeric_metrics(requirements: Iterable[Requirement]) -> list[str]:
+    """Return the columns of the requirements' metrics that are numbers."""
+    return [column for item in requirements if item.bound is not None for column in item.metric_columns]
 
 
 def stored_row(directory: Path, case: int) -> Row | None:

@@ -92,7 +92,8 @@ def show(
         int | None, Option(metavar="N", help="Show the drawn parameter values of the first N cases.")
     ] = None,
     figure: Annotated[
-        Path | None, Option(metavar="FILE", help="With --draw: write marginals and pairs as .svg or .png.")
+        Path | None,
+        Option(metavar="FILE", help="With --draw: write histograms and pairwise scatter plots (.svg, .png)."),
     ] = None,
     as_json: Annotated[bool, Option("--json", help="Print JSON, with all draws.")] = False,
 ) -> None:

@@ -36,7 +36,9 @@ class NewOptions:
     site: Annotated[str | None, Option(help="A site from `marsyard terrain list`.")] = None
     camera: Annotated[str | None, Option(metavar="FILE", help="Custom camera file (docs/custom-worlds.md).")] = None
     detector: Annotated[str | None, Option(metavar="FILE", help="Custom detector datasheet in TOML.")] = None
-    flight: Annotated[str | None, Option(metavar="FILE", help="Trajectory file; replaces simulated dynamics.")] = None
+    flight: Annotated[
+        str | None, Option(metavar="FILE", help="Trajectory file to use instead of simulated dynamics.")
+    ] = None
     axes: Annotated[str, Option(help="World axes of the trajectory: enu or ned.")] = "enu"
     bound: Annotated[
         float | None, Option(metavar="X", help="Bound of the requirement: maximum error, or minimum success fraction.")
@@ -159,7 +161,7 @@ def ingest(
         Path, Argument(metavar="FOLDER", help="ingest.toml, pictures.csv and pictures (docs/real-pictures.md).")
     ],
     out: Annotated[Path, Option(metavar="DIR", help="New folder for the cases and the campaign file.")],
-    system: Annotated[str | None, Option(help="System under test; by default real pictures.")] = None,
+    system: Annotated[str | None, Option(help="System under test; by default `measured`.")] = None,
 ) -> None:
     """Create a campaign from recorded pictures with measured attitude and altitude."""
     from marsyard.campaigns.definition.loading import load_campaign

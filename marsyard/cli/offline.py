@@ -63,13 +63,13 @@ def export(
 @options.handle_user_errors
 def score(
     directory: Annotated[Path, Argument(metavar="DIR", help="Folder written by `marsyard export`.")],
-    answers: Annotated[Path, Argument(metavar="ANSWERS", help="CSV file with the results of the external algorithm.")],
+    answers: Annotated[Path, Argument(metavar="ANSWERS", help="CSV file with the answers of the external algorithm.")],
     truth: TruthOption = None,
     out: options.OutOption = None,
     jobs: options.JobsOption = None,
     cluster: options.ClusterOption = None,
 ) -> None:
-    """Score the results of an external algorithm; write verdicts and report."""
+    """Score the answers of an external algorithm; write verdicts and report."""
     from marsyard.campaigns.running.engine import Watch, run_campaign
     from marsyard.campaigns.running.offline import find_cases_with_changed_images, scored_campaign, truth_folder
     from marsyard.reports.wording import count
@@ -99,9 +99,9 @@ def dataset(
     override: options.SetOption = None,
     bits_per_pixel: options.BitsOption = None,
 ) -> None:
-    """Write images with range, normals, rock masks, hazard maps and poses as WebDataset shards; repeat it to continue.
+    """Write images with range, normals, rock masks, hazard maps and poses as WebDataset shards.
 
-    For landing campaigns; two images per case. Existing shards are kept.
+    Landing campaigns give two images per case. Existing shards are kept: repeat the command to continue.
     """
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.dataset import write_dataset

@@ -34,12 +34,12 @@ SiteArgument = Annotated[
     str, Argument(metavar="SITE", help="A site from `marsyard terrain list`, or a DTM: .tif or .npz.")
 ]
 MaxHolesOption = Annotated[
-    float | None, Option(metavar="F", min=0.0, max=0.99, help="Maximum fraction of missing posts of a DTM.")
+    float | None, Option(metavar="F", min=0.0, max=0.99, help="Maximum fraction of missing elevation samples of a DTM.")
 ]
 CasesOption = Annotated[int | None, Option("-n", "--cases", metavar="N", help="Number of cases.")]
 SeedOption = Annotated[int | None, Option(metavar="S", help="Root seed of the random draws.")]
 JsonOption = Annotated[bool, Option("--json", help="Print JSON.")]
-DirectoryArgument = Annotated[Path, Argument(metavar="DIR", help="Folder of a finished campaign run.")]
+DirectoryArgument = Annotated[Path, Argument(metavar="DIR", help="Folder of a campaign run.")]
 BitsOption = Annotated[
     float | None,
     Option(metavar="BITS", min=0.1, max=16.0, help="Compress images with loss to this size per pixel (JPEG 2000)."),
@@ -68,7 +68,7 @@ CaseTimeOption = Annotated[
     float | None, Option(metavar="S", help="Time limit of a case in seconds (limits.case_time_s).")
 ]
 ChangedOption = Annotated[
-    bool, Option("--allow-changed", help="Continue with changed code or versions; the record stores the change.")
+    bool, Option("--allow-changed", help="Continue with changed code or versions; the change is recorded.")
 ]
 
 OutOption = Annotated[Path | None, Option(metavar="DIR", help="Output folder; by default runs/<campaign>-<UTC time>.")]

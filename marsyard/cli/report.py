@@ -133,7 +133,7 @@ def nightly(
 ) -> None:
     """Run the planned campaigns, compare each metric with previous nightly runs, write nightly.md and the dashboard.
 
-    Exit status: the worst of all campaigns; 1 if a metric regressed or a campaign could not be run.
+    Exit status: the most severe of all campaigns; 1 if a metric regressed or a campaign could not be run.
     """
     from marsyard.campaigns.errors import report_write_errors
     from marsyard.campaigns.store.record import folder_lock, git_commit

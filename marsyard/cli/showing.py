@@ -65,7 +65,7 @@ def show_campaign(campaign: Campaign, console: Console) -> None:
         console.print(table)
     table = _table("Requirements", "id", "statement", "criterion")
     for item in configuration.requirements:
-        table.add_row(Text(item.id), Text(item.statement), Text(requirement_text(item, item.metric)))
+        table.add_row(Text(item.id), Text(item.statement), Text(requirement_text(item)))
     console.print(table)
 
 

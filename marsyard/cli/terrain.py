@@ -202,12 +202,19 @@ class RenderOptions:
     site: SiteArgument
     camera: Annotated[str, Option(metavar="NAME", help="Camera such as mer-navcam; an unknown name prints all.")]
     out: Annotated[Path, Option(metavar="PREFIX", help="Path of the files without extension.")]
-    scale: Annotated[str | None, Option(metavar="SCALE", help="descent or ground; by default the camera's.")] = None
-    altitude: Annotated[float | None, Option(metavar="M", help="Height above the ground; by default the camera's.")] = (
-        None
-    )
-    east: Annotated[float | None, Option(metavar="M", help="By default 0, or the centre of a DTM; periodic.")] = None
-    north: Annotated[float | None, Option(metavar="M", help="By default 0, or the centre of a DTM; periodic.")] = None
+    scale: Annotated[
+        str | None,
+        Option(metavar="SCALE", help="Terrain resolution: descent or ground; by default that of the camera."),
+    ] = None
+    altitude: Annotated[
+        float | None, Option(metavar="M", help="Camera height above the ground; by default typical for the camera.")
+    ] = None
+    east: Annotated[
+        float | None, Option(metavar="M", help="East coordinate of the camera; by default 0, or the DTM centre.")
+    ] = None
+    north: Annotated[
+        float | None, Option(metavar="M", help="North coordinate of the camera; by default 0, or the DTM centre.")
+    ] = None
     azimuth: Annotated[float, Option(metavar="DEG", help="Viewing direction, clockwise from north.")] = 0.0
     elevation: Annotated[float | None, Option(metavar="DEG", help="Elevation of the optical axis; -90: down.")] = None
     sun_azimuth: Annotated[float, Option(metavar="DEG", help="Sun azimuth, clockwise from north.")] = 250.0
@@ -221,7 +228,10 @@ class RenderOptions:
 
 @with_options(RenderOptions)
 def render(arguments: RenderOptions) -> None:
-    """Render a site or DTM: PREFIX.png (16 bits), .npz (truth), .cahvor (camera), .json; pairs: -left and -right."""
+    """Render a site or DTM. Writes PREFIX.png (16 bits), .npz (ground truth), .cahvor (camera) and .json.
+
+    A stereo camera adds -left and -right to PREFIX.
+    """
     from marsyard.cli.pictures import ImageRequest, check_files, render_images, write_image
 
     with report_image_errors(arguments.out):

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from marsyard.algorithms.interface import VelocityOutcome
 from marsyard.reports import presentation
 from marsyard.reports.dimes import case_figures as figures
 from marsyard.reports.dimes.sections import FIRING, LANDING, field_test_section, sensitivity_section
@@ -134,5 +135,7 @@ def _write_stream(directory: Path, products: Mapping[str, Any]) -> list[Path]:
 
 STREAM_CASE = CaseKind(is_stream_case, view_stream, _write_stream, note_text("dimes.stream_legend"))
 DIMES_CASE = CaseKind(figures.is_dimes_case, view, figures.write_dimes_figures, note_text("dimes.legend"))
-DIMES = Presentation(cases=(STREAM_CASE, DIMES_CASE), sections=(FIRING, LANDING, sensitivity_section))
+DIMES = Presentation(
+    cases=(STREAM_CASE, DIMES_CASE), sections=(FIRING, LANDING, sensitivity_section), outcomes=(VelocityOutcome,)
+)
 FIELD_TEST = Presentation(first=(field_test_section,))

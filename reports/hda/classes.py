@@ -44,14 +44,14 @@ class HazardClass:
         return f"> {self.low:g}" if math.isinf(self.high) else f"{self.low:g} to {self.high:g}"
 
 
-_GROSS_RATE = "called safe, with a hazard of twice the roughness limit, three cells across"
+_GROSS_RATE = "classified as safe, with a large hazard"
 #: Rates of footprints over all flights by name: columns of hits and of all footprints.
 RATES: Mapping[str, tuple[str, str]] = {
-    "truly safe, with a hazard of the map under them (false alarms)": ("false_alarms", "footprints_truly_safe"),
-    "called safe by the map, not truly safe": ("footprints_called_safe_unsafe", "footprints_called_safe"),
+    "truly safe, with a detected hazard (false alarms)": ("false_alarms", "footprints_truly_safe"),
+    "classified as safe, not truly safe": ("footprints_called_safe_unsafe", "footprints_called_safe"),
     _GROSS_RATE: ("gross_hazards_called_safe", "footprints_called_safe"),
-    "such hazards, called safe": ("gross_hazards_called_safe", "gross_hazards"),
-    "such hazards, with no hazard of the map under them": ("gross_hazards_unflagged", "gross_hazards"),
+    "with a large hazard, classified as safe": ("gross_hazards_called_safe", "gross_hazards"),
+    "with a large hazard, without a detected hazard": ("gross_hazards_unflagged", "gross_hazards"),
 }
 
 
@@ -79,12 +79,12 @@ def draw_classes(frame: Rows, subject: Subject, key: str) -> BlocksAndData:
     class_grid = build_grid(
         [item for item in classes if item.called_safe.of],
         {
-            "By": lambda item: item.kind,
-            "Size / limit": lambda item: item.name,
+            "Hazard by": lambda item: item.kind,
+            "Size divided by limit": lambda item: item.name,
             "Footprints in flights": lambda item: f"{item.called_safe.of:,} in {item.called_safe.flights:,}",
-            "Called safe": lambda item: rate_text(item.called_safe),
-            "Not flagged": lambda item: rate_text(item.unflagged),
-            "Flights with one not flagged": lambda x: f"{x.unflagged.flights_hit:,} of {x.unflagged.flights:,}",
+            "Classified as safe": lambda item: rate_text(item.called_safe),
+            "Not detected": lambda item: rate_text(item.unflagged),
+            "Flights with an undetected hazard": lambda x: f"{x.unflagged.flights_hit:,} of {x.unflagged.flights:,}",
         },
     )
     rows = [[name, f"{item.hits:,} of {item.of:,}", rate_text(item)] for name, item in rates.items()]
@@ -104,8 +104,10 @@ def class_figure(classes: Sequence[HazardClass]) -> Figure:
     for axes, kind in zip(figure.subplots(1, 2, sharey=True), ("roughness", "slope"), strict=True):
         kind_classes = [item for item in classes if item.kind == kind]
         positions = np.arange(len(kind_classes))
-        called = RateLine("called safe", (positions - 0.08).tolist(), [item.called_safe for item in kind_classes])
-        unflagged = RateLine("not flagged", (positions + 0.08).tolist(), [item.unflagged for item in kind_classes])
+        called = RateLine(
+            "classified as safe", (positions - 0.08).tolist(), [item.called_safe for item in kind_classes]
+        )
+        unflagged = RateLine("not detected", (positions + 0.08).tolist(), [item.unflagged for item in kind_classes])
         draw_rates(axes, (called, unflagged), linestyle="")
         axes.set_xticks(positions, [item.name for item in kind_classes])
         axes.set(title=f"by {kind}", xlabel="size divided by the lander's limit")

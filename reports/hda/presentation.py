@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from marsyard.algorithms.interface import SiteOutcome
 from marsyard.reports.hda import products as stages
 from marsyard.reports.hda import sections
 from marsyard.reports.hda.case_figures import FIGURES, available_figures, write_hda_figures
@@ -51,8 +52,8 @@ def _stage_rows(products: Mapping[str, Any]) -> tuple[list[str], list[TableRow]]
         rotation_error = motion.rotation @ motion.true_rotation.T
         angle = np.degrees(np.arccos(np.clip(0.5 * (np.trace(rotation_error) - 1.0), -1.0, 1.0)))
         error_m = float(np.linalg.norm(motion.translation - motion.true_translation))
-        baseline = f"baseline {number(float(np.linalg.norm(motion.true_translation)))} m, off by {number(error_m)} m"
-        results["Motion"] = f"{baseline}; rotation off by {number(float(angle))} deg"
+        baseline = f"baseline {number(float(np.linalg.norm(motion.true_translation)))} m, error {number(error_m)} m"
+        results["Motion"] = f"{baseline}; rotation error {number(float(angle))} deg"
     if matches is not None:
         results["Structure"] = f"{matches.accepted.sum():,} of {len(matches.grid):,} matched"
     if maps is not None:
@@ -65,7 +66,7 @@ def _stage_rows(products: Mapping[str, Any]) -> tuple[list[str], list[TableRow]]
 SITES = SectionDeclaration(
     "sites",
     "Sites",
-    "Sites and hazards compared with the truth",
+    "Sites and hazards compared with the ground truth",
     rows=sections.landing_rows,
     parts=(
         RateTable(sections.site_fractions, cases="Flights", heading="Sites", data="shares", shared=False),
@@ -73,7 +74,7 @@ SITES = SectionDeclaration(
         Distribution(
             sections.hazard_distances,
             ("distance to the nearest unsafe position (m)", "fraction above this distance"),
-            "Fraction of positions farther than each distance from the nearest unsafe position of the lander.",
+            "Fraction of positions with a larger distance to the nearest unsafe position of the lander.",
             heading="Distance to true hazards",
             complementary=True,
             table=sections.distance_grid,
@@ -85,4 +86,5 @@ _SECTIONS = (sections.THRESHOLD, sections.FAULTS, limits_section, sections.MAP_E
 HDA = Presentation(
     cases=(CaseKind(stages.is_hda_case, view, write_hda_figures, note_text("hda.legend")),),
     sections=(*_SECTIONS, sections.run_times_section),
+    outcomes=(SiteOutcome,),
 )

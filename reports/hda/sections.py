@@ -187,8 +187,8 @@ MAP_ERRORS = kinds.SectionDeclaration(
 
 #: Errors of the touchdown.
 TOUCHDOWN_ERRORS = (
-    kinds.Quantity("touchdown_error_gps_m", "by averaged GPS, as in the paper"),
-    kinds.Quantity("touchdown_error_m", "by truth"),
+    kinds.Quantity("touchdown_error_gps_m", "averaged GPS as in the paper"),
+    kinds.Quantity("touchdown_error_m", "true touchdown"),
     kinds.Quantity("touchdown_error_estimated_m", "navigation filter estimate"),
 )
 _DEVIATIONS = ("gps_deviation_north_m", "gps_deviation_east_m")
@@ -220,9 +220,11 @@ def _draw_table_2(landed: pd.DataFrame, subject: Subject, key: str) -> kinds.Blo
             means[measure.column], intervals[measure.column] = float(values[finite].mean()), (low, high)
             text = f"mean {number(means[measure.column])} ({number(low)} to {number(high)})"
             range_text = " to ".join(number(float(quantile)) for quantile in np.quantile(values[finite], (0.05, 0.95)))
-            run_time = f"{1e3 * float(np.median(run_times_s)):.0f} ms here" if run_times_s.size else NOTHING
+            run_time = f"{1e3 * float(np.median(run_times_s)):.0f} ms (this host)" if run_times_s.size else NOTHING
             means_m = [f"{x.mean():.2f}" if x.size else NOTHING for x in deviations.values()]
-            rows.append([f"ours, {measure.title}", f"{int(finite.sum()):,}", text, range_text, *means_m, run_time])
+            rows.append(
+                [f"this campaign, {measure.title}", f"{int(finite.sum()):,}", text, range_text, *means_m, run_time]
+            )
     head = ["", "Landings", "Position error (m)", "5 % to 95 % quantiles (m)", "GPS SD north (m)", "GPS SD east (m)"]
     note, column = note_text("hda.touchdown", confidence=format_fraction(CONFIDENCE)), "touchdown_safe"
     safe_fraction = rates.flag_fraction(landed, column).share if column in landed else math.nan
@@ -247,14 +249,14 @@ TOUCHDOWN = kinds.SectionDeclaration(
         kinds.Distribution(
             TOUCHDOWN_ERRORS,
             ("distance of the touchdown from the site (m)", "fraction of landings"),
-            "Fraction of landings up to each distance from the site; vertical: the paper's runs, by averaged GPS.",
-            limits={"paper, runs 1, 3, 4": [run["error_m"] for run in PAPER["landings"]]},
+            "Fraction of landings up to each distance from the site. Vertical lines: runs of the paper (averaged GPS).",
+            limits={"paper, runs 1, 3 and 4": [run["error_m"] for run in PAPER["landings"]]},
         ),
         kinds.CustomBlocks(_draw_table_2),
         kinds.RateTable(
             (
                 kinds.Rate("touchdown", "touchdown on safe ground", kinds.flag_rate("touchdown_safe")),
-                kinds.Rate("site", "safe site", kinds.flag_rate("site_safe")),
+                kinds.Rate("site", "reported site is truly safe", kinds.flag_rate("site_safe")),
             ),
             cases="Landings",
             heading="Safety of the touchdown point",
@@ -267,7 +269,7 @@ TOUCHDOWN = kinds.SectionDeclaration(
 #: Classes of the true ground in both pictures, best first, and outcomes of the search. The surroundings of a wide safe
 #: site are safe up to a lander's radius.
 GROUNDS = ("wide safe site", "narrow safe site", "no safe site")
-ANSWERS = ("safe site, truly safe", "site, not safe", "no safe site", "not converged", "not finished")
+ANSWERS = ("truly safe site", "unsafe site", "'no safe site'", "not converged", "not finished")
 
 
 def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
@@ -279,10 +281,10 @@ def site_fractions(frame: pd.DataFrame) -> dict[str, rates.CaseFraction]:
     narrow, correct = rates.flag(frame, "safe_site_exists") & ~wide_site, refused | (reported & safe)
     fractions = {
         "chosen sites that are truly safe": rates.fraction_of(safe[reported], frame[reported]),
-        "'no safe site', where none exists": rates.fraction_of(refused[no_site], frame[no_site]),
-        "a site reported, where none exists": rates.fraction_of(reported[no_site], frame[no_site]),
-        "a site reported, where a wide safe site exists": rates.fraction_of(reported[wide_site], frame[wide_site]),
-        "a truly safe site or 'no safe site', where all safe sites are narrow": rates.fraction_of(
+        "answer 'no safe site' if none exists": rates.fraction_of(refused[no_site], frame[no_site]),
+        "site reported although none is safe": rates.fraction_of(reported[no_site], frame[no_site]),
+        "site reported if a wide safe site exists": rates.fraction_of(reported[wide_site], frame[wide_site]),
+        "truly safe site or 'no safe site' if all safe sites are narrow": rates.fraction_of(
             correct[narrow], frame[narrow]
         ),
         "converged (of all flights)": rates.fraction_of(rates.flag(frame, "converged"), frame),
@@ -309,7 +311,7 @@ def draw_outcomes(frame: pd.DataFrame, subject: Subject, key: str) -> kinds.Bloc
     counts = outcome_counts(frame)
     rows = [[ground, *(f"{answer_counts[name]:,}" for name in ANSWERS)] for ground, answer_counts in counts.items()]
     note = note_text("hda.outcomes")
-    block = Block(heading="Answers by ground truth", grid=Grid(["Ground in the pictures", *ANSWERS], rows), note=note)
+    block = Block(heading="Answers by ground truth", grid=Grid(["Ground truth", *ANSWERS], rows), note=note)
     return [block], {"outcomes": counts}
 
 

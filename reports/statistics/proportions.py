@@ -108,7 +108,7 @@ class ClusterMethod(StrEnum):
     """Method of the bounds of clustered cases."""
 
     KORN_GRAUBARD = "Korn-Graubard effective sample size"
-    TERRAIN_COUNT = "whole terrains counted"
+    TERRAIN_COUNT = "terrains counted instead of cases"
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from marsyard.algorithms.vtt.accuracy import HandOffOutcome
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
 from marsyard.reports.section import svg_figure
 from marsyard.reports.vtt import sections
@@ -18,6 +19,7 @@ from marsyard.reports.vtt.case_figures import (
 )
 from marsyard.reports.vtt.goal import GOAL
 from marsyard.reports.wording import NOTHING, label, note_text, number
+from marsyard.scenarios.rover.stops import RunOutcome
 
 #: Maximum number of stops with pictures on the page.
 _MAX_STOPS = 8
@@ -46,5 +48,7 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
 
 
 VTT = Presentation(
-    cases=(CaseKind(is_vtt_case, view, write_vtt_figures, note_text("vtt.legend")),), first=(*sections.SECTIONS, GOAL)
+    cases=(CaseKind(is_vtt_case, view, write_vtt_figures, note_text("vtt.legend")),),
+    first=(*sections.SECTIONS, GOAL),
+    outcomes=(RunOutcome, HandOffOutcome),
 )

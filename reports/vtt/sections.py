@@ -48,7 +48,7 @@ def table_1_section(subject: Subject) -> Section | None:
             "": lambda pair: pair[0],
             "Designation (cm)": lambda pair: f"{pair[1].designation_cm:g}",
             "Approach without tracker (cm)": lambda pair: f"{pair[1].untracked_cm:.1f}",
-            "Approach with N px of drift (cm)": lambda pair: pair[1].tracked_formula,
+            "Approach with a drift of N px (cm)": lambda pair: pair[1].tracked_formula,
         },
     )
     measured_note = note_text("vtt.table_1_measured", start=f"{START_M:g}", goal=f"{GOAL_M:g}")

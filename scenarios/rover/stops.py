@@ -128,8 +128,8 @@ class RunOutcome(Enum):
     """Outcome of a run. All outcomes except COMPLETED are expected failures: no position is reported at the goal."""
 
     COMPLETED = "the run was completed and the target was tracked at its end"
-    NOT_SEEDED = "the target was not found in the first pictures"
-    LOST = "the target was lost and not found again"
+    NOT_SEEDED = "the target was not found in the first images"
+    LOST = "the target was lost and was not found again"
     OUT_OF_REACH = "the mast or the cameras cannot show the target"
     NO_PATH = "the navigator found no path"
     STUCK = "the maximum number of steps was reached before the goal"

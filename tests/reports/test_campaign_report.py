@@ -136,7 +136,7 @@ def test_small_report_contains_the_main_results(
     for message in (
         "INSUFFICIENT",
         "DIMES-VEL",
-        "share 4 terrains",
+        "on 4 terrains: terrains counted instead of cases",
         "1 case crashed",
         "RuntimeError: the context is lost",
         f"marsyard replay {directory} 23",
@@ -170,7 +170,7 @@ def test_requirement_met_by_rate_has_its_own_symbol(
     text, _, twin = _write_and_read(directory)
     assert '<div class="headline status-met-by-rate">' in text
     assert ".status-met-by-rate { --status: var(--rate)" in text
-    assert "(evaluated by observed rate)." in text
+    assert "evaluated by observed rate; bounds at" in text
     diamond = "M12 1L23 12 12 23 1 12z"
     assert diamond in text.split("<span>MET BY RATE</span>")[0].rsplit("<svg", 1)[1]
     assert (twin["verdict"], twin["exit_code"]) == ("MET BY RATE", 3)
@@ -179,7 +179,7 @@ def test_requirement_met_by_rate_has_its_own_symbol(
 def test_few_terrains_give_an_insufficient_verdict(make_rows: Rows, make_run: MakeRun) -> None:
     text, _, twin = _write_and_read(make_run(make_rows(400, answered=1.0, spread=0.1)[[*MIN_COLUMNS, "terrain"]]))
     assert (twin["verdict"], twin["verdicts"][0]["plain_status"]) == ("INSUFFICIENT", "PASS")
-    assert "400 cases share 4 terrains and so are not independent" in text
+    assert "400 cases on 4 terrains: terrains counted instead of cases" in text
 
 
 def test_texts_from_files_are_escaped(

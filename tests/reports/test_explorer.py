@@ -33,7 +33,10 @@ def test_explorer_data_have_labels_outcomes_and_values(make_rows: Rows, make_run
     frame = make_rows(30, crashed=1)
     run = read_run(make_run(frame))
     data = explorer_data(run, METRIC, 5.0, ["3"])
-    assert [data["labels"][index] for index in data["axes"]] == ["velocity error x (m/s)", "velocity error y (m/s)"]
+    assert [data["labels"][index] for index in data["axes"]] == [
+        "east velocity error (m/s)",
+        "north velocity error (m/s)",
+    ]
     assert (data["cases"], data["pictured"], data["shown"], data["all"]) == (list(range(30)), [3], 30, 30)
     assert data["outcomes"][data["outcome"][29]] == "CRASHED"
     assert data["columns"][data["metric"]][29] is None

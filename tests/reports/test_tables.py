@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import math
+import tomllib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
+from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.reports.rates import fraction_of
 from marsyard.reports.tables import outcome_counts, statistics_grid, verdict_table
 from marsyard.reports.verdicts import evaluate_requirements
@@ -26,8 +29,12 @@ from marsyard.reports.wording import (
     magnitude_label,
     number,
     percent,
+    population_text,
     primary_metric,
+    requirement_text,
 )
+
+REQUIREMENTS = Path(__file__).parents[2] / "scenarios" / "requirements.toml"
 
 Rows = Callable[..., pd.DataFrame]
 
@@ -71,7 +78,7 @@ def test_outcomes_are_ordered_and_counted(make_rows: Rows) -> None:
 
 def test_statistics_table_has_errors_and_components(make_rows: Rows) -> None:
     grid = statistics_grid(make_rows(24), "velocity_error_m_s")
-    assert list(grid.head) == ["", "velocity error (m/s)", "velocity error x (m/s)", "velocity error y (m/s)"]
+    assert list(grid.head) == ["", "velocity error (m/s)", "east velocity error (m/s)", "north velocity error (m/s)"]
     assert [row[0] for row in grid.rows if "interval" not in row[0] and "bounds" not in row[0]][:3] == [
         "cases",
         "mean",
@@ -80,7 +87,7 @@ def test_statistics_table_has_errors_and_components(make_rows: Rows) -> None:
 
 
 def test_column_names_become_labels() -> None:
-    assert label("attitude_rate_max_deg_s") == "attitude rate max (deg/s)"
+    assert label("attitude_rate_max_deg_s") == "maximum attitude rate (deg/s)"
     assert label("terrain") == "terrain"
     assert magnitude_label("velocity_error_m_s") == "|velocity error| (m/s)"
 
@@ -138,3 +145,18 @@ def test_rate_without_cases_has_the_interval_0_to_1() -> None:
     assert (empty.hits, empty.n) == (0, 0)
     assert math.isnan(empty.share)
     assert empty.clustered_interval == (0.0, 1.0)
+
+
+def test_criteria_are_sentences_of_the_domain() -> None:
+    entries = {item["id"]: item for item in tomllib.loads(REQUIREMENTS.read_text(encoding="utf-8"))["requirements"]}
+    texts = {
+        name: requirement_text(Requirement.model_validate({k: v for k, v in entry.items() if k != "campaigns"}))
+        for name, entry in entries.items()
+    }
+    assert texts["VTT-POS"].startswith(
+        "|position error| ≤ 0.03 m in at least 99 % of valid answers at selectable targets"
+    )
+    assert texts["HDA-SAFE"].startswith("the site is safe in at least 99 % of cases with a reported site")
+    assert texts["HDA-TIME"].startswith("60 × |run time of all stages| ≤ 2 s in at least 95 %")
+    assert population_text("valid and selectable and navcam") == "valid answers at selectable targets, with the navcam"
+    assert population_text("in_the_dark") == "cases with in the dark"

@@ -92,10 +92,10 @@ def test_reported_sites_are_scored_against_the_truth() -> None:
     rates = site_fractions(frame)
     safe = rates["chosen sites that are truly safe"]
     assert (safe.n, safe.hits) == (frame["site_reported"].sum(), (frame["site_reported"] & frame["site_safe"]).sum())
-    assert rates["'no safe site', where none exists"].share == 1.0
+    assert rates["answer 'no safe site' if none exists"].share == 1.0
     counts = outcome_counts(frame)
     assert sum(sum(row.values()) for row in counts.values()) == len(frame)
-    assert counts["no safe site"]["no safe site"] == (frame["outcome"] == "NO_SAFE_SITE").sum()
+    assert counts["no safe site"]["'no safe site'"] == (frame["outcome"] == "NO_SAFE_SITE").sum()
 
 
 def test_crashed_flights_are_counted_as_not_finished() -> None:

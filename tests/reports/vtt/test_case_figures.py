@@ -126,5 +126,5 @@ def test_other_products_are_not_a_tracking_case() -> None:
 def test_case_view_has_one_row_per_stop() -> None:
     case_view = view(make_products(), "case7")
     assert [row.succeeded for row in case_view.rows] == [True, True, False]
-    assert case_view.head == ["Stop", "State", "range (m)", "azimuth (deg)", "match score"]
+    assert case_view.head == ["Stop", "State", "range (m)", "azimuth (deg)", "correlation of the match"]
     assert list(case_view.rows[1].values)[:3] == ["2", "normal", "6.000"]

@@ -239,7 +239,7 @@ def test_goal_statistics_by_camera() -> None:
     result = read_table(GOAL(make_subject(frame)), 1)
     assert result[1]["Median (mm)"] == "4.000"
     small_sample = read_table(GOAL(make_subject(frame.iloc[:20])), 1)
-    assert small_sample[0]["Its bound (mm)"] == "too few cases"
+    assert small_sample[0]["Bound of the 99 % quantile (mm)"] == "too few cases"
 
 
 def test_other_campaigns_have_no_tracking_section() -> None:
