@@ -42,7 +42,7 @@ def main() -> None:
         *starting.figures(5),
         *reporting.figures(),
     ]
-    print(f"{'core-seconds, unless said otherwise':<52}{'median':>8}{'least':>8}{'most':>8}  {'bar':<8}")
+    print(f"{'core-seconds, unless said otherwise':<52}{'median':>8}{'least':>8}{'most':>8}  {'limit':<8}")
     for figure in figures:
         mark = "" if figure.met else "  MISSED"
         low, high = min(figure.values), max(figure.values)

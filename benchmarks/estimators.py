@@ -91,8 +91,8 @@ def run_estimator(estimator: VelocityEstimator, descents: list[Descent]) -> Trie
 def side_by_side(cases: int) -> list[Figure]:
     """Core-seconds of each estimator on the same triples, binned to 256 x 256."""
     descents = recorded("dimes-smoke", cases)
-    bars = {"DIMES": 0.015}
+    limits = {"DIMES": 0.015}
     return [
-        Figure(f"a triple: {name}", run_estimator(estimator, descents).seconds.tolist(), bar=bars.get(name))
+        Figure(f"a triple: {name}", run_estimator(estimator, descents).seconds.tolist(), limit=limits.get(name))
         for name, estimator in ESTIMATORS.items()
     ]

@@ -31,15 +31,15 @@ def imu_check(quick: bool) -> Iterator[Measure]:
     # bounds: three standard errors of the quantiles, sqrt(q (1 - q) / n) divided by density times quantile, which is
     # 0.44 at the median and 0.03 at 99.5 %
     median = float(np.median(single)) / _stored_median_m_s() - 1.0
-    bar = 3.4 / math.sqrt(descents)
-    yield Measure("right tracks' discrepancy, median, from the stored derivation's", abs(median), "", bar, how)
+    limit = 3.4 / math.sqrt(descents)
+    yield Measure("right tracks' discrepancy, median, from the stored derivation's", abs(median), "", limit, how)
     tail = float(np.quantile(single, inputs.kept)) / threshold - 1.0
-    bar = 7.0 / math.sqrt(descents)
-    yield Measure("right tracks' discrepancy, 99.5 % quantile, from the threshold", abs(tail), "", bar, how)
+    limit = 7.0 / math.sqrt(descents)
+    yield Measure("right tracks' discrepancy, 99.5 % quantile, from the threshold", abs(tail), "", limit, how)
     bound = inputs.kept - 3.0 * math.sqrt(inputs.kept * (1.0 - inputs.kept) / descents)
     kept = float(np.mean(single < threshold))
     claim = "descents with one right track a pair that pass the IMU check"
-    yield Measure(claim, kept, "", bound, f"{how}; bar: 99.5 % less three deviations of the simulation", "at least")
+    yield Measure(claim, kept, "", bound, f"{how}; limit: 99.5 % less three deviations of the simulation", "at least")
     kept = float(np.mean(reference.best() < threshold))
     yield Measure("descents with two right tracks a pair that pass the IMU check", kept, "", 0.995, how, "at least")
     for tracks in (1, 2):
