@@ -126,7 +126,7 @@ def scatter_section(subject: Subject) -> Section | None:
     )
     rows = [[format_fraction(c.probability), number(c.estimate), interval(c.lower, c.upper)] for c in circles]
     grid = Grid(
-        ["Fraction of errors", f"Radius ({unit})", f"One-sided bounds at {format_fraction(CONFIDENCE)} each"], rows
+        ["Fraction of errors", f"Radius ({unit})", f"Lower and upper bound ({format_fraction(CONFIDENCE)} each)"], rows
     )
     note = note_text("common.scatter")
     data = {"ellipse": asdict(ellipse), "circles": [asdict(circle) for circle in circles]}
@@ -152,7 +152,7 @@ def drivers_section(subject: Subject) -> Section | None:
     if not ranked:
         return None
     note = note_text("common.drivers", confidence=format_fraction(CONFIDENCE))
-    headings = ["Condition", "Cases", "Rank correlation", "Its interval", "Fraction of variance", "Its interval", "p"]
+    headings = ["Condition", "Cases", "Correlation", "Its interval", "Variance fraction", "Fraction interval", "p"]
     blocks = []
     for name, drivers in ranked.items():
         rows = []
