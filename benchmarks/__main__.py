@@ -32,7 +32,7 @@ def main() -> None:
         *pictures.memory(500),
         *descent.frame(15),
         *descent.case(7),
-        *estimators.side_by_side(8),
+        *estimators.compare_estimators(8),
         *renderers.figures(5),
         *pictures.rover_pictures(3),
         *descent.new_terrains(2),

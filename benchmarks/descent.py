@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.bounds import bounds
 from benchmarks.pictures import descent_pose, descent_scene
-from benchmarks.stages import stages
+from benchmarks.stages import measure_stages
 from benchmarks.timing import Figure, core_seconds
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.descent.exposure import camera_optics
@@ -47,7 +47,7 @@ def case(repeats: int) -> list[Figure]:
 
     return [
         Figure("dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), limit=1.0),
-        *stages(run_next, repeats),
+        *measure_stages(run_next, repeats),
         *bounds(run_next, repeats),
     ]
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmarks.dimes_threshold import STORED, WRONG_BY_M_S
-from benchmarks.estimators import ESTIMATORS, recorded, run_estimator
+from benchmarks.estimators import ESTIMATORS, record_descents, run_estimator
 from benchmarks.threshold_derivation import ThresholdInputs
 from benchmarks.validation.imu_reference import Reference
 from benchmarks.validation.records import Check, Measure
@@ -63,10 +63,10 @@ def _stored_median_m_s() -> float:
 
 
 def estimators(quick: bool) -> Iterator[Measure]:
-    descents = recorded("dimes-smoke", 4 if quick else 48)
+    descents = record_descents("dimes-smoke", 4 if quick else 48)
     for name, estimator in ESTIMATORS.items():
         results = run_estimator(estimator, descents)
-        valid = results.valid
+        valid = results.valid_errors_m_s
         rms = float(np.sqrt(np.mean(valid**2))) if valid.size else float("nan")
         wrong = int(np.sum(valid > REQUIREMENT_M_S))
         how = (

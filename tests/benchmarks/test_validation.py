@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from benchmarks.bounds import CALLS
+from benchmarks.stages import STAGES
 from benchmarks.threshold_derivation import ThresholdInputs, right_track_errors
 from benchmarks.validation import dimes_checks, landing_checks, tracking_checks
 from benchmarks.validation.document import RESULTS
@@ -116,3 +119,10 @@ def test_second_implementation_agrees_without_instrument_errors() -> None:
     # discrepancy of two tracks and the IMU: median of a Rayleigh distribution
     sd = math.sqrt(2.0 * inputs.match_sd_m_s**2 + inputs.imu_sd_m_s**2)
     assert np.median(reference.single()) == pytest.approx(sd * math.sqrt(2.0 * math.log(2.0)), rel=0.15)
+
+
+def test_profiled_stages_name_existing_functions() -> None:
+    folder = Path(__file__).parents[2]
+    for file, function in {pair for pairs in (*STAGES.values(), *CALLS.values()) for pair in pairs}:
+        texts = [path.read_text() for path in folder.glob(f"[sac]*/**/{file}")]
+        assert any(f"def {function}(" in text for text in texts), (file, function)
