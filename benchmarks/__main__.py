@@ -32,7 +32,7 @@ def main() -> None:
         *pictures.memory(500),
         *descent.frame(15),
         *descent.case(7),
-        *estimators.side_by_side(8),
+        *estimators.compare_estimators(8),
         *renderers.figures(5),
         *pictures.rover_pictures(3),
         *descent.new_terrains(2),
@@ -42,7 +42,7 @@ def main() -> None:
         *starting.figures(5),
         *reporting.figures(),
     ]
-    print(f"{'core-seconds, unless said otherwise':<52}{'median':>8}{'least':>8}{'most':>8}  {'bar':<8}")
+    print(f"{'core-seconds, unless said otherwise':<52}{'median':>8}{'least':>8}{'most':>8}  {'limit':<8}")
     for figure in figures:
         mark = "" if figure.met else "  MISSED"
         low, high = min(figure.values), max(figure.values)

@@ -23,7 +23,7 @@ from scipy import stats
 
 from benchmarks import hda
 from benchmarks.engine import table_seconds
-from benchmarks.estimators import recorded
+from benchmarks.estimators import record_descents
 from benchmarks.pictures import descent_exposure
 from benchmarks.vtt import seeded_update
 from marsyard.algorithms.dimes import DimesEstimator
@@ -40,7 +40,7 @@ FALSE_ALARMS = 0.01
 
 
 def _dimes() -> Callable[[], object]:
-    measurements, estimator = recorded("dimes-smoke", 1)[0].measurements, DimesEstimator()
+    measurements, estimator = record_descents("dimes-smoke", 1)[0].measurements, DimesEstimator()
     return lambda: estimator.estimate(measurements)
 
 

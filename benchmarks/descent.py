@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.bounds import bounds
 from benchmarks.pictures import descent_pose, descent_scene
-from benchmarks.stages import stages
+from benchmarks.stages import measure_stages
 from benchmarks.timing import Figure, core_seconds
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.descent.exposure import camera_optics
@@ -30,7 +30,7 @@ def frame(repeats: int) -> list[Figure]:
         Figure(
             "descent frame, 1024 x 1024",
             core_seconds(lambda: renderer.render(scene, optics.rays, pose), repeats),
-            bar=0.2,
+            limit=0.2,
         )
     ]
 
@@ -46,8 +46,8 @@ def case(repeats: int) -> list[Figure]:
         campaign.scenario.run(parameters, campaign.streams(number))
 
     return [
-        Figure("dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), bar=1.0),
-        *stages(run_next, repeats),
+        Figure("dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), limit=1.0),
+        *measure_stages(run_next, repeats),
         *bounds(run_next, repeats),
     ]
 
@@ -61,7 +61,7 @@ def new_terrains(repeats: int) -> list[Figure]:
         Figure(
             f"new descent terrain, {name}",
             core_seconds(partial(synthesise, kind, np.random.default_rng(0)), repeats),
-            bar=2.0,
+            limit=2.0,
         )
         for name, kind in kinds.items()
     ]

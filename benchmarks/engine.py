@@ -91,14 +91,16 @@ def figures(repeats: int = 3) -> list[Figure]:
     busy = [span(0.05, 20, 140) for _ in range(repeats)]
     long = span(0.0, 10_000, 100_000)
     return [
-        Figure("engine: overhead of an empty case (ms)", [1e3 * (one.case_s - one.own_s) for one in empty], bar=2.0),
+        Figure("engine: overhead of an empty case (ms)", [1e3 * (one.case_s - one.own_s) for one in empty], limit=2.0),
         Figure(
-            "engine: overhead of a case of 50 ms (%)", [100.0 * (one.case_s / one.own_s - 1.0) for one in busy], bar=3.0
+            "engine: overhead of a case of 50 ms (%)",
+            [100.0 * (one.case_s / one.own_s - 1.0) for one in busy],
+            limit=3.0,
         ),
-        Figure("engine: growth of the parent, 10,000 to 100,000 cases (MB)", [long.grown_mb], bar=10.0),
+        Figure("engine: growth of the parent, 10,000 to 100,000 cases (MB)", [long.grown_mb], limit=10.0),
         *_a_hundred_thousand(),
         Figure("engine: speed-up by two workers, rendered cases", [gain() for _ in range(repeats)], minimum=1.85),
-        Figure(f"engine: table of 1,000,000 rows of {COLUMNS} numbers (s)", [table_seconds(1_000_000)], bar=30.0),
+        Figure(f"engine: table of 1,000,000 rows of {COLUMNS} numbers (s)", [table_seconds(1_000_000)], limit=30.0),
     ]
 
 
@@ -116,7 +118,7 @@ def _a_hundred_thousand(cases: int = 100_000) -> list[Figure]:
     Parallel(2)(delayed(_one)(campaign, case) for case in range(cases))
     loop = time.perf_counter() - began
     return [
-        Figure(f"engine: {cases:,} empty cases, two workers (wall s)", [ours], bar=60.0),
+        Figure(f"engine: {cases:,} empty cases, two workers (wall s)", [ours], limit=60.0),
         Figure("the same in a loop of joblib without storage (wall s)", [loop]),
     ]
 

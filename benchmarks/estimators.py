@@ -19,7 +19,7 @@ from marsyard.sim.measurements import DescentMeasurements
 #: Compared estimators, by name.
 ESTIMATORS: Mapping[str, VelocityEstimator] = {
     "DIMES": DimesEstimator(),
-    "DIMES, peaks by a quadric alone": DimesEstimator(DimesOptions(align=False)),
+    "DIMES, quadric peak fit only": DimesEstimator(DimesOptions(align=False)),
     "DIMES, whole pixels": DimesEstimator(DimesOptions(subpixel=False)),
     "OpenCV's phase correlation": PhaseCorrelationEstimator(),
     "OpenCV's ORB and homography": HomographyEstimator(),
@@ -31,49 +31,49 @@ REPEATS = 3
 class Recorder:
     """Estimator that records its measurements for other estimators."""
 
-    given: ClassVar[list[DescentMeasurements]] = []
+    recorded: ClassVar[list[DescentMeasurements]] = []
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """Record the measurements without an answer."""
-        self.given.append(measurements)
+        self.recorded.append(measurements)
         return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
 
 
 @dataclass(frozen=True)
 class Descent:
-    """Measurements of a descent, true mean velocity over the second pair, and whether templates overlap."""
+    """Measurements of a descent, true mean velocity over the second pair, and whether the overlap is feasible."""
 
     measurements: DescentMeasurements
     velocity_m_s: np.ndarray
-    room: bool
+    has_feasible_overlap: bool
 
 
-def recorded(campaign_name: str, cases: int) -> list[Descent]:
+def record_descents(campaign_name: str, cases: int) -> list[Descent]:
     """Record the first cases of a descent campaign."""
     campaign = load_campaign(campaign_name, ["parameters.algorithm=benchmarks.estimators:Recorder"])
     descents = []
     for case in range(cases):
-        Recorder.given.clear()
+        Recorder.recorded.clear()
         row = campaign.scenario.run(campaign.parameters(case), campaign.streams(case)).row
         velocity = np.array([row["velocity_true_x_m_s"], row["velocity_true_y_m_s"]])
-        descents.append(Descent(Recorder.given[0], velocity, bool(row["feasible_overlap"])))
+        descents.append(Descent(Recorder.recorded[0], velocity, bool(row["feasible_overlap"])))
     return descents
 
 
 @dataclass(frozen=True)
-class Tried:
+class EstimatorResult:
     """Errors of an estimator in m/s (NaN without an answer) and core-seconds per descent."""
 
     errors_m_s: np.ndarray
     seconds: np.ndarray
 
     @property
-    def valid(self) -> np.ndarray:
+    def valid_errors_m_s(self) -> np.ndarray:
         """Errors of the answers."""
         return self.errors_m_s[np.isfinite(self.errors_m_s)]
 
 
-def run_estimator(estimator: VelocityEstimator, descents: list[Descent]) -> Tried:
+def run_estimator(estimator: VelocityEstimator, descents: list[Descent]) -> EstimatorResult:
     """Run an estimator on descents."""
     errors, seconds = [], []
     for descent in descents:
@@ -82,17 +82,17 @@ def run_estimator(estimator: VelocityEstimator, descents: list[Descent]) -> Trie
             start = time.process_time()
             answer = estimator.estimate(descent.measurements)
             times.append(time.process_time() - start)
-        given = np.full(2, np.nan) if answer.velocity_m_s is None else answer.velocity_m_s
-        errors.append(float(np.hypot(*(given - descent.velocity_m_s))))
+        velocity = np.full(2, np.nan) if answer.velocity_m_s is None else answer.velocity_m_s
+        errors.append(float(np.hypot(*(velocity - descent.velocity_m_s))))
         seconds.append(min(times))
-    return Tried(np.array(errors), np.array(seconds))
+    return EstimatorResult(np.array(errors), np.array(seconds))
 
 
-def side_by_side(cases: int) -> list[Figure]:
+def compare_estimators(cases: int) -> list[Figure]:
     """Core-seconds of each estimator on the same triples, binned to 256 x 256."""
-    descents = recorded("dimes-smoke", cases)
-    bars = {"DIMES": 0.015}
+    descents = record_descents("dimes-smoke", cases)
+    limits_s = {"DIMES": 0.015}
     return [
-        Figure(f"a triple: {name}", run_estimator(estimator, descents).seconds.tolist(), bar=bars.get(name))
+        Figure(f"a triple: {name}", run_estimator(estimator, descents).seconds.tolist(), limit=limits_s.get(name))
         for name, estimator in ESTIMATORS.items()
     ]

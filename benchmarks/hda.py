@@ -107,12 +107,12 @@ def _whole(given: LandingMeasurements, repeats: int) -> list[Figure]:
         Figure(
             "HDA, the paper's parameters (paper: 0.77 s)",
             core_seconds(lambda: HdaEstimator(PAPER).estimate(given), repeats),
-            bar=0.03,
+            limit=0.03,
         ),
         Figure(
             "HDA, 160 x 120 points of 640 x 480",
             core_seconds(lambda: HdaEstimator(DENSE).estimate(given), repeats),
-            bar=0.2,
+            limit=0.2,
         ),
         Figure(
             "the same by semi-global matching",
@@ -125,7 +125,7 @@ def _large_map(repeats: int) -> Figure:
     rough = 0.02 * np.random.default_rng(1).standard_normal((256, 256))
     ground = ElevationMap(rough, np.zeros(2), 0.1)
     return Figure(
-        "HDA hazard maps of 256 x 256", core_seconds(lambda: hazard_maps(ground, HdaOptions()), repeats), bar=0.05
+        "HDA hazard maps of 256 x 256", core_seconds(lambda: hazard_maps(ground, HdaOptions()), repeats), limit=0.05
     )
 
 
@@ -137,4 +137,4 @@ def case(cases: int) -> Figure:
         campaign.scenario.run(campaign.parameters(number), campaign.streams(number))
 
     times = [time for number in range(cases) for time in core_seconds(partial(fly, number), 1)]
-    return Figure("hda-hazardous case: flight, 2 frames, map, landing, truth", times, bar=1.5)
+    return Figure("hda-hazardous case: flight, 2 frames, map, landing, truth", times, limit=1.5)

@@ -95,7 +95,7 @@ def rover_pictures(repeats: int) -> list[Figure]:
 
     return [
         Figure("navcam frame over rocks", core_seconds(lambda: renderer.render(scene, full, left), repeats)),
-        Figure("stereo pair of subframes, 161 x 161", core_seconds(pair, 3 * repeats), bar=0.06),
+        Figure("stereo pair of subframes, 161 x 161", core_seconds(pair, 3 * repeats), limit=0.06),
     ]
 
 
@@ -128,12 +128,12 @@ def memory(frames: int) -> list[Figure]:
     # medians, because the memory of scenes with rocks varies
     growth = float(np.median(sizes[-quarter:]) - np.median(sizes[quarter : 2 * quarter]))
     return [
-        Figure(f"own memory, most over {len(sizes)} frames of {scenes} scenes, GB", [max(sizes)], bar=1.2),
-        Figure("its growth from the second quarter of these frames to the last, GB", [growth], bar=0.02),
+        Figure(f"own memory, most over {len(sizes)} frames of {scenes} scenes, GB", [max(sizes)], limit=1.2),
+        Figure("its growth from the second quarter of these frames to the last, GB", [growth], limit=0.02),
         Figure(
             "greatest resident memory, terrain files included, GB",
             [resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20],
-            bar=1.2,
+            limit=1.2,
         ),
     ]
 
@@ -149,7 +149,7 @@ def on_all_cores(repeats: int) -> list[Figure]:
         text=True,
         check=True,
     )
-    return [Figure("the same on all cores (wall s)", json.loads(done.stdout), bar=0.12)]
+    return [Figure("the same on all cores (wall s)", json.loads(done.stdout), limit=0.12)]
 
 
 def _wall_seconds(repeats: int) -> list[float]:

@@ -47,7 +47,7 @@ def figures(repeats: int) -> list[Figure]:
     theirs = _pyrender_shaded(given)
     paired = [(core_seconds(ours, 1)[0], core_seconds(theirs, 1)[0]) for _ in range(repeats)]
     timings = [
-        Figure("descent frame with shadows and detector", [mine for mine, _ in paired], bar=0.2),
+        Figure("descent frame with shadows and detector", [mine for mine, _ in paired], limit=0.2),
         *on_all_cores(repeats),
         Figure("pyrender's shaded frame of a mesh as fine, with shadows", [other for _, other in paired]),
         Figure("how many times slower that is", [other / mine for mine, other in paired], minimum=3.0),

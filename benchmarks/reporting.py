@@ -51,15 +51,15 @@ def figures(cases: int = 1_000_000, campaigns: int = 1_000) -> list[Figure]:
         index = site / "index.html"
         shown, filtered = time_page(page, hover_a_case), time_page(index, filter_campaigns)
         return [
-            Figure(f"report of {cases:,} cases", [of_large.core_s], bar=30.0),
-            Figure(f"report of {cases:,} cases: memory (GB)", [of_large.memory_gb], bar=2.0),
-            Figure(f"report of {cases:,} cases: page (MB)", [page.stat().st_size / 1e6], bar=10.0),
-            Figure("the same, from opening until a tooltip appears (wall s)", shown, bar=3.0),
-            Figure("report of 24 cases", [of_small.core_s], bar=8.0),
+            Figure(f"report of {cases:,} cases", [of_large.core_s], limit=30.0),
+            Figure(f"report of {cases:,} cases: memory (GB)", [of_large.memory_gb], limit=2.0),
+            Figure(f"report of {cases:,} cases: page (MB)", [page.stat().st_size / 1e6], limit=10.0),
+            Figure("the same, from opening until a tooltip appears (wall s)", shown, limit=3.0),
+            Figure("report of 24 cases", [of_small.core_s], limit=8.0),
             Figure(f"dashboard of {campaigns:,} campaigns", [fresh.core_s]),
             Figure("the same, written again without changes", [again.core_s]),
-            Figure("the same: index (MB)", [index.stat().st_size / 1e6], bar=10.0),
-            Figure("the same, from opening until filtered (wall s)", filtered, bar=3.0),
+            Figure("the same: index (MB)", [index.stat().st_size / 1e6], limit=10.0),
+            Figure("the same, from opening until filtered (wall s)", filtered, limit=3.0),
         ]
 
 

@@ -11,28 +11,28 @@ from benchmarks.timing import Figure
 #: Functions of each stage, as end of the file name and function name; callees are included.
 Stages = Mapping[str, tuple[tuple[str, str], ...]]
 STAGES: Stages = {
-    "terrain, its rocks": (("descent/world.py", "of"), ("descent/world.py", "scene")),
+    "terrain and rocks": (("descent/exposure.py", "from_parameters"), ("descent/exposure.py", "scene")),
     "flight": (("descent/flight.py", "create_flight"),),
     "mesh and OpenGL": (("render/renderer.py", "_draw_views"),),
-    "what rays meet": (("kernels/primary.py", "trace_primary_rays"),),
+    "ray intersection": (("kernels/primary.py", "trace_primary_rays"),),
     "shadow of the ground": (("render/scene.py", "ground_shadow"),),
     "shading": (("kernels/shading.py", "shade"),),
-    "pixels with edges, but for their shading": (
+    "edge pixels without shading": (
         ("render/renderer.py", "edge_pixels"),
         ("render/renderer.py", "supersample_rays"),
         ("kernels/edges.py", "trace_subpixel_rays"),
     ),
-    "detector": (("sensor/detector.py", "drawn"), ("sensor/detector.py", "expose"), ("sensor/motion.py", "seen")),
+    "detector": (("sensor/detector.py", "draw"), ("sensor/detector.py", "expose"), ("sensor/optics.py", "from_camera")),
     "instruments": (("descent/measurement.py", "draw"), ("descent/measurement.py", "measure")),
     "DIMES": (("dimes/estimator.py", "estimate"),),
     "feasible overlap": (("descent/score.py", "feasible_overlap_row"),),
 }
 
 #: Name of the remainder.
-REST = "all else"
+REMAINDER = "other"
 
 
-def stages(run: Callable[[], object], repeats: int) -> list[Figure]:
+def measure_stages(run: Callable[[], object], repeats: int) -> list[Figure]:
     """Core-seconds of every stage and of the remainder, per run, after a warm-up run.
 
     Python's profiler slows stages with many small calls (flight, instruments) by up to a half.
@@ -42,18 +42,18 @@ def stages(run: Callable[[], object], repeats: int) -> list[Figure]:
 
 
 def profile_stages(run: Callable[[], object], repeats: int, stages: Stages) -> dict[str, list[float]]:
-    """The same as `stages` for given stages, by name."""
+    """Return the core-seconds of each stage per run, by name."""
     run()
-    timings: dict[str, list[float]] = {name: [] for name in (*stages, REST)}
+    timings: dict[str, list[float]] = {name: [] for name in (*stages, REMAINDER)}
     for _ in range(repeats):
         profile = cProfile.Profile(time.process_time)
         profile.runcall(run)
-        for name, seconds in _of_each_stage(profile, stages).items():
+        for name, seconds in _sum_stage_seconds(profile, stages).items():
             timings[name].append(seconds)
     return timings
 
 
-def _of_each_stage(profile: cProfile.Profile, stages: Stages) -> dict[str, float]:
+def _sum_stage_seconds(profile: cProfile.Profile, stages: Stages) -> dict[str, float]:
     """Seconds in the functions of each stage with their callees, and in all other functions."""
     entries = profile.getstats()
     seconds = dict.fromkeys(stages, 0.0)
@@ -65,4 +65,4 @@ def _of_each_stage(profile: cProfile.Profile, stages: Stages) -> dict[str, float
                 entry.code.co_name == function and entry.code.co_filename.endswith(file) for file, function in functions
             ):
                 seconds[name] += entry.totaltime
-    return seconds | {REST: sum(entry.inlinetime for entry in entries) - sum(seconds.values())}
+    return seconds | {REMAINDER: sum(entry.inlinetime for entry in entries) - sum(seconds.values())}

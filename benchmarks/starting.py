@@ -16,8 +16,8 @@ from benchmarks.timing import Figure
 def figures(repeats: int) -> list[Figure]:
     """Wall-clock times of starting the command, of compiling kernels and of the first run."""
     return [
-        Figure("marsyard --help (wall s)", [_wall_s("--help") for _ in range(repeats)], bar=0.3),
-        Figure("marsyard list (wall s)", [_wall_s("list") for _ in range(repeats)], bar=0.6),
+        Figure("marsyard --help (wall s)", [_wall_s("--help") for _ in range(repeats)], limit=0.3),
+        Figure("marsyard list (wall s)", [_wall_s("list") for _ in range(repeats)], limit=0.6),
         *_first_use(),
     ]
 
@@ -42,7 +42,7 @@ def _first_use() -> list[Figure]:
         again = min(run(built, f"again {number}") for number in range(2))
     return [
         Figure("marsyard compile on a fresh installation, part of its set-up (wall s)", [ahead]),
-        Figure("additional time of the first run for kernels (wall s)", [with_terrains - again], bar=3.0),
+        Figure("additional time of the first run for kernels (wall s)", [with_terrains - again], limit=3.0),
         Figure("the same with the eight terrains that it builds (wall s)", [first - again]),
     ]
 

@@ -14,7 +14,7 @@ class Figure:
 
     name: str
     values: list[float]
-    bar: float | None = None
+    limit: float | None = None
     minimum: float | None = None
 
     @property
@@ -25,14 +25,16 @@ class Figure:
     @property
     def asked(self) -> str:
         """The bound as text."""
-        if self.bar is not None:
-            return f"<= {self.bar:g}"
+        if self.limit is not None:
+            return f"<= {self.limit:g}"
         return f">= {self.minimum:g}" if self.minimum is not None else ""
 
     @property
     def met(self) -> bool:
         """Whether the median is within the bounds."""
-        return (self.bar is None or self.median <= self.bar) and (self.minimum is None or self.median >= self.minimum)
+        return (self.limit is None or self.median <= self.limit) and (
+            self.minimum is None or self.median >= self.minimum
+        )
 
 
 def core_seconds(run: Callable[[], object], repeats: int) -> list[float]:

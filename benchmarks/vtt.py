@@ -62,7 +62,7 @@ def updates(repeats: int) -> list[Figure]:
     options = VttOptions()
     brute = replace(options, coarse_levels=0)
     return [
-        Figure("target tracking update, ms", _update_ms(VisualTargetTracker(options), repeats), bar=2.0),
+        Figure("target tracking update, ms", _update_ms(VisualTargetTracker(options), repeats), limit=2.0),
         Figure("the same by the full search, ms", _update_ms(VisualTargetTracker(brute), repeats)),
         Figure("the same by OpenCV's Lucas-Kanade, ms", _update_ms(lucas_kanade_tracker(), repeats)),
     ]
@@ -106,7 +106,7 @@ def runs(repeats: int) -> list[Figure]:
     }
     parameters = RoverScenarioParameters.model_validate(of_run)
     elapsed_s = core_seconds(lambda: run_case(parameters, Streams(1, "benchmark", 0)), repeats)
-    return [Figure("a rover's run from 10 m to 2 m, rendered", elapsed_s, bar=1.5)]
+    return [Figure("a rover's run from 10 m to 2 m, rendered", elapsed_s, limit=1.5)]
 
 
 def figures(repeats: int) -> list[Figure]:

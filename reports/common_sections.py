@@ -126,7 +126,7 @@ def scatter_section(subject: Subject) -> Section | None:
     )
     rows = [[format_fraction(c.probability), number(c.estimate), interval(c.lower, c.upper)] for c in circles]
     grid = Grid(
-        ["Fraction of errors", f"Radius ({unit})", f"One-sided bounds at {format_fraction(CONFIDENCE)} each"], rows
+        ["Fraction of errors", f"Radius ({unit})", f"Lower and upper bound ({format_fraction(CONFIDENCE)} each)"], rows
     )
     note = note_text("common.scatter")
     data = {"ellipse": asdict(ellipse), "circles": [asdict(circle) for circle in circles]}
@@ -152,7 +152,7 @@ def drivers_section(subject: Subject) -> Section | None:
     if not ranked:
         return None
     note = note_text("common.drivers", confidence=format_fraction(CONFIDENCE))
-    headings = ["Condition", "Cases", "Rank correlation", "Its interval", "Fraction of variance", "Its interval", "p"]
+    headings = ["Condition", "Cases", "Correlation", "Its interval", "Variance fraction", "Fraction interval", "p"]
     blocks = []
     for name, drivers in ranked.items():
         rows = []
@@ -185,7 +185,7 @@ def rank_drivers(frame: pd.DataFrame, metric: str, response: Float[np.ndarray, "
     return [(column, drivers[column], p_values[column]) for column in order]
 
 
-#: Maximum ratio of the ends of a logarithmic axis with ticks at 2 and 5.
+#: A logarithmic axis with a smaller ratio of maximum to minimum also has ticks at 2 and 5.
 _MAX_TICK_RATIO = 50
 #: Number of points of a convergence curve, spaced logarithmically, and the minimum number of cases.
 MAX_POINTS, MIN_CASES = 12, 8
@@ -247,7 +247,7 @@ def success_rate_curves(subject: Subject) -> list[tuple[str, float, list[Point]]
 
 
 def error_curves(frame: pd.DataFrame, metric: str | None) -> dict[str, tuple[str, str, list[Point]]]:
-    """Return name, axis label and points of mean and 95 % quantile of the first magnitudes; empty for too few cases."""
+    """Return name, axis label and points of mean and 95 % quantile of the first n errors; empty for too few cases."""
     if metric is None:
         return {}
     magnitude, groups = np.abs(numbers(frame, metric)), rates.terrain_groups(frame)
@@ -296,12 +296,12 @@ def curve_figure(points: Sequence[Point], name: str, required: float | None) -> 
 
 #: Column of the normalised estimation error squared, and its degrees of freedom.
 NEES, NEES_DIMENSION = "velocity_nees", 2
-#: Probability of the band of the mean, and of the counted ellipse.
+#: Probability of the band of the mean NEES, and of the ellipse inside which errors are counted.
 BAND_PROBABILITY = 0.95
 
 
 def evaluate_consistency(nees: Float[np.ndarray, " n"], dimension: int = NEES_DIMENSION) -> dict[str, Any]:
-    """Consistency of at least one estimate from its NEES (normalised estimation error squared) of a dimension.
+    """Evaluate the consistency of estimates with their covariances from their NEES (normalised error squared).
 
     Keys: mean NEES with its 95 % band for correct covariances, fraction of errors `inside` their 95 % ellipse with its
     90 % interval, and `word`: "consistent", "too sure" (errors larger than the covariances) or "too cautious".

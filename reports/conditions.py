@@ -54,14 +54,7 @@ def conditions_section(subject: Subject) -> Section | None:
         return None
     blocks = [Block(heading=f"By {label(name)}", grid=_bin_grid(frame, metric, bins)) for name, bins in tables.items()]
     if terrain_rows:
-        head = [
-            "",
-            "Terrains",
-            "SD within terrains",
-            "SD between terrains",
-            "Fraction of variance between terrains",
-            "p",
-        ]
+        head = ["", "Terrains", "SD within terrains", "SD between terrains", "Fraction between terrains", "p"]
         rows = []
         for row in terrain_rows:
             deviations = [number(row["within_sd"]), number(row["between_sd"])]

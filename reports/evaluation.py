@@ -58,7 +58,7 @@ def combine_verdicts(
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",
         Status.MET_BY_RATE: f"{fraction} met by the rate only, not at the required confidence.",
         Status.FAIL: f"{fraction} not met.",
-        Status.INSUFFICIENT: f"{count(len(frame), 'case')} cannot decide {fraction}.{_remedy_text(verdicts)}",
+        Status.INSUFFICIENT: f"{count(len(frame), 'case')} are too few to decide {fraction}.{_remedy_text(verdicts)}",
     }[worst]
     return OverallVerdict(worst, crashed, sentence + crash_text)
 

@@ -191,7 +191,11 @@ class RateByCondition:
         figure = rate_figure(lines, (self.by.title, self.ylabel), limit)
         rows = []
         for value, n, bin_rates in records:
-            rows.append([f"{value:.4g}", f"{n:,}", *map(_format_rate, bin_rates.values())])
+            texts = [
+                rates.fraction_text(rate) if isinstance(rate, CaseFraction) else rates.rate_text(rate)
+                for rate in bin_rates.values()
+            ]
+            rows.append([f"{value:.4g}", f"{n:,}", *texts])
         grid = Grid([self.by.title, self.cases, *(rate.name for rate in self.rates)], rows)
         bins = [({self.by.column: x, "n": n}, bin_rates) for x, n, bin_rates in records]
         data: dict[str, Any] = {
@@ -201,10 +205,6 @@ class RateByCondition:
             data["limit"] = limit[1]
         block = Block(text=self.text, figures=[svg_figure(figure, key, self.caption or self.by.title)])
         return [block, Block(grid=grid, note=self.note)], data
-
-
-def _format_rate(rate: CaseFraction | PooledRate) -> str:
-    return rates.fraction_text(rate) if isinstance(rate, CaseFraction) else rates.rate_text(rate)
 
 
 def condition_bins(values: Float[np.ndarray, " n"], max_values: int = _BINS) -> list[Bool[np.ndarray, " n"]]:

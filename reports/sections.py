@@ -96,10 +96,8 @@ def outcome_grid(frame: pd.DataFrame) -> Grid:
     """Count the cases by outcome, with the meaning of each outcome."""
     kinds: list[type[Enum]] = [Fault, *(kind for presentation in presentations() for kind in presentation.outcomes)]
     meanings = {member.name: str(member.value) for kind in kinds for member in kind}
-    rows = [
-        [name, f"{cases:,}", percent(cases / len(frame)), meanings.get(name, NOTHING)]
-        for name, cases in outcome_counts(frame)
-    ]
+    n, counts = len(frame), outcome_counts(frame)
+    rows = [[name, f"{cases:,}", percent(cases / n), meanings.get(name, NOTHING)] for name, cases in counts]
     return Grid(["Outcome", "Cases", "Fraction", "Meaning"], rows)
 
 

@@ -141,7 +141,7 @@ class Verdict:
             return f"Evaluated by observed rate; also met {confidence_text}."
         if self.status is Status.INSUFFICIENT:
             min_cases = count(min_cases_for_rate(self.probability), "case")
-            return f"Evaluated by observed rate; this needs at least {min_cases}."
+            return f"The evaluation by observed rate needs at least {min_cases}."
         return f"Evaluated by observed rate; {confidence_text} the verdict would be {self.confident_status}."
 
     def _terrain_text(self) -> str:

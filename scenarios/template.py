@@ -87,10 +87,6 @@ def toml_environment(*folders: Path) -> Environment:
     return environment
 
 
-def _binned_size(choices: Choices) -> Mapping[str, Any]:
-    return {"binned_size": binned_size_for(*read_camera(choices.camera).size)} if choices.camera else {}
-
-
 _REFUSED_FLIGHT = "--flight: only descents accept a recorded trajectory, and {} is not a descent"
 _REFUSED_CAMERA = (
     "--camera and --detector: tracking uses the stereo cameras of a mast; see camera.preset and camera.custom"
@@ -102,7 +98,7 @@ VELOCITY = CampaignTemplate(
     site="gusev",
     bound=5.0,
     bound_text="horizontal velocity within this many m/s (5 of the DIMES requirement)",
-    values=_binned_size,
+    values=lambda c: {"binned_size": binned_size_for(*read_camera(c.camera).size)} if c.camera else {},
 )
 LANDING = CampaignTemplate(
     file=SCENARIOS_FOLDER / "landing" / "new.toml.j2",

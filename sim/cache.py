@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-#: Default limit where ``MARSYARD_CACHE_GB`` is not set: a fraction of the free space, and a bound on it.
+#: Default size limit if ``MARSYARD_CACHE_GB`` is not set: fraction of the free space, and maximum.
 FREE_FRACTION, LIMIT_GB = 0.4, 10.0
 GIGA = 10**9
-#: Suffix of files that are being written, and the age from which such a file is left over from an interrupted process.
+#: Suffix of files that are being written, and the age after which such a file belongs to an interrupted process.
 UNFINISHED, ABANDONED_S = ".part", 86400.0
 _CHECKSUM_BYTES = 4  #: Bytes of the checksum after an array.
 #: Files that this process has verified, with their state at that time: device, inode, modification time and size.
@@ -25,7 +25,7 @@ _VERIFIED: dict[Path, tuple[int, int, int, int]] = {}
 
 
 class CacheWarning(UserWarning):
-    """A cached file is damaged and built again, or cannot be written. Results do not depend on it."""
+    """A cached file is damaged and will be rebuilt, or cannot be written. Results do not depend on it."""
 
 
 def cache_directory(kind: str) -> Path:
@@ -39,7 +39,7 @@ def cache_directory(kind: str) -> Path:
 def limit_bytes(folder: Path, kept_bytes: int) -> int:
     """Return the size limit of a cache folder whose files take `kept_bytes` now.
 
-    ``MARSYARD_CACHE_GB`` where it is set; otherwise 40 % of the space that is free without the cached files, at most
+    ``MARSYARD_CACHE_GB`` if it is set; otherwise 40 % of the space that is free without the cached files, at most
     10 GB. Raises ValueError if the variable is not a positive number.
     """
     configured = os.environ.get("MARSYARD_CACHE_GB")
@@ -69,22 +69,22 @@ def evict_files(folder: Path, wanted_bytes: int, in_use: Collection[Path] = ()) 
     Files `in_use` are never deleted. Unfinished files are deleted once they are a day old. Other processes may delete
     files at the same time, or hold a deleted file open. Raises ValueError as `limit_bytes` does.
     """
-    kept, kept_bytes = [], 0
+    entries, stored_bytes = [], 0
     for path in folder.iterdir():
         with contextlib.suppress(FileNotFoundError):
             status = path.stat()
             if path.suffix != UNFINISHED:
-                kept.append((status.st_atime, path, status.st_size))
-                kept_bytes += status.st_size
+                entries.append((status.st_atime, path, status.st_size))
+                stored_bytes += status.st_size
             elif time.time() - status.st_mtime > ABANDONED_S:
                 path.unlink()
-    limit = limit_bytes(folder, kept_bytes)
-    for _, path, size in sorted(kept):
-        if kept_bytes + wanted_bytes <= limit:
+    limit = limit_bytes(folder, stored_bytes)
+    for _, path, size in sorted(entries):
+        if stored_bytes + wanted_bytes <= limit:
             break
         if path not in in_use:
             path.unlink(missing_ok=True)
-            kept_bytes -= size
+            stored_bytes -= size
 
 
 def touch(path: Path) -> None:
@@ -137,7 +137,7 @@ def load_array(path: Path) -> np.ndarray | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, EOFError) as error:
-        warnings.warn(f"the cached file {path} is damaged and built again: {error}", CacheWarning, stacklevel=2)
+        warnings.warn(f"the cached file {path} is damaged and will be rebuilt: {error}", CacheWarning, stacklevel=2)
         return None
     _VERIFIED[path] = state
     return mapped

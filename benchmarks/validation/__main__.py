@@ -47,19 +47,19 @@ def _arguments() -> argparse.Namespace:
     names = [check.name for check in CHECKS]
     parser.add_argument("--only", action="append", choices=names, help="this check; may be given again for another")
     parser.add_argument(
-        "--quick", action="store_true", help="fewer samples, the same bars; nothing is kept and no page is written"
+        "--quick", action="store_true", help="fewer samples, the same limits; nothing is kept and no page is written"
     )
     return parser.parse_args()
 
 
 def _print(console: Console, title: str, measures: list[Measure]) -> None:
     table = Table(title=title, title_justify="left")
-    for column in ("claim", "bar", "measured", "", "how"):
+    for column in ("claim", "limit", "measured", "", "how"):
         table.add_column(column, overflow="fold")
     for measure in measures:
-        verdict = "-" if measure.bar is None else ("[green]met" if measure.passed else "[bold red]missed")
-        bar = "" if measure.bar is None else document.shown(measure, measure.bar)
-        table.add_row(measure.claim, bar, document.shown(measure, measure.measured), verdict, measure.how)
+        verdict = "-" if measure.limit is None else ("[green]met" if measure.passed else "[bold red]missed")
+        limit = "" if measure.limit is None else document.shown(measure, measure.limit)
+        table.add_row(measure.claim, limit, document.shown(measure, measure.measured), verdict, measure.how)
     console.print(table)
 
 

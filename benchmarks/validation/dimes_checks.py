@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmarks.dimes_threshold import STORED, WRONG_BY_M_S
-from benchmarks.estimators import ESTIMATORS, recorded, run_estimator
+from benchmarks.estimators import ESTIMATORS, record_descents, run_estimator
 from benchmarks.threshold_derivation import ThresholdInputs
 from benchmarks.validation.imu_reference import Reference
 from benchmarks.validation.records import Check, Measure
@@ -31,15 +31,15 @@ def imu_check(quick: bool) -> Iterator[Measure]:
     # bounds: three standard errors of the quantiles, sqrt(q (1 - q) / n) divided by density times quantile, which is
     # 0.44 at the median and 0.03 at 99.5 %
     median = float(np.median(single)) / _stored_median_m_s() - 1.0
-    bar = 3.4 / math.sqrt(descents)
-    yield Measure("right tracks' discrepancy, median, from the stored derivation's", abs(median), "", bar, how)
+    limit = 3.4 / math.sqrt(descents)
+    yield Measure("right tracks' discrepancy, median, from the stored derivation's", abs(median), "", limit, how)
     tail = float(np.quantile(single, inputs.kept)) / threshold - 1.0
-    bar = 7.0 / math.sqrt(descents)
-    yield Measure("right tracks' discrepancy, 99.5 % quantile, from the threshold", abs(tail), "", bar, how)
+    limit = 7.0 / math.sqrt(descents)
+    yield Measure("right tracks' discrepancy, 99.5 % quantile, from the threshold", abs(tail), "", limit, how)
     bound = inputs.kept - 3.0 * math.sqrt(inputs.kept * (1.0 - inputs.kept) / descents)
     kept = float(np.mean(single < threshold))
     claim = "descents with one right track a pair that pass the IMU check"
-    yield Measure(claim, kept, "", bound, f"{how}; bar: 99.5 % less three deviations of the simulation", "at least")
+    yield Measure(claim, kept, "", bound, f"{how}; limit: 99.5 % less three deviations of the simulation", "at least")
     kept = float(np.mean(reference.best() < threshold))
     yield Measure("descents with two right tracks a pair that pass the IMU check", kept, "", 0.995, how, "at least")
     for tracks in (1, 2):
@@ -63,10 +63,10 @@ def _stored_median_m_s() -> float:
 
 
 def estimators(quick: bool) -> Iterator[Measure]:
-    descents = recorded("dimes-smoke", 4 if quick else 48)
+    descents = record_descents("dimes-smoke", 4 if quick else 48)
     for name, estimator in ESTIMATORS.items():
         results = run_estimator(estimator, descents)
-        valid = results.valid
+        valid = results.valid_errors_m_s
         rms = float(np.sqrt(np.mean(valid**2))) if valid.size else float("nan")
         wrong = int(np.sum(valid > REQUIREMENT_M_S))
         how = (

@@ -70,9 +70,9 @@ def write(checks: Sequence[Check], kept: dict[str, dict]) -> None:
 
 
 def _row(measure: Measure) -> str:
-    verdict = "" if measure.bar is None else ("met" if measure.passed else "**missed**")
-    bar = "reported" if measure.bar is None else f"{measure.sense} {shown(measure, measure.bar)}"
-    return f"| {measure.claim} | {bar} | {shown(measure, measure.measured)} | {verdict} | {measure.how} |"
+    verdict = "" if measure.limit is None else ("met" if measure.passed else "**missed**")
+    limit = "reported" if measure.limit is None else f"{measure.sense} {shown(measure, measure.limit)}"
+    return f"| {measure.claim} | {limit} | {shown(measure, measure.measured)} | {verdict} | {measure.how} |"
 
 
 def _environments(checks: Sequence[Check], kept: dict[str, dict]) -> str:

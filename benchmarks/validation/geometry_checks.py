@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.validation.bars import find_bar
+from benchmarks.validation.limits import find_limit
 from benchmarks.validation.markers import MARKERS
 from benchmarks.validation.motion import View, render
 from benchmarks.validation.raycast import Ground, meet_triangles
@@ -66,7 +66,7 @@ def run_markers(quick: bool) -> Iterator[Measure]:
         for camera, error in result["errors"].items():
             for figure in ("rms", "worst"):
                 claim = f"markers, {figure}: {camera}"
-                yield Measure(f"{claim}, {backend}", error[figure], "px", find_bar(claim), how)
+                yield Measure(f"{claim}, {backend}", error[figure], "px", find_limit(claim), how)
 
 
 def _tilted_plane(slope: tuple[float, float], side: int, spacing: float) -> Surface:
@@ -94,7 +94,7 @@ def run_planes(quick: bool) -> Iterator[Measure]:
         error = np.abs(points @ upward / frame.range_m)[near].max()
         how = f"all {int(near.sum())} pixels within two heights of a plane tilted by 10 deg"
         claim = f"world points of a tilted plane: {name}"
-        yield Measure(claim, float(error), "of range", find_bar(claim), how)
+        yield Measure(claim, float(error), "of range", find_limit(claim), how)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ SEED = 20050107
 #: Terrain banks of the sites, as in the campaigns.
 BANK = {"bank": 8, "bank_seed": 1}
 SITES = ("heli-benign", "heli-hazardous")
-ROTATION_BAR_DEG, BASELINE_BAR, ELEVATION_BAR = 0.05, 0.0075, 0.005
+ROTATION_LIMIT_DEG, BASELINE_LIMIT, ELEVATION_LIMIT = 0.05, 0.0075, 0.005
 #: 160 x 120 structure pixels, with about 59 features as in the paper and with about 200. The number of features limits
 #: the accuracy of motion over rocks, because affine warps do not fit the sides of rocks.
 PAPER = HdaOptions(track_seed=TrackSeed.POSE, grid_px=4)
@@ -102,20 +102,20 @@ def accuracy(quick: bool) -> Iterator[Measure]:
     for site in (*SITES, ""):
         rows = [pair["ours"] for pair in pairs if pair["ours"]["site"] == site or not site]
         where = f"{len(rows)} noise-free pairs" + (f" over {site}" if site else "")
-        bars = (None, None, None) if site else (ROTATION_BAR_DEG, BASELINE_BAR, ELEVATION_BAR)
+        limits = (None, None, None) if site else (ROTATION_LIMIT_DEG, BASELINE_LIMIT, ELEVATION_LIMIT)
         tracks = float(np.median([float(row["tracks"]) for row in rows]))
         how = f"{where}, 8 to 15 m high, 0.2 of that apart, {tracks:.0f} tracks, scale and vertical exact"
-        yield Measure("rotation's error, rms", _rms(rows, _value("rotation_error_deg")), "deg", bars[0], how)
+        yield Measure("rotation's error, rms", _rms(rows, _value("rotation_error_deg")), "deg", limits[0], how)
         moved = _rms(rows, _value("baseline_error_fraction"))
-        yield Measure("baseline's error, direction and length, over its length, rms", moved, "", bars[1], how)
+        yield Measure("baseline's error, direction and length, over its length, rms", moved, "", limits[1], how)
         elevation = _rms(rows, lambda row: float(row.get("elevation_rms_m", np.nan)) / float(row["range_m"]))
-        yield Measure("elevation's error over the height, rms", elevation, "", bars[2], how)
+        yield Measure("elevation's error over the height, rms", elevation, "", limits[2], how)
     few = [pair["paper"] for pair in pairs]
     tracks = float(np.median([float(row["tracks"]) for row in few]))
     how = f"the same {len(few)} pairs"
     turned = _rms(few, _value("rotation_error_deg"))
     claim = f"rotation's error of the paper's features, {tracks:.0f} tracks, rms"
-    yield Measure(claim, turned, "deg", ROTATION_BAR_DEG, how)
+    yield Measure(claim, turned, "deg", ROTATION_LIMIT_DEG, how)
 
 
 def _value(name: str) -> Callable[[dict[str, Scalar]], float]:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
-from benchmarks.validation.bars import find_bar
+from benchmarks.validation.limits import find_limit
 from benchmarks.validation.motion import View, render
 from benchmarks.validation.raycast import Ground, meet_triangles
 from benchmarks.validation.records import Check, Measure
@@ -58,7 +58,7 @@ def run_opposition(quick: bool) -> Iterator[Measure]:
             errors.append(float(np.linalg.norm(_peak(radiance) - pixel)))
         how = f"{len(errors)} suns; centre of the light above 90 % of the peak's height"
         claim = f"opposition peak from the antisolar point: {name}"
-        yield Measure(claim, max(errors), "px", find_bar(claim), how)
+        yield Measure(claim, max(errors), "px", find_limit(claim), how)
 
 
 def _peak(radiance: np.ndarray) -> np.ndarray:
@@ -113,8 +113,8 @@ def _shadow_row(name: str, view: View, sun: Sun, count: int, farthest: float, st
         f"{np.mean(cast):.1%} in cast shadow{dark_text}; {np.mean(theirs & ~ours):.2%} wrongly dark"
     )
     # about three times the maximum disagreement from the air (0.03 %), and twice that from a mast (0.24 %)
-    bar = 0.999 if farthest > FARTHEST_FROM_A_MAST_M else 0.995
-    return Measure(f"shadows as an independent ray cast has them: {name}", agree, "", bar, how, "at least")
+    limit = 0.999 if farthest > FARTHEST_FROM_A_MAST_M else 0.995
+    return Measure(f"shadows as an independent ray cast has them: {name}", agree, "", limit, how, "at least")
 
 
 def run_shadows(quick: bool) -> Iterator[Measure]:
@@ -186,7 +186,7 @@ def run_reflectance(quick: bool) -> Iterator[Measure]:
             ("rendered brightness against the formula", max(off), how),
             ("spherical albedo from the stated one", albedo, "the law integrated over sun and eye by Sobol points"),
         ):
-            yield Measure(f"{claim}: {name}", measured, "", find_bar(f"{claim}: {name}"), by)
+            yield Measure(f"{claim}: {name}", measured, "", find_limit(f"{claim}: {name}"), by)
 
 
 def _spherical_albedo(law: Photometry, log2_points: int) -> float:
@@ -257,9 +257,9 @@ def run_sun(quick: bool) -> Iterator[Measure]:
         angle = np.square(rays.pixel_angles.astype(np.float64)).reshape(radiance.shape)
         flux.append(abs(float((light * angle).sum()) / np.pi - 1.0))
     claim = "the sun's disc from the sun's direction"
-    yield Measure(claim, max(off), "px", find_bar(claim), f"{len(off)} suns in the navcam's sky")
+    yield Measure(claim, max(off), "px", find_limit(claim), f"{len(off)} suns in the navcam's sky")
     claim = "light of the sun's disc from the direct sun"
-    yield Measure(claim, max(flux), "", find_bar(claim), "the same pictures")
+    yield Measure(claim, max(flux), "", find_limit(claim), "the same pictures")
 
 
 CHECKS = (

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.validation.bars import find_bar
 from benchmarks.validation.estimators import PATCH
+from benchmarks.validation.limits import find_limit
 from benchmarks.validation.motion import STEPS_PX, Motion, View, measure, render, supersample
 from benchmarks.validation.records import Check, Measure
 from benchmarks.validation.scenes import descent_view, renderer, rock_view, tile_view
@@ -16,7 +16,7 @@ from marsyard.sim.render.renderer import edge_pixels
 from marsyard.sim.terrain.sites import sites
 
 #: Bound for the quick control: images with 16 samples per pixel are less accurate than with 256.
-QUICK_CONTROL_BAR_PX = 0.005
+QUICK_CONTROL_LIMIT_PX = 0.005
 DESCENT_HEIGHT_M = 2000.0
 #: Height at which a pixel of the descent camera is 0.25 m; the orthoimage has 0.5 m.
 TILE_HEIGHT_M = 300.0
@@ -44,15 +44,15 @@ def uncertainty(errors: Sequence[np.ndarray]) -> float:
     return float(max((error.std(axis=0, ddof=1) / np.sqrt(len(error))).max() for error in errors))
 
 
-def _row(claim: str, errors: Sequence[np.ndarray], steps: np.ndarray, bar: float | None = None) -> Measure:
-    """Row of a bias; the default bound is that of `bars`."""
+def _row(claim: str, errors: Sequence[np.ndarray], steps: np.ndarray, limit: float | None = None) -> Measure:
+    """Row of a bias; the default bound is that of `limits`."""
     scatter = max(error.std(axis=0, ddof=1).max() for error in errors)
     patches = min(len(error) for error in errors)
     how = (
         f"{patches} patches, {len(steps)} steps from {steps[0]:.2g} to {steps[-1]:.2g} px; "
         f"one patch scatters by {scatter:.2g} px, the mean by {uncertainty(errors):.1g} px"
     )
-    return Measure(claim, bias(errors), "px", find_bar(claim) if bar is None else bar, how)
+    return Measure(claim, bias(errors), "px", find_limit(claim) if limit is None else limit, how)
 
 
 def _fits(motions: Sequence[Motion]) -> tuple[float, float]:
@@ -86,7 +86,7 @@ def run(quick: bool) -> Iterator[Measure]:
     raw = replace(rock_view(ROCK_SITE, 10.0), footprint=1.0 / 64.0)
     errors = [motion.error for motion in measure(renderer(), raw, np.array([0.25, 0.5, 0.75]))]
     yield Measure(
-        "the same of raw point samples, rock and ground from 10 m: what the bar is to catch",
+        "the same of raw point samples, rock and ground from 10 m: what the limit is to catch",
         bias(errors),
         "px",
         None,
@@ -123,8 +123,8 @@ def run_control(quick: bool) -> Iterator[Measure]:
     for name, view in _control_views():
         motions = list(measure(renderer(), view, CONTROL_STEPS_PX, samples))
         claim = f"the estimator's own bias, {name}, {samples**2} samples a pixel"
-        bar = QUICK_CONTROL_BAR_PX if quick else None
-        yield _row(claim, [motion.error for motion in motions], CONTROL_STEPS_PX, bar)
+        limit = QUICK_CONTROL_LIMIT_PX if quick else None
+        yield _row(claim, [motion.error for motion in motions], CONTROL_STEPS_PX, limit)
 
 
 def _edge_error(view: View) -> tuple[float, float, int]:

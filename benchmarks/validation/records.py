@@ -17,7 +17,7 @@ class Measure:
         Validated property.
     measured, unit
         Measured value and its unit; "" for a fraction.
-    bar, sense
+    limit, sense
         Bound (None for values without a bound), and whether it is an upper or lower bound.
     how
         Short description of the method.
@@ -26,17 +26,17 @@ class Measure:
     claim: str
     measured: float
     unit: str
-    bar: float | None
+    limit: float | None
     how: str
     sense: Literal["at most", "at least"] = "at most"
 
     @property
     def passed(self) -> bool:
         """Whether the bound is met; True without a bound."""
-        if self.bar is None:
+        if self.limit is None:
             return True
         # NaN exceeds every bound
-        return self.measured <= self.bar if self.sense == "at most" else self.measured >= self.bar
+        return self.measured <= self.limit if self.sense == "at most" else self.measured >= self.limit
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
             truth = mean if what == "mean" else spread
             interval_pairs = (interval(draw(30), 0.95) for _ in range(trials))
             covered = _fraction((low <= truth <= high for low, high in interval_pairs), trials)
-            how = f"{trials} samples of 30; BCa, widened; bar: nominal less three deviations of the simulation"
+            how = f"{trials} samples of 30; BCa, widened; limit: nominal less three deviations of the simulation"
             yield Measure(
                 f"95 % interval of the {what}, {name}", covered, "", _min_coverage(0.95, trials), how, "at least"
             )
@@ -146,9 +146,9 @@ def run_sequential(quick: bool) -> Iterator[Measure]:
             wrong = np.mean([_simulate_decision(rng, asked, max_cases, correlation) for _ in range(trials)], axis=0)
             kind = "independent cases" if correlation is None else f"cases on terrains, correlation {correlation}"
             how = f"{trials} campaigns of up to {max_cases} cases at a true rate of {asked}; Monte Carlo error allowed"
-            bar = 1.0 - _min_coverage(CONFIDENCE, trials)
+            limit = 1.0 - _min_coverage(CONFIDENCE, trials)
             for word, share in zip(("PASS", "FAIL"), wrong.tolist(), strict=True):
-                yield Measure(f"false {word} of {asked} at 90 %, {kind}", share, "", bar, how)
+                yield Measure(f"false {word} of {asked} at 90 %, {kind}", share, "", limit, how)
 
 
 def _simulate_decision(

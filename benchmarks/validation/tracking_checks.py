@@ -20,9 +20,9 @@ from marsyard.sim.sensor.odometry import EXACT
 from marsyard.sim.streams import Streams
 
 SEED = 20061108
-DRIFT_RMS_BAR_PX, DRIFT_WORST_BAR_PX, RANGE_BAR = 1.0, 2.5, 0.15
+DRIFT_RMS_LIMIT_PX, DRIFT_WORST_LIMIT_PX, RANGE_LIMIT = 1.0, 2.5, 0.15
 #: Maximum fraction of lost targets: 2 of 100 measured, plus three standard deviations (4).
-LOST_BAR = 0.06
+LOST_LIMIT = 0.06
 CAMERAS = ("research-navcam", "research-pancam")
 #: Parameters without errors of cameras, mast and odometry.
 NO_ERRORS: dict[str, Any] = {
@@ -79,15 +79,15 @@ def _drifts(rows: list[dict[str, Scalar]], name: str, *, tested: bool) -> Iterat
         yield _measure_losses(f"targets lost before 2 m: {name}", int(np.isnan(px).sum()), len(px), how)
     tracked = px[~np.isnan(px)]
     rms, worst = float(np.sqrt(np.mean(tracked**2))), float(tracked.max())
-    yield Measure(f"drift of the tracked point, rms: {name}", rms, "px", DRIFT_RMS_BAR_PX if tested else None, how)
+    yield Measure(f"drift of the tracked point, rms: {name}", rms, "px", DRIFT_RMS_LIMIT_PX if tested else None, how)
     yield Measure(
-        f"drift of the tracked point, worst: {name}", worst, "px", DRIFT_WORST_BAR_PX if tested else None, how
+        f"drift of the tracked point, worst: {name}", worst, "px", DRIFT_WORST_LIMIT_PX if tested else None, how
     )
 
 
 def _measure_losses(claim: str, lost: int, cases: int, how: str) -> Measure:
     """Row of the fraction of lost cases, which other figures exclude; one lost case is always allowed."""
-    return Measure(claim, lost / cases, "", max(LOST_BAR, 1.0 / cases), how)
+    return Measure(claim, lost / cases, "", max(LOST_LIMIT, 1.0 / cases), how)
 
 
 def _sun_moved_deg(rows: list[dict[str, Scalar]]) -> float:
@@ -103,7 +103,9 @@ def stereo(quick: bool) -> Iterator[Measure]:
         errors, expected = np.array(measured).reshape(-1, 2).T
         ratio = float(np.sqrt(np.mean(errors**2) / np.mean(expected**2)))
         how = f"first pairs of {len(errors)} runs of vtt-accuracy at rocks of 1.5 m, disparity wrong by 1/3 px rms"
-        yield Measure(f"stereo range error at 10 m over Eq. 1, less 1: {camera}", abs(ratio - 1.0), "", RANGE_BAR, how)
+        yield Measure(
+            f"stereo range error at 10 m over Eq. 1, less 1: {camera}", abs(ratio - 1.0), "", RANGE_LIMIT, how
+        )
         how = f"of {len(pairs)} selectable targets; the row above leaves them out"
         yield _measure_losses(
             f"first stereo pairs in which the target is not found: {camera}",

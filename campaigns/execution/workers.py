@@ -59,7 +59,7 @@ _MAX_START_DEATHS = 3
 _PREFIX = "marsyard-"
 #: Lock file, held by the owner of a folder while it runs.
 _LOCK = "lock"
-#: Fraction of the free memory at the start that all workers share, without a given limit.
+#: Default memory limit of all workers together, as a fraction of the memory that is free at the start.
 _MEMORY_FRACTION = 0.8
 
 
@@ -152,7 +152,7 @@ class WatchedWorker:
             return
         self._checked_s = now
         if not self._alive():
-            # loky waits for a pipe that stays open in any process that outlived its supervisor
+            # loky waits for its pipe, which descendants that survive their supervisor keep open: kill them
             kill(marked_processes(self._mark))
             return
         item, since_s = self._board.read()
@@ -181,7 +181,7 @@ class WatchedWorker:
         return self._process is not None and self._process.is_alive()
 
     def _signal(self, number: int) -> None:
-        """Signal the supervisor; its number cannot be reused before the executor's object has registered its end."""
+        """Signal the supervisor; its process id cannot be reused until loky has registered its end."""
         if self._alive():
             with suppress(ProcessLookupError):
                 os.kill(self._process.pid, number)
@@ -302,7 +302,7 @@ class _Run:
         self._idle = deque(workers)
         self._retries: deque[list[int]] = deque()
         self._attempts: dict[int, int] = {}
-        self._spoilers: dict[int, int | None] = {}
+        self._suspect_predecessors: dict[int, int | None] = {}
         self._running: dict[Future[Any], tuple[WatchedWorker, Sequence[int]]] = {}
         self._deaths_at_start = 0
 
@@ -357,14 +357,14 @@ class _Run:
         suspects = [result for result in batch_result.results if result.crashed and result.previous_item is not None]
         for suspect in suspects:
             # at most one, the last of the batch; it runs again in the fresh process
-            self._spoilers[suspect.item] = suspect.previous_item
+            self._suspect_predecessors[suspect.item] = suspect.previous_item
             self._submit(worker, [suspect.item])
         if not suspects:
             self._idle.append(worker)
         finished = [result for result in batch_result.results if result not in suspects]
-        pairs = [(result, self._spoilers.pop(result.item, None)) for result in finished]
-        # an item that does not crash in a fresh process was spoiled by the previous item
-        return [result if result.crashed else replace(result, spoiled_by=spoiler) for result, spoiler in pairs]
+        pairs = [(result, self._suspect_predecessors.pop(result.item, None)) for result in finished]
+        # an item that does not crash in a fresh process crashed because of the previous item
+        return [result if result.crashed else replace(result, spoiled_by=predecessor) for result, predecessor in pairs]
 
     def _handle_worker_crash(
         self, worker: WatchedWorker, batch: Sequence[int], error: BaseException

@@ -36,13 +36,9 @@ class NewOptions:
     site: Annotated[str | None, Option(help="A site from `marsyard terrain list`.")] = None
     camera: Annotated[str | None, Option(metavar="FILE", help="Custom camera file (docs/custom-worlds.md).")] = None
     detector: Annotated[str | None, Option(metavar="FILE", help="Custom detector datasheet in TOML.")] = None
-    flight: Annotated[
-        str | None, Option(metavar="FILE", help="Trajectory file to use instead of simulated dynamics.")
-    ] = None
+    flight: Annotated[str | None, Option(metavar="FILE", help="Trajectory file instead of simulated dynamics.")] = None
     axes: Annotated[str, Option(help="World axes of the trajectory: enu or ned.")] = "enu"
-    bound: Annotated[
-        float | None, Option(metavar="X", help="Bound of the requirement: maximum error, or minimum success fraction.")
-    ] = None
+    bound: Annotated[float | None, Option(metavar="X", help="Requirement: maximum error, or minimum fraction.")] = None
     cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24
     out: Annotated[Path | None, Option(metavar="FILE", help="File to write; by default NAME.toml.")] = None
     overwrite: OverwriteOption = False

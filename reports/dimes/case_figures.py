@@ -33,7 +33,7 @@ _ROW_HEIGHTS = {"rectified": 1.95, "templates": 1.0, "delivered": 1.95}
 _INCHES = 8.3 / 4.9
 #: Side of a rectified picture as drawn, pixels.
 _RECTIFIED_PX = 384
-#: Valid template numbers; two templates a pair are drawn, the table lists all.
+#: Accepted template numbers. The figure shows at most `_MAX_TRACKS` templates per pair; the table lists all.
 _TEMPLATES = range(100)
 _DASHED = (0, (2, 1.5))
 
@@ -42,9 +42,9 @@ _DASHED = (0, (2, 1.5))
 class Track:
     """One template and its track.
 
-    pair, template: numbers from 0 valid: whether it passed the validity checks values: values of the track in the
-    products' table, by column patch, window: rectified template and search window position: row and column of the
-    matched template's centre in the window
+    - pair, template: indices from 0; valid: whether the track passed the validity checks
+    - values: values of the track in the table of the products, by column
+    - patch, window: rectified template and search window; position: row and column of the match in the window
     """
 
     pair: int
@@ -62,7 +62,7 @@ def is_dimes_case(products: Mapping[str, Any]) -> bool:
 
 
 def read_tracks(products: Mapping[str, Any]) -> list[Track]:
-    """Read the tracks of a case; invalid tracks are ignored."""
+    """Read the tracks of a case; rows with an unknown pair or template are skipped."""
     try:
         table = np.atleast_2d(np.asarray(products.get("tracks", ()), dtype=np.float64))
         names = [str(name) for name in np.asarray(products.get("tracks_columns", ())).ravel()]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -129,11 +128,12 @@ def draw_stream_case(products: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _write_stream(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    return presentation.save_figures(directory, {"stream": draw_stream_case(products)})
-
-
-STREAM_CASE = CaseKind(is_stream_case, view_stream, _write_stream, note_text("dimes.stream_legend"))
+STREAM_CASE = CaseKind(
+    is_stream_case,
+    view_stream,
+    lambda directory, products: presentation.save_figures(directory, {"stream": draw_stream_case(products)}),
+    note_text("dimes.stream_legend"),
+)
 DIMES_CASE = CaseKind(figures.is_dimes_case, view, figures.write_dimes_figures, note_text("dimes.legend"))
 DIMES = Presentation(
     cases=(STREAM_CASE, DIMES_CASE), sections=(FIRING, LANDING, sensitivity_section), outcomes=(VelocityOutcome,)

@@ -44,14 +44,14 @@ class HazardClass:
         return f"> {self.low:g}" if math.isinf(self.high) else f"{self.low:g} to {self.high:g}"
 
 
-_GROSS_RATE = "classified as safe, with a large hazard"
+_GROSS_RATE = "large hazard, of footprints classified as safe"
 #: Rates of footprints over all flights by name: columns of hits and of all footprints.
 RATES: Mapping[str, tuple[str, str]] = {
-    "truly safe, with a detected hazard (false alarms)": ("false_alarms", "footprints_truly_safe"),
-    "classified as safe, not truly safe": ("footprints_called_safe_unsafe", "footprints_called_safe"),
+    "detected hazard, of truly safe footprints (false alarms)": ("false_alarms", "footprints_truly_safe"),
+    "not truly safe, of footprints classified as safe": ("footprints_called_safe_unsafe", "footprints_called_safe"),
     _GROSS_RATE: ("gross_hazards_called_safe", "footprints_called_safe"),
-    "with a large hazard, classified as safe": ("gross_hazards_called_safe", "gross_hazards"),
-    "with a large hazard, without a detected hazard": ("gross_hazards_unflagged", "gross_hazards"),
+    "classified as safe, of footprints with a large hazard": ("gross_hazards_called_safe", "gross_hazards"),
+    "no detected hazard, of footprints with a large hazard": ("gross_hazards_unflagged", "gross_hazards"),
 }
 
 

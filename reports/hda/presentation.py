@@ -74,7 +74,7 @@ SITES = SectionDeclaration(
         Distribution(
             sections.hazard_distances,
             ("distance to the nearest unsafe position (m)", "fraction above this distance"),
-            "Fraction of positions with a larger distance to the nearest unsafe position of the lander.",
+            "Fraction of sites and touchdowns farther than this from the nearest unsafe position.",
             heading="Distance to true hazards",
             complementary=True,
             table=sections.distance_grid,

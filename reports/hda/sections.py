@@ -249,14 +249,14 @@ TOUCHDOWN = kinds.SectionDeclaration(
         kinds.Distribution(
             TOUCHDOWN_ERRORS,
             ("distance of the touchdown from the site (m)", "fraction of landings"),
-            "Fraction of landings up to each distance from the site. Vertical lines: runs of the paper (averaged GPS).",
+            "Cumulative distribution of the distance from touchdown to site. Vertical lines: runs of the paper.",
             limits={"paper, runs 1, 3 and 4": [run["error_m"] for run in PAPER["landings"]]},
         ),
         kinds.CustomBlocks(_draw_table_2),
         kinds.RateTable(
             (
                 kinds.Rate("touchdown", "touchdown on safe ground", kinds.flag_rate("touchdown_safe")),
-                kinds.Rate("site", "reported site is truly safe", kinds.flag_rate("site_safe")),
+                kinds.Rate("site", "target site is truly safe", kinds.flag_rate("site_safe")),
             ),
             cases="Landings",
             heading="Safety of the touchdown point",

@@ -146,10 +146,6 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
     return CaseView(facts, svg_figures, head, rows)
 
 
-def _is_measured_case(products: Mapping[str, Any]) -> bool:
-    return bool(read_matched_pairs(products))
-
-
 def _landing_figures(products: Mapping[str, Any]) -> list[str]:
     return [name for name in available_figures(products) if name in _WITHOUT_TRUTH]
 
@@ -163,7 +159,10 @@ def _write_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
     return [*written, *presentation.save_figures(directory, figures, dpi=130)]
 
 
-MEASURED = Presentation(cases=(CaseKind(_is_measured_case, view, _write_figures, _LEGEND),), first=(agreement_section,))
+MEASURED = Presentation(
+    cases=(CaseKind(lambda products: bool(read_matched_pairs(products)), view, _write_figures, _LEGEND),),
+    first=(agreement_section,),
+)
 
 
 #: Upper end of the colour scale of residuals.

@@ -24,7 +24,7 @@ MAX_ERROR_M, QUANTILE = 0.03, 0.99
 _RATES: Mapping[str, str] = {
     "Completed": "completed",
     "Tracked at the goal": "tracked",
-    f"Within {100.0 * MAX_ERROR_M:g} cm, of completed": "within",
+    f"Within {100.0 * MAX_ERROR_M:g} cm (of completed runs)": "within",
     "False track": "false_tracks",
 }
 

@@ -47,7 +47,7 @@ def table_1_section(subject: Subject) -> Section | None:
             "Camera": lambda pair: pair[1].name,
             "": lambda pair: pair[0],
             "Designation (cm)": lambda pair: f"{pair[1].designation_cm:g}",
-            "Approach without tracker (cm)": lambda pair: f"{pair[1].untracked_cm:.1f}",
+            "Error at the goal without tracking (cm)": lambda pair: f"{pair[1].untracked_cm:.1f}",
             "Approach with a drift of N px (cm)": lambda pair: pair[1].tracked_formula,
         },
     )
@@ -94,8 +94,8 @@ def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
 
 
 def _measured_grid(accuracy: Sequence[Mapping[str, Any]]) -> Grid:
-    head = ["Camera", "Runs", "Designation (cm)", "Table I", "Disparity error, 1 sigma (px)"]
-    head += ["Approach without tracker (cm)", "Table I", "Approach with tracker (cm)", "Table I at the measured drift"]
+    head = ["Camera", "Runs", "Designation (cm)", "Paper: designation (cm)", "Disparity error, 1 sigma (px)"]
+    head += ["Without tracking (cm)", "Paper (cm)", "With tracking (cm)", "Paper's formula (cm)"]
     rows = []
     for row in accuracy:
         printed = next((p for name, p in PRINTED.items() if row["camera"].endswith(name.lower())), None)

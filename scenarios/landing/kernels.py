@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-#: Smaller deviations contribute their square (Huber loss), which makes the plane of least absolute deviations unique.
+#: Smaller deviations contribute their square (Huber loss), which makes the cost function differentiable.
 SQUARED_BELOW_M = 1e-4
 #: Maximum change of the plane at convergence, and maximum number of iterations.
 CONVERGED_M, MAX_ITERATIONS = 1e-5, 60

@@ -8,8 +8,8 @@ The image plane is that of Yakimovsky & Cunningham 1978: a point P' (after disto
     u = (P' - C).H / (P' - C).A        v = (P' - C).V / (P' - C).A
 
 so that H = hs H' + hc A and V = vs V' + vc A, with H' and V' the unit vectors of the image's columns and rows, hs and
-vs the focal lengths in pixels and (hc, vc) the image centre. H' and V' need not be perpendicular, nor the three
-right-handed.
+vs the focal lengths in pixels and (hc, vc) the image centre. H' and V' need not be perpendicular, and H', V', A
+need not form a right-handed frame.
 """
 
 from __future__ import annotations
@@ -104,10 +104,10 @@ class CameraModel(ABC):
     def rays(
         self, pixels: Float[np.ndarray, "*batch 2"]
     ) -> tuple[Float[np.ndarray, "*batch 3"], Float[np.ndarray, "*batch 3"]]:
-        """Origins (metres) and unit directions of the lines of sight of pixels, also between and outside the frame's.
+        """Return the origins (metres) and unit directions of the rays of pixels.
 
-        Origins are C, which `Cahvore` moves along the optical axis; they may be read-only. Directions are NaN where no
-        ray reaches the pixel, because the range of the distortion ends before it.
+        Pixels may be fractional or outside the frame. Origins are C, which `Cahvore` moves along the optical axis; they
+        may be read-only. Directions are NaN for pixels beyond the valid range of the distortion.
         """
         flat = pixels.reshape(-1, 2)
         directions = np.empty((len(flat), 3))
@@ -133,9 +133,9 @@ class CameraModel(ABC):
         return np.stack(np.meshgrid(np.arange(columns, dtype=np.float64), np.arange(rows, dtype=np.float64)), axis=-1)
 
     def transform(self: M, new_from_old: RigidTransform) -> M:
-        """The camera after a rigid motion: ``moved(T).project(T.apply(points))`` equals ``project(points)``.
+        """Return the camera after a rigid motion: ``transform(T).project(T.apply(points))`` equals ``project(points)``.
 
-        With the camera in the body frame, ``moved(world_from_body)`` is the camera in the world frame. Raises
+        With the camera in the body frame, ``transform(world_from_body)`` is the camera in the world frame. Raises
         ValueError if `new_from_old` holds more than one transform.
         """
         if not new_from_old.single:

@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
 #: Maximum number of Newton steps, and the relative size of the last step: the error is of its square.
-NEWTON_STEPS, CONVERGED = 12, 1e-9
+NEWTON_STEPS, TOLERANCE = 12, 1e-9
 #: Steps of the bisection if Newton's method fails: more than a float has bits.
 BISECTIONS = 70
 
@@ -39,12 +39,12 @@ def radial_image(
     - image_plane, axis_image: H, V and A, and their scalar products with O
     - r, tau_limit: (rho0, rho1, rho2), and the tau at which the distance from the axis stops growing
     """
-    along_x, along_y, along_z = points
+    point_x, point_y, point_z = points
     h, v, a = image_plane
-    count = along_x.size
+    count = point_x.size
     columns, rows, is_visible = np.empty(count), np.empty(count), np.empty(count, dtype=np.bool_)
     for n in range(count):
-        x, y, z = along_x[n], along_y[n], along_z[n]
+        x, y, z = point_x[n], point_y[n], point_z[n]
         omega = _dot(axis, x, y, z)
         tau = (x * x + y * y + z * z) / (omega * omega) - 1.0
         tau = 0.0 if tau < 0.0 else tau
@@ -74,11 +74,11 @@ def _bisect(polynomial: Triple, tau: float, upper: float) -> float:
         while _excess(polynomial, tau, high) < 0.0:
             high *= 2.0
     for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        if _excess(polynomial, tau, middle) > 0.0:
-            high = middle
+        midpoint = 0.5 * (low + high)
+        if _excess(polynomial, tau, midpoint) > 0.0:
+            high = midpoint
         else:
-            low = middle
+            low = midpoint
     return 0.5 * (low + high)
 
 
@@ -96,10 +96,10 @@ def _undistortion(polynomial: Triple, limits: tuple[float, float], tau: float) -
         s = tau * ratio * ratio
         step = (ratio * (k1 + s * (k3 + s * k5)) - 1.0) / (k1 + s * (3.0 * k3 + s * (5.0 * k5)))
         ratio -= step
-        if abs(step) <= CONVERGED * ratio:
+        if abs(step) <= TOLERANCE * ratio:
             break
     upper = math.sqrt(limits[0] / tau)
-    if abs(step) <= CONVERGED * ratio and 0.0 < ratio <= upper:
+    if abs(step) <= TOLERANCE * ratio and 0.0 < ratio <= upper:
         return ratio
     solution: float = _bisect(polynomial, tau, upper)
     return solution
@@ -134,16 +134,16 @@ def radial_sight(
     - polynomial, limits: as in `undistortion`
     """
     m = direction_from_pixel
-    along_x, along_y, along_z = np.empty(u.size), np.empty(u.size), np.empty(u.size)
+    direction_x, direction_y, direction_z = np.empty(u.size), np.empty(u.size), np.empty(u.size)
     for n in range(u.size):
         x = m[0, 0] * u[n] + m[0, 1] * v[n] + m[0, 2]
         y = m[1, 0] * u[n] + m[1, 1] * v[n] + m[1, 2]
         z = m[2, 0] * u[n] + m[2, 1] * v[n] + m[2, 2]
-        along = _dot(axis, x, y, z)
-        x, y, z = x - along * axis[0], y - along * axis[1], z - along * axis[2]
-        tau = (x * x + y * y + z * z) / (along * along) if along > 0.0 else math.nan
+        axial = _dot(axis, x, y, z)
+        x, y, z = x - axial * axis[0], y - axial * axis[1], z - axial * axis[2]
+        tau = (x * x + y * y + z * z) / (axial * axial) if axial > 0.0 else math.nan
         ratio = _undistortion(polynomial, limits, tau)
-        along_x[n] = along * axis[0] + ratio * x
-        along_y[n] = along * axis[1] + ratio * y
-        along_z[n] = along * axis[2] + ratio * z
-    return along_x, along_y, along_z
+        direction_x[n] = axial * axis[0] + ratio * x
+        direction_y[n] = axial * axis[1] + ratio * y
+        direction_z[n] = axial * axis[2] + ratio * z
+    return direction_x, direction_y, direction_z

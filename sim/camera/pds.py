@@ -295,9 +295,9 @@ def is_xml(head: bytes) -> bool:
 def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[CameraModel, ...]:
     """Read every camera model of a PDS4 label (.xml or .lblx), in order.
 
-    Subframes and averaged pixels in the picture's own processing (not in the command) are refused as by `read_pds3`
-    unless `subframe_folded_in` is set: the vectors then describe the stored picture, as those of Mars 2020 do. Raises
-    CameraFileError as `read_pds3`.
+    Raises CameraFileError as `read_pds3` does, also if ground processing cropped or averaged the picture. With
+    `subframe_folded_in` such pictures are accepted: the vectors then describe the stored picture, as those of Mars 2020
+    do. Subframes and averages of the command are accepted.
     """
     source = Source(str(path))
     text = source.text()

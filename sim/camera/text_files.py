@@ -7,9 +7,9 @@ The text files are those of the programs CCALADJ and cmod:
     C =  0.442604 -0.0611635 -1.25106
     A = ...
 
-and the model's other vectors H, V, O, R, E. CAHVORE states its type (1 perspective, 2 fish-eye, 3 general) and for
-type 3 the linearity: ``Model = CAHVORE3,0.37 = general``. The derived lines Hs, Hc, Vs, Vc and Theta, the covariance
-matrices ``S`` and ``S internal`` and unknown lines are not read.
+and the model's other vectors H, V, O, R, E. The line Model of CAHVORE contains its type (1 perspective, 2 fish-eye, 3
+general) and for type 3 the linearity: ``Model = CAHVORE3,0.37 = general``. The derived lines Hs, Hc, Vs, Vc and Theta,
+the covariance matrices ``S`` and ``S internal`` and unknown lines are not read.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from marsyard.sim.camera.models import Cahvore
 from marsyard.sim.camera.pds import is_pds3, is_xml, read_pds3, read_pds4
 
 #: Number of bytes that identify a format.
-_HEAD = 4096
+_FORMAT_BYTES = 4096
 
-#: Frames of written cameras, as stated in their files.
+#: Texts of the frames in written files.
 BODY_FRAME = "body (metres); the body's pose in the world, where it is known, is stated next to this file"
 HEAD_FRAME = "head of the mast (metres: x forward, y left, z up at azimuth and elevation zero)"
 
@@ -52,13 +52,13 @@ def read_cameras(
 
     Raises CameraFileError if the file cannot be read or is wrong; it names file, field and allowed values.
     """
-    head = Source(str(path)).head(_HEAD)
-    if is_pds3(head):
+    leading_bytes = Source(str(path)).head(_FORMAT_BYTES)
+    if is_pds3(leading_bytes):
         return read_pds3(path, subframe_folded_in=subframe_folded_in)
-    if is_xml(head):
+    if is_xml(leading_bytes):
         return read_pds4(path, subframe_folded_in=subframe_folded_in)
-    if is_calibration(head):
-        return tuple(one.camera for one in read_calibrations(path))
+    if is_calibration(leading_bytes):
+        return tuple(calibration.camera for calibration in read_calibrations(path))
     return (read_cahvor(path, size=size),)
 
 
@@ -83,7 +83,7 @@ def read_cahvor(path: str | Path, *, size: tuple[int, int] | None = None) -> Cam
         match = _ASSIGNMENT.match(line.partition("#")[0])
         if match is not None and match["name"] in lines:
             name = match["name"]
-            raise source.error(name, f"given twice, in lines {lines[name][1]} and {number}", "once")
+            raise source.error(name, f"defined twice, in lines {lines[name][1]} and {number}", "once")
         if match is not None:
             lines[match["name"]] = match["value"], number
 
@@ -101,8 +101,8 @@ def read_cahvor(path: str | Path, *, size: tuple[int, int] | None = None) -> Cam
     kind = None if model["type"] is None else int(model["type"])
     linearity = None
     if name == "CAHVORE":
-        word = model["parameter"]
-        parameter = None if word is None else _parse_number("Model", word, number, source)
+        linearity_text = model["parameter"]
+        parameter = None if linearity_text is None else _parse_number("Model", linearity_text, number, source)
         linearity = linearity_of_type(kind, parameter, "Model", source)
     size = _read_size(lines.get("Dimensions"), size, source)
     vectors = {}
@@ -111,7 +111,7 @@ def read_cahvor(path: str | Path, *, size: tuple[int, int] | None = None) -> Cam
         words = value.split()
         if len(words) != 3:
             raise source.error(letter, f"{len(words)} words in line {number}", "three finite numbers")
-        vectors[letter] = [_parse_number(letter, word, number, source) for word in words]
+        vectors[letter] = [_parse_number(letter, linearity_text, number, source) for linearity_text in words]
     return create_camera(name, vectors, size, linearity, source)
 
 
@@ -122,20 +122,22 @@ def _parse_number(name: str, word: str, number: int, source: Source) -> float:
         raise source.error(name, f"{word!r} in line {number} is not a number", "finite numbers") from None
 
 
-def _read_size(line: tuple[str, int] | None, given: tuple[int, int] | None, source: Source) -> tuple[int, int]:
+def _read_size(line: tuple[str, int] | None, expected_size: tuple[int, int] | None, source: Source) -> tuple[int, int]:
     """(columns, rows) by the line Dimensions, or as given if the file has none."""
     if line is None:
-        if given is None:
+        if expected_size is None:
             raise source.error("Dimensions", "missing", "a line 'Dimensions = columns rows', or size = [columns, rows]")
-        return given
+        return expected_size
     words = line[0].split()
     if len(words) != 2 or not all(word.isdecimal() and int(word) > 0 for word in words):
         fault = f"{line[0]!r} in line {line[1]}"
         raise source.error("Dimensions", fault, "two positive integers, columns and rows")
-    stated = int(words[0]), int(words[1])
-    if given is not None and given != stated:
-        raise source.error("Dimensions", f"{stated[0]} {stated[1]}", f"the given size, {given[0]} {given[1]}")
-    return stated
+    file_size = int(words[0]), int(words[1])
+    if expected_size is not None and expected_size != file_size:
+        raise source.error(
+            "Dimensions", f"{file_size[0]} {file_size[1]}", f"the given size, {expected_size[0]} {expected_size[1]}"
+        )
+    return file_size
 
 
 def write_cahvor(camera: CameraModel, path: str | Path, comment: str = "", *, frame: str = "") -> None:

@@ -82,6 +82,13 @@ def test_each_pair_needs_one_track() -> None:
     assert combine_tracks(one, [np.array([15.0, 5.0])], velocities).outcome is VelocityOutcome.IMU_MISMATCH
 
 
+def test_discrepancy_at_the_threshold_is_a_mismatch() -> None:
+    velocities = np.zeros((2, 3))
+    still, moving = [np.zeros(2)], [np.array([THRESHOLD, 0.0])]
+    assert combine_tracks(still, moving, velocities).outcome is VelocityOutcome.IMU_MISMATCH
+    assert combine_tracks(still, [0.999 * moving[0]], velocities).outcome is VelocityOutcome.VALID
+
+
 @pytest.mark.parametrize("broken", [0, 1])
 def test_invalid_tracks_are_ignored(broken: int) -> None:
     good, bad = np.array([5.0, 5.0]), np.array([25.0, 5.0])

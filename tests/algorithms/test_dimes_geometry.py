@@ -208,6 +208,8 @@ def test_best_candidates_are_selected_with_min_spacing() -> None:
     assert best_candidates(contrasts, pixels, everywhere, 2, 31.0) == [0, 3]
     assert best_candidates(contrasts, pixels, everywhere, 4, 31.0) == [0, 3, 2]
     assert best_candidates(contrasts, pixels, everywhere, 2, 5.0) == [0, 1]
+    # a candidate at exactly the exclusion distance is available
+    assert best_candidates(contrasts, pixels, everywhere, 2, 10.0) == [0, 1]
     assert best_candidates(contrasts, pixels, np.array([False, True, False, False]), 2, 31.0) == [1, 3]
     assert best_candidates(np.zeros(0), np.zeros((0, 2)), np.zeros(0, dtype=bool), 2, 31.0) == []
 

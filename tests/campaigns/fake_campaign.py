@@ -35,7 +35,7 @@ probability = 0.99
 confidence = 0.9
 """
 #: A case that raises, two that abort their process, one without an answer.
-FAILING_CASES = "raising_cases = [3]\naborting_cases = [5, 6]\nsilent_cases = [2]"
+FAILING_CASES = "raising_cases = [3]\naborting_cases = [5, 6]\nrefusing_cases = [2]"
 
 
 def write_campaign(

@@ -36,14 +36,14 @@ class FakeParameters(BaseModel):
     heights_m: tuple[float, float] = (1.0, 2.0)
     raising_cases: frozenset[int] = frozenset()
     aborting_cases: frozenset[int] = frozenset()
-    silent_cases: frozenset[int] = frozenset()
+    refusing_cases: frozenset[int] = frozenset()
     looping_cases: frozenset[int] = frozenset()
-    swelling_cases: frozenset[int] = frozenset()
-    chatting_cases: frozenset[int] = frozenset()
-    leaving_cases: frozenset[int] = frozenset()
+    allocating_cases: frozenset[int] = frozenset()
+    flooding_cases: frozenset[int] = frozenset()
+    exiting_cases: frozenset[int] = frozenset()
     forking_cases: frozenset[int] = frozenset()
     stopping_cases: frozenset[int] = frozenset()
-    altering_cases: frozenset[int] = frozenset()
+    state_changing_cases: frozenset[int] = frozenset()
     shared: int = 0
     fail_prepare: bool = False
     cache: str = ""
@@ -67,9 +67,9 @@ def misbehave(parameters: FakeParameters, case: int) -> None:
     if case in parameters.looping_cases:
         # backtracks 2^64 times in C without releasing the interpreter lock
         re.match("(a+)+$", "a" * 64 + "b")
-    while case in parameters.chatting_cases:
+    while case in parameters.flooding_cases:
         os.write(1, b"another line of text\n" * 1000)
-    if case in parameters.leaving_cases:
+    if case in parameters.exiting_cases:
         os._exit(0)
     if case in parameters.forking_cases and os.fork() == 0:
         # the child has its own session, keeps the worker's open files and leaves a temporary file
@@ -78,10 +78,10 @@ def misbehave(parameters: FakeParameters, case: int) -> None:
         time.sleep(3600)
     if case in parameters.stopping_cases:
         os.kill(os.getppid(), signal.SIGSTOP)
-    if case in parameters.altering_cases:
+    if case in parameters.state_changing_cases:
         os.chdir("/")
     arrays = []
-    while case in parameters.swelling_cases:
+    while case in parameters.allocating_cases:
         arrays.append(np.ones(1_000_000))
 
 
@@ -104,7 +104,7 @@ class FakeScenario:
         if streams.case in parameters.aborting_cases:
             os.abort()
         misbehave(parameters, streams.case)
-        answered = streams.case not in parameters.silent_cases
+        answered = streams.case not in parameters.refusing_cases
         # the environment variable imitates a change of the algorithm's code
         scale = parameters.error_scale * float(os.environ.get("FAKE_ERROR_SCALE", "1"))
         error = scale * streams.generator("noise").normal(size=2) if answered else np.full(2, np.nan)

@@ -340,8 +340,13 @@ def test_additional_cases_account_for_the_design_effect(velocity: dict[str, Any]
         [frame, _make_rows(verdict.further_cases, 0).assign(terrain=1000 + np.arange(verdict.further_cases) // 5)]
     )
     more["case"] = np.arange(len(more))
-    (later,) = evaluate_requirements(more, [{**velocity, "probability": 0.82}], SamplingDesign(first_look=1000))
+    rule = [{**velocity, "probability": 0.82}]
+    (later,) = evaluate_requirements(more, rule, SamplingDesign(first_look=1000))
     assert later.status is Status.PASS
+    (earlier,) = evaluate_requirements(
+        more.iloc[: 1000 + int(0.9 * verdict.further_cases)], rule, SamplingDesign(first_look=1000)
+    )
+    assert earlier.status is Status.INSUFFICIENT
 
 
 def _make_terrain_design(bank: int, **dispersion: Any) -> SamplingDesign:

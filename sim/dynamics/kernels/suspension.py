@@ -23,46 +23,46 @@ def rotate(x: float, z: float, angle: float, about: Array) -> tuple[float, float
 
 
 @njit(cache=True)
-def wheel_centres(rest: Array, rocker_pivot: Array, bogie_pivot: Array, joints: Array) -> Array:
+def wheel_centres(level: Array, rocker_pivot: Array, bogie_pivot: Array, joints: Array) -> Array:
     """Centres of the wheels in the rover frame.
 
-    - rest: the same on level ground, shape (6, 3): left front, middle, rear, right front, middle, rear
+    - level: wheel centres on level ground, shape (6, 3): left front, middle, rear, right front, middle, rear
     - rocker_pivot, bogie_pivot: (x, z) of the axes on level ground
     - joints: angles of the differential, the left and the right bogie
     """
     centres = np.empty((2 * WHEELS_PER_SIDE, 3))
     for wheel in range(2 * WHEELS_PER_SIDE):
         side = wheel // WHEELS_PER_SIDE
-        x, z = rest[wheel, 0], rest[wheel, 2]
+        x, z = level[wheel, 0], level[wheel, 2]
         if wheel % WHEELS_PER_SIDE > 0:
             x, z = rotate(x, z, joints[1 + side], bogie_pivot)
         x, z = rotate(x, z, joints[0] if side == 0 else -joints[0], rocker_pivot)
-        centres[wheel, 0], centres[wheel, 1], centres[wheel, 2] = x, rest[wheel, 1], z
+        centres[wheel, 0], centres[wheel, 1], centres[wheel, 2] = x, level[wheel, 1], z
     return centres
 
 
 @njit(cache=True)
 def tread_points(
-    unknowns: Array, yaw: float, position: Array, rest: Array, rocker_pivot: Array, bogie_pivot: Array, treads: Array
+    states: Array, yaw: float, position: Array, level: Array, rocker_pivot: Array, bogie_pivot: Array, treads: Array
 ) -> tuple[Array, Array, Array]:
     """World x, y and z of points of the wheels' treads, each of shape (n, 6, points).
 
-    - unknowns: heights, pitches, rolls, and joints as for `wheel_centres`, shape (n, 6)
+    - states: heights, pitches, rolls, and joints as for `wheel_centres`, shape (n, 6)
     - yaw, position: rotation of the rover about the vertical, and world x and y of its origin
     - treads: points relative to the wheels' centres, shape (6, points, 3), or (1, points, 3) if common to all wheels
     """
-    count, on_tread = unknowns.shape[0], treads.shape[1]
-    x = np.empty((count, 2 * WHEELS_PER_SIDE, on_tread))
+    count, points_per_tread = states.shape[0], treads.shape[1]
+    x = np.empty((count, 2 * WHEELS_PER_SIDE, points_per_tread))
     y, z = np.empty_like(x), np.empty_like(x)
     sy, cy = math.sin(yaw), math.cos(yaw)
     for n in range(count):
         # rotation by roll about x, then by -pitch about y, then by yaw about z
-        sp, cp = math.sin(-unknowns[n, 1]), math.cos(-unknowns[n, 1])
-        sr, cr = math.sin(unknowns[n, 2]), math.cos(unknowns[n, 2])
-        centres = wheel_centres(rest, rocker_pivot, bogie_pivot, unknowns[n, 3:])
+        sp, cp = math.sin(-states[n, 1]), math.cos(-states[n, 1])
+        sr, cr = math.sin(states[n, 2]), math.cos(states[n, 2])
+        centres = wheel_centres(level, rocker_pivot, bogie_pivot, states[n, 3:])
         for wheel in range(2 * WHEELS_PER_SIDE):
             tread = treads[wheel % treads.shape[0]]
-            for k in range(on_tread):
+            for k in range(points_per_tread):
                 a = centres[wheel, 0] + tread[k, 0]
                 b = centres[wheel, 1] + tread[k, 1]
                 c = centres[wheel, 2] + tread[k, 2]
@@ -70,5 +70,5 @@ def tread_points(
                 left = cr * b - sr * c
                 x[n, wheel, k] = position[0] + cy * forward - sy * left
                 y[n, wheel, k] = position[1] + sy * forward + cy * left
-                z[n, wheel, k] = unknowns[n, 0] + cp * (sr * b + cr * c) - sp * a
+                z[n, wheel, k] = states[n, 0] + cp * (sr * b + cr * c) - sp * a
     return x, y, z

@@ -14,6 +14,7 @@ from marsyard.algorithms.hda.hazards import (
     ElevationMap,
     Resolution,
     check_footprints,
+    elevation_map,
     grassfire,
     roughness_limit_m,
     safe_landing_map,
@@ -295,3 +296,12 @@ def test_coarse_map_has_no_safe_cells() -> None:
     inside = (slice(10, 50), slice(10, 50))
     assert np.all(check_footprints(all_safe, ground, SHARP, options)[inside] == Safety.SAFE)
     assert np.all(check_footprints(all_safe, ground, coarse, options) == Safety.HAZARD)
+
+
+def test_elevation_map_is_centred_on_its_points() -> None:
+    x, y = np.meshgrid(np.arange(10.0), np.arange(6.0))
+    ground = elevation_map(np.stack([x.ravel(), y.ravel(), np.zeros(60)], axis=-1))
+    assert ground is not None
+    rows, columns = ground.elevation_m.shape
+    corners = ground.positions(np.array([[0.0, 0.0], [rows - 1.0, columns - 1.0]]))
+    np.testing.assert_allclose(corners.mean(axis=0), [4.5, 2.5], atol=1e-9)

@@ -334,7 +334,7 @@ def test_choice_between_tables_uses_defaults_for_omitted_keys(campaign_file: Cam
 @pytest.mark.parametrize(
     ("path", "allowed"),
     [
-        ("wnd.est_m_s", "aborting_cases, altering_cases, altitude_m, "),
+        ("wnd.est_m_s", "aborting_cases, allocating_cases, altitude_m, "),
         ("wind.est_m_s", "wind.east_m_s, wind.north_m_s"),
         ("wind.east_m_s.x", "wind.east_m_s, wind.north_m_s"),
     ],

@@ -40,7 +40,7 @@ def test_campaign_with_failing_cases_finishes(
     # same rows with one worker, without the failing cases, and for single replayed cases
     single = read_case_rows(run(campaign_file(FAILING_CASES), tmp_path / "single", watch, jobs=1))
     assert [differing_columns(row, other) for row, other in zip(rows, single, strict=True)] == [()] * 12
-    healthy = read_case_rows(run(campaign_file("silent_cases = [2]"), tmp_path / "healthy", watch))
+    healthy = read_case_rows(run(campaign_file("refusing_cases = [2]"), tmp_path / "healthy", watch))
     for case in (0, 1, 2, 4, 7, 8, 9, 10, 11):
         assert differing_columns(rows[case], healthy[case]) == ()
     for case in (3, 5, 7):

@@ -157,10 +157,10 @@ with stop_on_signals():
     assert (process.returncode, errors) == (130, b"killed\n")
 
 
-def test_case_that_changes_its_process_is_noted(
+def test_side_effects_on_the_worker_are_reported(
     failing_campaign: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
-    path = campaign_file("altering_cases = [1, 7]\nforking_cases = [4]\nsilent_cases = [2]")
+    path = campaign_file("state_changing_cases = [1, 7]\nforking_cases = [4]\nrefusing_cases = [2]")
     rows = read_case_rows(run(path, tmp_path / "run", watch, "retain.showcase=none"))
     assert sorted(watch.notes) == [
         "case 1 changed its worker process: the working folder",
@@ -177,14 +177,14 @@ def test_hostile_cases_do_not_affect_other_cases(
     hostile = {
         "raising_cases": (0, "CRASHED"),
         "aborting_cases": (1, "CRASHED"),
-        "leaving_cases": (4, "CRASHED"),
+        "exiting_cases": (4, "CRASHED"),
         "looping_cases": (7, "TIMED_OUT"),
-        "swelling_cases": (8, "OUT_OF_MEMORY"),
-        "chatting_cases": (9, "TOO_MUCH_OUTPUT"),
+        "allocating_cases": (8, "OUT_OF_MEMORY"),
+        "flooding_cases": (9, "TOO_MUCH_OUTPUT"),
     }
     parameters = "\n".join(f"{name} = [{case}]" for name, (case, _) in hostile.items())
     limits = "[limits]\ncase_time_s = 4\nmemory_gb = 0.25\noutput_mb = 0.1"
-    path = campaign_file(f"{parameters}\nsilent_cases = [2]", more=limits)
+    path = campaign_file(f"{parameters}\nrefusing_cases = [2]", more=limits)
     rows = read_case_rows(run(path, tmp_path / "hostile", watch, "retain.showcase=none"))
     expected = dict(hostile.values())
     outcomes = {row["case"]: row["outcome"] for row in rows if row["outcome"] not in ("VALID", "SILENT")}
@@ -193,7 +193,7 @@ def test_hostile_cases_do_not_affect_other_cases(
         assert row["case"] in (*expected, 3, 5, 6) or differing_columns(row, other) == ()
     stored = record.read(tmp_path / "hostile")
     assert (stored["state"], stored["cases_finished"], stored["cases_crashed"]) == ("finished", 12, 6)
-    # each failed case has an error and a trace
+    # each failed case has an error and a trace; case 4 exits without a trace
     assert all(rows[case]["error"] and "fake_scenario.py" in rows[case]["traceback"] for case in expected if case != 4)
     # only the case that timed out runs again
     before = read_case_rows(tmp_path / "hostile")

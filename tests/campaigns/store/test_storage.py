@@ -16,12 +16,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.products import load_products, pack_products, save_packed
 from marsyard.campaigns.store.record import folder_lock, is_locked
 from marsyard.campaigns.store.rows import RowStore, create_store
-from marsyard.campaigns.store.table import read_rows, write_table
+from marsyard.campaigns.store.table import numeric_metrics, read_rows, write_table
 
 
 def complete_row(row: dict[str, Any]) -> dict[str, Any]:
@@ -239,3 +240,10 @@ def test_unsupported_products_are_rejected(tmp_path: Path, value: object) -> Non
         pack_products({"a": [value]})
     with pytest.raises(StoreError, match="contains no products"):
         load_products(tmp_path)
+
+
+def test_columns_of_a_sum_are_its_summands() -> None:
+    shared = {"probability": 0.9, "confidence": 0.9}
+    total = Requirement.model_validate({"id": "A", "metric": "a_s + b_s", "bound": 2.0, **shared})
+    flag = Requirement.model_validate({"id": "B", "metric": "safe", **shared})
+    assert numeric_metrics([total, flag]) == ["a_s", "b_s"]

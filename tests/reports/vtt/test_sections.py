@@ -33,7 +33,7 @@ def test_table_1_agrees_with_the_printed_digits() -> None:
         assert (printed.pop(""), result.pop("")) == ("printed", "computed")
         assert result == printed
     assert computed[0]["Designation (cm)"] == "9.7"
-    assert computed[2]["Approach without tracker (cm)"] == "42.0"
+    assert computed[2]["Error at the goal without tracking (cm)"] == "42.0"
 
 
 def test_measured_accuracy_is_3_sigma_per_camera() -> None:
@@ -48,7 +48,7 @@ def test_measured_accuracy_is_3_sigma_per_camera() -> None:
     assert pancam["drift_px"] == pytest.approx(np.sqrt(12.5))
     result = read_table(table_1_section(make_subject(frame)), 1)
     # Navcam, 2 px of drift: sqrt(1.6^2 + 0.32^2) = 1.63
-    assert result[0]["Table I at the measured drift"] == "1.6"
+    assert result[0]["Paper's formula (cm)"] == "1.6"
     # runs from other ranges, at unselectable targets or without result are excluded
     assert measured_accuracy(frame.assign(range_start_m=7.0)) == []
     assert measured_accuracy(frame.assign(selectable=False)) == []

@@ -278,7 +278,7 @@ TEXT_FAULTS = [
     ("     0.939950", "     0.039950", "A: a must be a unit vector"),
     ("O =      0.946551", "O =     -0.946551", "O: "),
     ("R =      0.000960", "R =     -1.000960", "R: r must begin with a number above -1"),
-    ("R =  ", "A =  ", "A: given twice, in lines 9 and 13"),
+    ("R =  ", "A =  ", "A: defined twice, in lines 9 and 13"),
     ("V =  ", "W =  ", "V: missing"),
 ]
 

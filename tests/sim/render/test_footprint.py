@@ -29,7 +29,7 @@ def _is_inside(footprint: Footprint, x: np.ndarray, y: np.ndarray) -> np.ndarray
 
 @pytest.mark.parametrize("elevation", [0.2, 0.7, 1.5])
 def test_footprint_contains_every_shaded_position(elevation: float) -> None:
-    """Rays to the sun that intersect a sphere, from ground of any height above the lowest; few others."""
+    """It contains all ground points whose ray to the sun intersects a sphere, at any height, and few others."""
     rng = np.random.default_rng(0)
     spheres = np.column_stack(
         [rng.uniform(-900.0, 900.0, (40, 2)), rng.uniform(-30.0, 30.0, 40), rng.uniform(0.5, 3.0, 40)]
@@ -37,15 +37,15 @@ def test_footprint_contains_every_shaded_position(elevation: float) -> None:
     sun = direction(rng.uniform(0.0, 6.0), elevation)
     footprint = shadow_footprint(spheres, sun, -40.0)
     # Points in the spheres, traced back along the sun rays to any height.
-    inside = np.repeat(spheres, 500, axis=0)
-    away = rng.standard_normal((len(inside), 3))
-    away *= (rng.random(len(inside)) ** (1.0 / 3.0) / np.linalg.norm(away, axis=1))[:, None]
-    points = inside[:, :3] + inside[:, 3:] * away
-    fall = rng.random(len(points)) * (points[:, 2] + 40.0)
-    ground = points - (fall / sun[2])[:, None] * sun
+    sphere_of_point = np.repeat(spheres, 500, axis=0)
+    offset = rng.standard_normal((len(sphere_of_point), 3))
+    offset *= (rng.random(len(sphere_of_point)) ** (1.0 / 3.0) / np.linalg.norm(offset, axis=1))[:, None]
+    points = sphere_of_point[:, :3] + sphere_of_point[:, 3:] * offset
+    height_drop = rng.random(len(points)) * (points[:, 2] + 40.0)
+    ground = points - (height_drop / sun[2])[:, None] * sun
     assert _is_inside(footprint, ground[:, 0], ground[:, 1]).all()
     anywhere = rng.uniform(-1000.0, 1000.0, (20000, 2))
-    # Shadows of 70 m / tan(elevation), some cells wide, of 40 objects on 4 km2.
+    # 40 shadows, each up to 70 m / tan(elevation) long and a few cells wide, on 4 km2
     assert _is_inside(footprint, *anywhere.T).mean() < 0.15 + 0.1 / np.tan(elevation)
 
 
@@ -72,7 +72,7 @@ def test_footprint_does_not_change_images() -> None:
 
 @pytest.mark.parametrize("elevation", [0.25, 1.0])
 def test_potentially_visible_objects_give_equal_images(elevation: float) -> None:
-    """Bitwise equal: a subframe from a mast among rocks with a low and a high sun from both sides."""
+    """A mast subframe among rocks is bitwise equal with and without culling, for two sun elevations and azimuths."""
     terrain = ROCKY.model_copy(update={"spacing_m": 0.05, "rms_slope_deg": 5.0, "slope_baseline_m": 1.0})
     terrain = terrain.model_copy(update={"outer_scale_m": 10.0, "craters_per_km2": 0.0})
     rocks = RockParameters(abundance=0.1, smallest_m=0.05)
@@ -87,6 +87,6 @@ def test_potentially_visible_objects_give_equal_images(elevation: float) -> None
         full, subset = (process_renderer(default_backend()).render(one, rays, pose) for one in (scene, near))
         np.testing.assert_array_equal(subset.radiance, full.radiance)
         np.testing.assert_array_equal(subset.range_m, full.range_m)
-        # Data of bodies are kept.
+        # culling keeps the spheres of the remaining objects
         repeated = Objects(**{name: getattr(near.objects, name) for name in Objects.__dataclass_fields__})
         np.testing.assert_array_equal(near.objects.spheres, repeated.spheres)

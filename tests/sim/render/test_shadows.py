@@ -27,7 +27,7 @@ ALBEDO = 0.2
 #: Brightness is then albedo times the cosine of incidence in sunlight, and 0 in shadow.
 LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_share=0.0, surrounding_albedo=0.0)
 #: Required fraction of equal pixels, from docs/validation.md.
-BAR = 0.995
+MIN_AGREEMENT = 0.995
 
 
 def _with_uniform_albedo(surface: Surface) -> Surface:
@@ -61,7 +61,7 @@ def test_low_sun_shadows_of_rough_ground_match_ray_cast(
     frame = renderer.render(scene, PixelRays.of(descent_camera(512)), pose)
     agree, in_shadow = _agreement(frame, scene, 4000, 0.3)
     assert in_shadow > 0.02
-    assert agree >= BAR
+    assert agree >= MIN_AGREEMENT
 
 
 def test_rock_shadows_match_ray_cast(renderer: Renderer) -> None:
@@ -85,11 +85,11 @@ def test_rock_shadows_match_ray_cast(renderer: Renderer) -> None:
     frame = renderer.render(scene, PixelRays.of(camera), rigid(Rotation.from_euler("x", 15.0, degrees=True), eye))
     agree, in_shadow = _agreement(frame, scene, 3000, 0.02)
     assert in_shadow > 0.02
-    assert agree >= BAR
+    assert agree >= MIN_AGREEMENT
 
 
 def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
-    """The softness of a shadow edge 55 m away follows from the visible part of the solar disc."""
+    """The penumbra 55 m from the ridge equals the visible fraction of the solar disc."""
     spacing, elevation = 0.5, np.radians(20.0)
     heights = np.zeros((256, 256)) + np.maximum(20.0 - spacing * np.abs(np.arange(256.0) - 60.0), 0.0)
     samples = np.stack([heights, np.full_like(heights, ALBEDO)], axis=-1).astype(np.float32)
@@ -102,11 +102,11 @@ def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer, descent
     edge = float(np.interp(elevation, skyline[::-1], ground[::-1]))
     pose = rigid(Rotation.identity(), np.array([edge, 64.0, 8.0]))
     frame = renderer.render(Scene(surface, (edge, 64.0), sun, LAMBERT), PixelRays.of(descent_camera(256)), pose)
-    at = frame.points_world()[..., 0].ravel()
-    offset = np.clip((elevation - np.interp(at, ground, skyline)) / sun.angular_radius_rad, -1.0, 1.0)
+    x_m = frame.points_world()[..., 0].ravel()
+    offset = np.clip((elevation - np.interp(x_m, ground, skyline)) / sun.angular_radius_rad, -1.0, 1.0)
     expected = 0.5 + (offset * np.sqrt(1.0 - offset**2) + np.arcsin(offset)) / np.pi
     lit = frame.radiance.ravel() / (ALBEDO * np.sin(elevation))
-    # One metre wide, with pixels of 3 cm.
+    # the penumbra is 1 m wide; a pixel covers 3 cm
     assert 0.1 < np.mean((expected > 0.0) & (expected < 1.0)) < 0.3
     np.testing.assert_allclose(lit, expected, atol=0.01)
 
@@ -134,27 +134,29 @@ def test_hidden_positions_agree_with_all_triangles(elevation: float) -> None:
 
 
 @pytest.mark.parametrize("azimuth_deg", [20.0, 110.0, 200.0, 290.0, 45.0])
-def test_partial_shadow_sweep_equals_the_whole_sweep(rough: Surface, azimuth_deg: float) -> None:
+def test_shadow_sweep_of_an_area_equals_the_full_sweep(rough: Surface, azimuth_deg: float) -> None:
     """Includes the border of the terrain period."""
     sun = Sun(direction(np.radians(azimuth_deg), np.radians(35.0)))
     heights = height_range(rough.levels[0])
-    shown = (-40.0, 60.0, 700.0, 760.0)
-    everywhere, in_view = ground_shadow(rough, sun, heights), ground_shadow(rough, sun, heights, shown)
-    full, part, spacing = everywhere.height, in_view.height, everywhere.spacing
-    assert everywhere[2:] == in_view[2:]
+    area_m = (-40.0, 60.0, 700.0, 760.0)
+    full_shadow, area_shadow = ground_shadow(rough, sun, heights), ground_shadow(rough, sun, heights, area_m)
+    full, part, spacing = full_shadow.height, area_shadow.height, full_shadow.spacing
+    assert full_shadow[2:] == area_shadow[2:]
     assert len(part) < len(full)
-    x, y = (np.arange(int(a / spacing) - 1, int(b / spacing) + 3) for a, b in (shown[:2], shown[2:]))
-    rows, columns = (x, y) if everywhere.along_x else (y, x)
-    of_whole, of_part = (each[np.ix_(rows & (len(each) - 1), columns & (len(each) - 1))] for each in (full, part))
-    np.testing.assert_array_equal(of_part, of_whole)
+    x, y = (np.arange(int(a / spacing) - 1, int(b / spacing) + 3) for a, b in (area_m[:2], area_m[2:]))
+    rows, columns = (x, y) if full_shadow.along_x else (y, x)
+    full_values, part_values = (
+        grid[np.ix_(rows & (len(grid) - 1), columns & (len(grid) - 1))] for grid in (full, part)
+    )
+    np.testing.assert_array_equal(part_values, full_values)
 
 
 @pytest.mark.parametrize("azimuth_deg", [20.0, 110.0, 225.0])
 def test_ground_less_steep_than_the_sun_has_no_shadow(rough: Surface, azimuth_deg: float) -> None:
-    def at(elevation_rad: float) -> Sun:
+    def sun_at(elevation_rad: float) -> Sun:
         return Sun(direction(np.radians(azimuth_deg), elevation_rad))
 
-    high = at(np.radians(80.0))
+    high = sun_at(np.radians(80.0))
     steepest = slope_bounds(rough, high)
     rng = np.random.default_rng(4)
     x, y = rng.uniform(0.0, rough.period_m, (2, 20000))
@@ -162,8 +164,8 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(rough: Surface, azimuth_de
     assert np.all(slopes <= steepest)
     assert np.all(slopes.max(axis=0) > 0.6 * np.array(steepest))
     east, north = np.abs(high.direction[:2]) / np.hypot(*high.direction[:2])
-    rises = np.arctan(steepest[0] * east + steepest[1] * north)
-    just_above, just_below = (at(rises + high.angular_radius_rad + off) for off in (1e-4, -1e-4))
+    max_slope_angle = np.arctan(steepest[0] * east + steepest[1] * north)
+    just_above, just_below = (sun_at(max_slope_angle + high.angular_radius_rad + off) for off in (1e-4, -1e-4))
     assert sun_over_slopes(just_above, steepest)
     assert slope_bounds(rough, just_above) == steepest
     assert not sun_over_slopes(just_below, steepest)

@@ -39,20 +39,20 @@ def _make_path(seed: int) -> FlownPath:
 
 def _run_filter(
     seed: int,
-    imu_class: ImuParameters = SMALL_UNIT,
-    rtk_class: RtkParameters = RTK,
-    compass_class: TiltCompassParameters = COMPASS,
+    imu_parameters: ImuParameters = SMALL_UNIT,
+    rtk_parameters: RtkParameters = RTK,
+    compass_parameters: TiltCompassParameters = COMPASS,
     covariance_times_s: tuple[float, ...] = (),
     parameters: FilterParameters = FilterParameters(),  # noqa: B008 - frozen
 ) -> tuple[FlownPath, Imu, NavigationSolution]:
     path, rng = _make_path(seed), np.random.default_rng([seed, 1])
     span = path.span_s
-    imu = Imu.draw(imu_class, span, rng)
-    receiver, compass = RtkReceiver.draw(rtk_class, span, rng), TiltCompass.draw(compass_class, rng)
+    imu = Imu.draw(imu_parameters, span, rng)
+    receiver, compass = RtkReceiver.draw(rtk_parameters, span, rng), TiltCompass.draw(compass_parameters, rng)
     increments = imu.increments(path, *span, rng)
     solutions = receiver.measure(path, receiver.sampling.within(*span), rng)
     readings = compass.measure(path, compass.sampling.within(*span), rng)
-    navigation = NavigationFilter(parameters, SMALL_UNIT, rtk_class, compass_class, GRAVITY)
+    navigation = NavigationFilter(parameters, SMALL_UNIT, rtk_parameters, compass_parameters, GRAVITY)
     start = navigation.initialize(solutions, readings)
     return path, imu, navigation.run(start, increments, solutions, readings, np.array(covariance_times_s))
 
@@ -61,14 +61,14 @@ def _errors(path: FlownPath, imu: Imu, solution: NavigationSolution, at: np.ndar
     """True minus estimated state, fifteen columns; the effect of gravity on scale and misalignment counts as bias."""
     times = imu.boundaries(*path.span_s)[at]
     true = path.motion(times)
-    lifted = imu.accelerometer.sensitivity_error[:, 2] * GRAVITY
+    gravity_scale_error = imu.accelerometer.sensitivity_error[:, 2] * GRAVITY
     return np.concatenate(
         [
             true.positions_m - solution.positions_m[at],
             true.velocities_m_s - solution.velocities_m_s[at],
             (true.attitudes * solution.attitudes[at].inv()).as_rotvec(),
             imu.gyro.bias_at(times) - solution.gyro_biases_rad_s[at],
-            imu.accelerometer.bias_at(times) + lifted - solution.accelerometer_biases_m_s2[at],
+            imu.accelerometer.bias_at(times) + gravity_scale_error - solution.accelerometer_biases_m_s2[at],
         ],
         axis=1,
     )
@@ -81,7 +81,7 @@ def test_errors_are_consistent_with_the_covariance() -> None:
     floating = RtkParameters(float_fraction=0.3, float_s=10.0)
     squares = []
     for seed in range(FLIGHTS):
-        path, imu, solution = _run_filter(seed, rtk_class=floating, covariance_times_s=(-3.0, 0.0, 2.5, 5.0))
+        path, imu, solution = _run_filter(seed, rtk_parameters=floating, covariance_times_s=(-3.0, 0.0, 2.5, 5.0))
         errors = _errors(path, imu, solution, solution.covariance_indices)
         covariances = solution.covariances
         squares.append([float(e @ np.linalg.solve(p, e)) for e, p in zip(errors, covariances, strict=True)])
@@ -94,13 +94,14 @@ def test_innovations_are_white() -> None:
     normalised: dict[int, list[float]] = {POSITION_FIX: [], VELOCITY_FIX: []}
     products: dict[int, list[float]] = {POSITION_FIX: [], VELOCITY_FIX: []}
     for seed in range(20):
-        message = _run_filter(seed)[2].innovations
-        assert np.mean(message.used) > 0.99
+        innovations = _run_filter(seed)[2].innovations
+        assert np.mean(innovations.used) > 0.99
         for kind in normalised:
             for axis in range(3):
-                one = message.normalised[(message.kinds == kind) & (message.axes == axis) & (message.times_s > -8.0)]
-                normalised[kind].extend(one)
-                products[kind].extend(one[1:] * one[:-1])
+                selected = (innovations.kinds == kind) & (innovations.axes == axis) & (innovations.times_s > -8.0)
+                values = innovations.normalised[selected]
+                normalised[kind].extend(values)
+                products[kind].extend(values[1:] * values[:-1])
     for kind in normalised:
         # 7,600 values determine a variance to 1.6 % and a correlation to 0.011; unmodelled bias adds to both.
         assert np.var(normalised[kind]) == pytest.approx(1.0, abs=0.1)
@@ -108,7 +109,7 @@ def test_innovations_are_white() -> None:
 
 
 def test_better_instruments_make_smaller_errors() -> None:
-    """An ideal inertial unit, and white noise of 2 mm and 5 mm/s averaged over about a second."""
+    """Ideal inertial unit; the receiver has white noise of 2 mm and 5 mm/s, averaged over about 1 s by the filter."""
     none = {name: 0.0 for name, value in SMALL_UNIT.model_dump().items() if isinstance(value, float)}
     times = {"rate_hz": 100.0, "gyro_wander_s": 100.0, "accelerometer_wander_s": 60.0}
     ideal = ImuParameters.model_validate(none | times | {"clock": {}})
@@ -123,15 +124,15 @@ def test_better_instruments_make_smaller_errors() -> None:
 
 def test_outage_errors_are_consistent_with_the_covariance() -> None:
     """Eight seconds of inertial navigation: the position drifts by decimetres, as for a tilt of 0.2 deg."""
-    away = RtkParameters(outages=(Outage(start_s=-3.0, duration_s=8.1),), float_fraction=0.0)
+    with_outage = RtkParameters(outages=(Outage(start_s=-3.0, duration_s=8.1),), float_fraction=0.0)
     squares, sizes = [], []
     for seed in range(FLIGHTS):
-        path, imu, solution = _run_filter(seed, rtk_class=away, covariance_times_s=(5.0,))
+        path, imu, solution = _run_filter(seed, rtk_parameters=with_outage, covariance_times_s=(5.0,))
         error = _errors(path, imu, solution, solution.covariance_indices)[0]
         squares.append(error[:9] @ np.linalg.solve(solution.covariances[0][:9, :9], error[:9]))
         sizes.append(np.hypot(*error[:2]))
     assert 0.2 < np.sqrt(np.mean(np.square(sizes))) < 3.0
-    # In an outage the errors are below the filter's model, as inclinometers have a low weight.
+    # the errors agree with the covariance in an outage
     low, high = (float(chi2.ppf(p, 9 * FLIGHTS)) / FLIGHTS for p in (0.001, 0.999))
     assert low < np.mean(squares) < high
 
@@ -141,16 +142,16 @@ def test_stuck_instruments_are_ignored() -> None:
     tilts: dict[str, list[np.ndarray]] = {name: [] for name in ("free", "stuck")}
     for seed in range(20):
         for name, unit in (("free", COMPASS), ("stuck", stuck)):
-            path, imu, solution = _run_filter(seed, compass_class=unit)
+            path, imu, solution = _run_filter(seed, compass_parameters=unit)
             error = _errors(path, imu, solution, np.array([1500]))[0]
             tilts[name].append(np.degrees(error[6:9]))
             if name == "stuck":
                 late = solution.innovations.kinds[solution.innovations.times_s > -7.0]
                 assert set(late) == {POSITION_FIX, VELOCITY_FIX}
-    free, left = (np.sqrt(np.mean(np.square(tilts[name]), axis=0)) for name in ("free", "stuck"))
+    rms_free, rms_stuck = (np.sqrt(np.mean(np.square(tilts[name]), axis=0)) for name in ("free", "stuck"))
     # The receiver's velocities determine the tilt with or without inclinometers.
-    assert np.all(left[:2] < 1.5 * free[:2] + 0.05)
-    assert left[2] < 4.0
+    assert np.all(rms_stuck[:2] < 1.5 * rms_free[:2] + 0.05)
+    assert rms_stuck[2] < 4.0
 
 
 def test_filter_resets_after_persistent_rejection() -> None:

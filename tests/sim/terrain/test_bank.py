@@ -52,7 +52,7 @@ def test_damaged_file_is_rebuilt(cache: Path, damage: bytes | None) -> None:
     built = _terrain_bytes(bank, 3)
     path = next(cache.iterdir())
     path.write_bytes(path.read_bytes()[:1000] if damage is None else damage)
-    with pytest.warns(CacheWarning, match="damaged and built again"):
+    with pytest.warns(CacheWarning, match="damaged and will be rebuilt"):
         assert _terrain_bytes(bank, 3) == built
     assert _terrain_bytes(bank, 3) == built
 

@@ -66,6 +66,6 @@ MEASURED: Mapping[str, float] = {
 }
 
 
-def find_bar(claim: str) -> float:
+def find_limit(claim: str) -> float:
     """Bound of a claim, rounded to two digits. Raises KeyError for an unknown claim."""
     return float(f"{FACTOR * MEASURED[claim]:.2g}")
